@@ -340,7 +340,7 @@ def dataclass_from_table(kind: type[T], table: Mapping[str, Any], where: str, ba
 def _unknown_setting(where: str, key: str, names: Sequence[str]) -> UsageError:
     near = difflib.get_close_matches(key, names, n=3, cutoff=0.6)
     known = " or ".join(f"{where}.{name}" for name in near)
-    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names)}"
+    hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names) or 'no settings'}"
     return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from tests.constants import with_constants
 from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
@@ -27,7 +28,7 @@ def unit(window):
 
 def prepared(gray):
     image = photograph(gray)
-    return prepare_image(image, HarrisCorners(spacing_rel=0.01).detect(image))
+    return prepare_image(image, with_constants(HarrisCorners, spacing_rel=0.01)().detect(image))
 
 
 def test_scan_equals_its_numpy_twin():
@@ -99,7 +100,7 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level():
 
 def test_growth_equals_its_numpy_twin():
     images = stereo_scene(200, 260)
-    one, two = (prepare_image(i, HarrisCorners(spacing_rel=0.01).detect(i)) for i in images)
+    one, two = (prepare_image(i, with_constants(HarrisCorners, spacing_rel=0.01)().detect(i)) for i in images)
     xy1, xy2 = one.features.xy, two.features.xy
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     affine, radius = np.tile(np.eye(2), (len(xy1), 1, 1)), np.full(len(xy1), 12.0)

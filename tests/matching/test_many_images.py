@@ -6,7 +6,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from tests.conftest import refuses, same_pairs
+from tests.conftest import same_pairs
 from tests.synthetic import photograph, texture
 from thesisrecon import PipelineConfig, load, reconstruct
 from thesisrecon.errors import StageFailure
@@ -33,7 +33,6 @@ def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
     )
     assert np.array_equal(kept, (levels + 1) // 2)
     assert len(fewer.seeds.patches) == len(fewer.seeds.xy) == kept.sum()
-    refuses(ValueError, "many_share must be above 0", SeedsAndGrowth, many_share=0.0)
 
 
 def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path, monkeypatch):

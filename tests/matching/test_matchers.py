@@ -6,6 +6,7 @@ import pytest
 from scipy.ndimage import affine_transform, gaussian_filter
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.features.harris import HarrisCorners
@@ -119,7 +120,11 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
 
 
 def test_seeds_of_simulated_views_lead_to_matches_of_an_oblique_and_turned_photograph():
-    gray, detector, variant = texture(300, 420, 5), MultiScaleCorners(upsample_below_px=0), SeedsAndGrowth()
+    gray, detector, variant = (
+        texture(300, 420, 5),
+        with_constants(MultiScaleCorners, upsample_below_px=0)(),
+        SeedsAndGrowth(),
+    )
     c, s = np.cos(0.6), np.sin(0.6)
     A = np.array([[c, -s], [s, c]]) @ np.diag([0.3, 0.95]) @ np.array([[c, s], [-s, c]])
     B, centre = np.linalg.inv(A), np.array([209.5, 149.5])
@@ -224,8 +229,7 @@ def test_relative_difference_and_thresholds_drop_wrong_matches():
 
 
 WRONG_STRENGTH = {"window": 8, "radius_rel": 0.0, "candidates": 0, "min_strength": 5.0}
-WRONG_GROWTH = {"neighbours": 0, "ratio": 0.0, "grown_ratio": -1.0}
-WRONG_GROWTH |= {"band_rel": 0.0, "affine_std": -1.0}
+WRONG_GROWTH = {"neighbours": 0, "ratio": 0.0, "oblique_pairs": -1}
 
 
 @pytest.mark.parametrize(

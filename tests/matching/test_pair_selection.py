@@ -1,7 +1,7 @@
 """Pair selection: lists and windows of the user, and the estimate of the overlap."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.synthetic import one_by_one, photograph, texture
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
@@ -110,7 +111,7 @@ def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
         (lambda: SequenceWindow(0), "window .* must be at least 1"),
         (lambda: SequenceWindow(-3), "must be at least 1; got -3"),
         (lambda: OverlapEstimate(nearest=0), "nearest must be at least 1"),
-        (lambda: OverlapEstimate(words=0), "words must be at least 1"),
+        (lambda: OverlapEstimate(most=0), "most must be at least 1"),
     ],
 )
 def test_meaningless_options_are_rejected(make, words):
@@ -141,7 +142,7 @@ def windows():
     walls = [texture(520, 700, seed) for seed in (1, 2)]
     wall = [k % 2 for k in range(CROPS)]
     place = rng.uniform(0.0, (700 - SIDE, 520 - SIDE), (CROPS, 2)).astype(int)
-    detector = MultiScaleCorners(full_corners=300, half_corners=100, seeds_per_level=400)
+    detector = with_constants(MultiScaleCorners, seeds_per_level=400)(full_corners=300, half_corners=100)
     images = [photograph(walls[w][y : y + SIDE, x : x + SIDE]) for w, (x, y) in zip(wall, place, strict=True)]
     return Windows([detector.detect(image) for image in images], wall, place.astype(float))
 
@@ -158,7 +159,7 @@ def test_only_pairs_between_groups_are_tried_again_the_likeliest_first(windows):
     assert not pairs_to_connect(features, [pair_of(0, 4, True), *pairs], CROPS)
 
 
-ESTIMATE = OverlapEstimate(all_up_to=2, nearest=1, shortlist=10, words=256)
+ESTIMATE = with_constants(OverlapEstimate, all_up_to=2, shortlist=10, words=256)(nearest=1)
 
 
 def test_pairs_that_overlap_are_chosen_and_few_others(windows):
@@ -180,7 +181,7 @@ def test_of_many_pairs_the_best_and_some_of_the_rest_are_taken(windows, monkeypa
     evidence = np.random.default_rng(1).uniform(5.0, 9.0, (CROPS, CROPS))
     for most, spread in ((2, 0), (2, 3), (CROPS, 0)):
         numbers = iter(range(CROPS))
-        few = replace(ESTIMATE, shortlist=CROPS, most=most, spread=spread)
+        few = with_constants(type(ESTIMATE), shortlist=CROPS)(1, most, spread)
         chosen = as_set(choose(few, CROPS, windows.features).pairs)
         for k in range(CROPS):
             mine = sorted((p for p in every if k in p), key=lambda p: -evidence[p])
@@ -192,7 +193,7 @@ def test_of_many_pairs_the_best_and_some_of_the_rest_are_taken(windows, monkeypa
 
 
 def test_every_photograph_is_paired_and_all_hang_together(windows):
-    strict = replace(ESTIMATE, min_evidence=1e9)
+    strict = with_constants(type(ESTIMATE), min_evidence=1e9)(nearest=1)
     pairs = choose(strict, CROPS, windows.features).pairs
     assert set(pairs.ravel().tolist()) == set(range(CROPS))
     assert len(pairs) <= 2 * CROPS

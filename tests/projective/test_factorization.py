@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.projective.test_reconstruction import residuals
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.errors import StageFailure
@@ -74,8 +75,8 @@ def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_beg
         assert affine == pytest.approx(often, rel=0.01)
 
 
-def test_too_few_core_points_are_refused():
-    refuses(ValueError, "core_points", Factorization, core_points=3)
+def test_a_negative_number_of_iterations_is_refused():
+    refuses(ValueError, "iterations", Factorization, iterations=-1)
 
 
 def test_points_that_disagree_are_left_out():
@@ -105,7 +106,7 @@ def test_a_scene_is_reconstructed_from_its_core_despite_bad_views(iterations):
     t = scene.tracks
     wrong = np.random.default_rng(5).random(len(t.xy)) < 0.03
     xy = t.xy + np.where(wrong[:, None], 80.0, 0.0)
-    found = Factorization(core_points=60, iterations=iterations).reconstruct(
+    found = with_constants(Factorization, core_points=60)(iterations).reconstruct(
         replace(t, xy=xy), true_pairs(scene), scene.sizes, rng=np.random.default_rng(0)
     )
     assert found.registered.all()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.constants import with_constants
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.errors import StageFailure
@@ -200,7 +201,7 @@ def observe(scene, R, t):
 
 
 def reconstruct(scene, pairs, seed=0, **changes):
-    variant = replace(IncrementalProjective(), **changes)
+    variant = with_constants(IncrementalProjective, **changes)()
     return variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(seed))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.geometry._critical_motions import (
     UpgradedCameras,
@@ -46,7 +47,7 @@ def report_at_the_truth(scene, cameras="shared"):
     estimate = projective_estimate(scene, rng)
     known = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
     prior = prior_for(estimate, known)
-    answer = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17).calibrate(
+    answer = with_constants(HypothesesAndRefinement, camera_subsets=0, focal_steps=17)(search=None).calibrate(
         estimate, prior=prior, rng=rng
     )
     assert answer.identifiability is not None

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -26,7 +27,7 @@ from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)
-EXACT = [NonlinearQuadric(criterion=FREE), KruppaEquations(criterion=FREE)]
+EXACT = [with_constants(kind, criterion=FREE)() for kind in (NonlinearQuadric, KruppaEquations)]
 ALONE = [LinearQuadric(), *EXACT]
 
 

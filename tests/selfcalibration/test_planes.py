@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.constants import with_constants
 from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CONSTANT, prior_for, setup
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
@@ -114,7 +115,7 @@ def test_three_views_of_a_constant_camera_suffice(seed):
     candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
     nearest = np.linalg.norm(candidates.planes - plane, axis=1).min()
     assert nearest < 1e-6
-    answer = Stratified(ModulusConstraint(), max_candidates=21).calibrate(
+    answer = with_constants(Stratified, max_candidates=21)(ModulusConstraint()).calibrate(
         projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(0)
     )
     assert answer.K[0, 0, 0] == pytest.approx(1500.0, rel=1e-6)

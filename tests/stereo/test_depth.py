@@ -8,6 +8,7 @@ import PIL.Image
 import pytest
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
@@ -135,8 +136,10 @@ def test_views_are_undistorted_when_they_are_used_and_the_same_within_any_memory
 def test_the_surroundings_of_a_view_are_enough_for_its_map(links):
     """What is sent to a worker elsewhere: a part of the scene, and the same bytes come back."""
     walled = make_walled(on_arc(tuple(np.linspace(-15.0, 15.0, 5))))
-    few = {"max_neighbours": 1, "min_comparison_views": 2, "max_side": 80, "match_side": 64}
-    stereo = replace(STEREO, sequence_links=links, **few)
+    few = {"max_neighbours": 1, "max_side": 80, "match_side": 64}
+    stereo = replace(
+        with_constants(MultiViewStereo, min_comparison_views=2)(STEREO.pairs), sequence_links=links, **few
+    )
     scene = stereo.prepare(walled.images, walled.reconstruction)
     raw = {i: stereo.depth_map(scene, i) for i in scene.views}
     for i in (0, 2):

@@ -1,12 +1,11 @@
 """Every variant on pairs whose disparity is known, and on pairs that have none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.synthetic import texture
 from thesisrecon.stereo._cost import estimate_noise, prepare_stereo_images, row_strips
 from thesisrecon.stereo.correspondence import PairMatching
@@ -93,7 +92,9 @@ def test_strips_change_little(paths):
     left, right, _, _ = pair_with_truth()
     variant = SemiGlobalMatching(paths=paths)
     whole = variant.match(left, right, disparity_range=(0, 24))
-    strips = replace(variant, memory_mb=1.2).match(left, right, disparity_range=(0, 24))
+    strips = with_constants(SemiGlobalMatching, memory_mb=1.2)(paths).match(
+        left, right, disparity_range=(0, 24)
+    )
     known = np.isfinite(whole.disparity) & np.isfinite(strips.disparity)
     assert (np.isfinite(whole.disparity) == np.isfinite(strips.disparity)).mean() > 0.99
     assert np.mean(np.abs(whole.disparity - strips.disparity)[known] > 0.5) < 0.002

@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from tests.conftest import refuses
+from tests.constants import with_constants
 from tests.surface.sphere import SHAPE, K, looking_at_origin, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
@@ -83,19 +84,17 @@ def test_a_surface_is_the_same_slab_by_slab_and_needs_the_memory_of_its_faces(ri
 
 def test_memory_is_kept_by_larger_voxels(ring):
     fine = VolumetricFusion().fuse(ring[:2])
-    coarse = VolumetricFusion(max_blocks=150).fuse(ring[:2])
+    coarse = with_constants(VolumetricFusion, max_blocks=150)().fuse(ring[:2])
     assert 0 < len(coarse.faces) < 0.5 * len(fine.faces)
 
 
-@pytest.mark.parametrize(
-    "setting", [{"voxel_px": 0.0}, {"voxel_px": np.nan}, {"max_blocks": 7}, {"tolerance": -0.1}]
-)
+@pytest.mark.parametrize("setting", [{"voxel_px": 0.0}, {"voxel_px": np.nan}, {"tolerance": -0.1}])
 def test_settings_under_which_voxels_would_grow_for_ever_are_refused(setting):
     refuses(ValueError, "must be", VolumetricFusion, **setting)
 
 
 def test_voxels_stop_growing_with_as_few_blocks_as_there_may_be(ring):
-    refuses(StageFailure, "no surface", VolumetricFusion(max_blocks=8).fuse, ring[:1])
+    refuses(StageFailure, "no surface", with_constants(VolumetricFusion, max_blocks=8)().fuse, ring[:1])
 
 
 def test_seen_through_points_are_removed(ring):

@@ -76,19 +76,10 @@ class LocallyOptimisedRansac:
         Largest Sampson distance of an inlier during the search.
     confidence : float
         Probability that one of six searches draws a sample without outliers.
-    starts, max_starts : int
-        Number of searches that must end at the same score, and maximum number of searches.
-    min_samples : int
-        Minimum number of samples of six searches together. It holds for any inlier ratio, because a wrong F
-        of a dominant plane also has many inliers.
-    max_samples : int
-        Maximum number of samples of all searches together.
-    gates : tuple of float
-        Residual limits of the successive refinements, in units of ``threshold_px``.
+    starts : int
+        Number of searches that must end at the same score.
     inlier_sigmas : float
         Maximum residual of an inlier in standard deviations; infinite includes the tail of the noise.
-    inlier_floor_px : float
-        Residual up to which a match is always an inlier.
 
     References
     ----------
@@ -99,12 +90,17 @@ class LocallyOptimisedRansac:
     threshold_px: float = 1.0
     confidence: float = 0.9999
     starts: int = 3
-    max_starts: int = 10
-    min_samples: int = 4000
-    max_samples: int = 60000
-    gates: tuple[float, ...] = (2.0, 1.5, 1.0)
     inlier_sigmas: float = np.inf
-    inlier_floor_px: float = 0.3
+
+    # Maximum number of searches.
+    max_starts = 10
+    # Minimum number of samples of six searches together, for any inlier ratio, because a wrong F of a
+    # dominant plane also has many inliers; and maximum number of samples of all searches together.
+    min_samples, max_samples = 4000, 60000
+    # Residual limits of the successive refinements, in units of ``threshold_px``.
+    gates = (2.0, 1.5, 1.0)
+    # Residual up to which a match is always an inlier.
+    inlier_floor_px = 0.3
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
@@ -112,9 +108,7 @@ class LocallyOptimisedRansac:
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
         if not 1 <= self.starts <= self.max_starts:
-            raise ValueError(f"starts must lie in [1, max_starts]; got {self.starts} and {self.max_starts}")
-        if self.max_samples < SEARCHES or min(self.gates, default=0.0) <= 0.0:
-            raise ValueError("a search needs at least six samples and gates above 0")
+            raise ValueError(f"starts must lie between 1 and {self.max_starts}; got {self.starts}")
         if not self.inlier_sigmas > 0.0:
             raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
 

@@ -135,8 +135,6 @@ class ThesisRansac:
         Sampson distance of an inlier during the search.
     samples : int
         Maximum number of samples.
-    stop_inlier_ratio : float
-        Inlier ratio at which sampling stops.
     epipolar_distance : bool
         Minimise the distances to epipolar lines (5.6) in the refinement instead of the Sampson distances
         (5.4).
@@ -148,16 +146,18 @@ class ThesisRansac:
 
     threshold_px: float = 1.0
     samples: int = 1000
-    stop_inlier_ratio: float = 0.95
     epipolar_distance: bool = False
     rounds: int = 2
     inlier_test: InlierTest = "sampson"
 
+    # Inlier ratio at which sampling stops.
+    stop_inlier_ratio = 0.95
+
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if self.samples < 1 or self.rounds < 0 or not 0.0 < self.stop_inlier_ratio <= 1.0:
-            raise ValueError("a search needs samples >= 1, rounds >= 0 and 0 < stop_inlier_ratio <= 1")
+        if self.samples < 1 or self.rounds < 0:
+            raise ValueError(f"a search needs samples >= 1, rounds >= 0; got {self.samples}, {self.rounds}")
         if self.inlier_test not in INLIER_TESTS:
             raise ValueError(
                 f"inlier_test must be one of {', '.join(INLIER_TESTS)}; got {self.inlier_test!r}"

@@ -36,19 +36,19 @@ class PairVerification:
         Minimum number of verified matches, at least 8.
     min_inlier_ratio : float
         Minimum fraction of the matches that are verified, in [0, 1].
-    homography_px : float
-        Distance within which a homography explains a match, or 4.3 sigma if that is more.
     """
 
     min_inliers: int = 60
     min_inlier_ratio: float = 0.25
-    homography_px: float = 2.0
+
+    # Distance within which a homography explains a match, or 4.3 sigma if that is more.
+    homography_px = 2.0
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:
             raise ValueError(f"min_inliers must be at least 8; got {self.min_inliers}")
-        if not 0.0 <= self.min_inlier_ratio <= 1.0 or not self.homography_px > 0.0:
-            raise ValueError("min_inlier_ratio must lie in [0, 1] and homography_px be positive")
+        if not 0.0 <= self.min_inlier_ratio <= 1.0:
+            raise ValueError(f"min_inlier_ratio must lie in [0, 1]; got {self.min_inlier_ratio}")
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         """See `thesisrecon.config.Verifier.verify`."""

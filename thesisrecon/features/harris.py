@@ -42,15 +42,8 @@ class CornerMeasure:
     ----------
     formula : {"noble", "harris"}
         det / trace, or det - k trace^2.
-    harris_k : float
-        k of the second formula, in (0, 0.25).
-    derivative_sigma_px : float
-        Gaussian before the derivative; 0 for none.
-    derivative_taps : tuple of float
-        Derivative kernel along either axis, odd length, sum 0; scaled to slope 1 for a unit ramp.
-    integration_sigma_px, integration_taps : float and int
-        Gaussian of M and its odd number of taps; 0 for three sigma to each side. The thesis has sigma 1 and 9
-        taps.
+    integration_sigma_px : float
+        Gaussian of M, three sigma to each side. The thesis has sigma 1.
     colour : bool
         Mean of M over red, green and blue, else M of the grey values.
     subpixel : bool
@@ -58,29 +51,18 @@ class CornerMeasure:
     """
 
     formula: Literal["noble", "harris"] = "noble"
-    harris_k: float = 0.04
-    derivative_sigma_px: float = 1.0
-    derivative_taps: tuple[float, ...] = (-0.5, 0.0, 0.5)
     integration_sigma_px: float = 1.5
-    integration_taps: int = 0
     colour: bool = False
     subpixel: bool = True
 
+    # k of Harris and Stephens.
+    harris_k = 0.04
+    # Gaussian before the derivative.
+    derivative_sigma_px = 1.0
+
     def __post_init__(self) -> None:
-        taps = np.array(self.derivative_taps)
-        if len(taps) < 3 or len(taps) % 2 == 0 or abs(taps.sum()) > 1e-6 * np.abs(taps).sum():
-            raise ValueError(f"derivative_taps must be an odd number of taps of sum 0; got {taps.tolist()}")
-        if not _slope(taps) > 0.0:
-            raise ValueError(f"derivative_taps must rise from left to right; got {taps.tolist()}")
-        if not 0.0 < self.harris_k < 0.25:
-            raise ValueError(f"harris_k must lie between 0 and 0.25; got {self.harris_k}")
-        if not (self.derivative_sigma_px >= 0.0 and self.integration_sigma_px > 0.0):
-            raise ValueError(
-                "derivative_sigma_px must be at least 0 and integration_sigma_px above 0; "
-                f"got {self.derivative_sigma_px} and {self.integration_sigma_px}"
-            )
-        if self.integration_taps < 0 or (self.integration_taps and self.integration_taps % 2 == 0):
-            raise ValueError(f"integration_taps must be odd, or 0; got {self.integration_taps}")
+        if not self.integration_sigma_px > 0.0:
+            raise ValueError(f"integration_sigma_px must be above 0; got {self.integration_sigma_px}")
 
     def _channels(self, image: Image) -> F32:
         """(C, H, W) grey values or three colours."""
@@ -90,10 +72,8 @@ class CornerMeasure:
 
     def _response(self, channels: F32) -> F32:
         """R (H, W), zero near the border."""
-        derivative = np.array(self.derivative_taps)
-        derivative = (derivative / _slope(derivative)).astype(np.float32)
-        if self.derivative_sigma_px > 0.0:
-            channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
+        derivative = np.array([-0.5, 0.0, 0.5], np.float32)
+        channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
         # Mean over the channels, so that R of a grey image does not depend on ``colour``; the taps are used
         # twice.
         taps = self._integration() / np.float32(np.sqrt(len(channels)))
@@ -116,16 +96,7 @@ class CornerMeasure:
         return (2.0 * NOISE_RESPONSE) ** 2 * (1.0 - 4.0 * self.harris_k)
 
     def _integration(self) -> F32:
-        if self.integration_taps == 0:
-            return gaussian_taps(self.integration_sigma_px)
-        x = np.arange(self.integration_taps) - self.integration_taps // 2
-        taps = np.exp(-0.5 * (x / self.integration_sigma_px) ** 2)
-        normalized: F32 = (taps / taps.sum()).astype(np.float32)
-        return normalized
-
-
-def _slope(taps: F64) -> float:
-    return float(taps @ (np.arange(len(taps)) - len(taps) // 2))
+        return gaussian_taps(self.integration_sigma_px)
 
 
 @dataclass(frozen=True)
@@ -140,8 +111,6 @@ class HarrisCorners:
         Minimum response relative to the largest one; 0 for all above the noise.
     selection : {"spacing", "spread"}
         Drop corners too near to a stronger one, or use :func:`select_spread`.
-    spacing_rel : float
-        Minimum distance of two corners for "spacing", relative to the long side.
     measure : CornerMeasure
         Response and its parameters.
     """
@@ -149,16 +118,16 @@ class HarrisCorners:
     max_corners: int = 2000
     threshold_rel: float = 0.002
     selection: Literal["spacing", "spread"] = "spacing"
-    spacing_rel: float = 0.004
     measure: CornerMeasure = field(default_factory=CornerMeasure)
+
+    # Minimum distance of two corners for "spacing", relative to the long side.
+    spacing_rel = 0.004
 
     def __post_init__(self) -> None:
         if self.max_corners < 1:
             raise ValueError(f"max_corners must be at least 1; got {self.max_corners}")
         if not 0.0 <= self.threshold_rel <= 1.0:
             raise ValueError(f"threshold_rel must lie between 0 and 1; got {self.threshold_rel}")
-        if not self.spacing_rel >= 0.0:
-            raise ValueError(f"spacing_rel must be at least 0; got {self.spacing_rel}")
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import chain
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -50,14 +51,8 @@ class MultiScaleCorners:
     spread : bool
         Select corners and seeds that cover the image (:func:`~thesisrecon.features.harris.select_spread`),
         else the strongest.
-    seeds_per_level : int
-        Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
     levels : int
         Number of levels; with fewer than 3 there is no half size.
-    upsample_below_px : int
-        Long side below which the image is doubled; 0 for never.
-    oblique_tilts : tuple of float
-        Compressions of the simulated views that give seeds for pairs with a wide baseline; () for none.
     measure : CornerMeasure
         Response and its parameters at every size.
     """
@@ -65,11 +60,15 @@ class MultiScaleCorners:
     full_corners: int = 3000
     half_corners: int = 1500
     spread: bool = True
-    seeds_per_level: int = 1400
     levels: int = 5
-    upsample_below_px: int = 1000
-    oblique_tilts: tuple[float, ...] = (1.414, 2.828)
     measure: CornerMeasure = field(default_factory=CornerMeasure)
+
+    # Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
+    seeds_per_level = 1400
+    # Long side below which the image is doubled.
+    upsample_below_px = 1000
+    # Compressions of the simulated views that give seeds for pairs with a wide baseline (ASIFT).
+    oblique_tilts: ClassVar[tuple[float, ...]] = (1.414, 2.828)
 
     def __post_init__(self) -> None:
         if self.levels < 1:
@@ -84,10 +83,6 @@ class MultiScaleCorners:
                 "half_corners must be 0 with fewer than 3 levels, because the third level has half the size; "
                 f"got {self.half_corners} with levels = {self.levels}"
             )
-        if self.seeds_per_level < 0:
-            raise ValueError(f"seeds_per_level must be at least 0; got {self.seeds_per_level}")
-        if not all(tilt > 1.0 for tilt in self.oblique_tilts):
-            raise ValueError(f"oblique_tilts must be above 1; got {self.oblique_tilts}")
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""

@@ -291,16 +291,10 @@ class SeedsAndGrowth:
 
     Parameters
     ----------
-    ratio, grown_ratio : float
-        Maximum ratio of the distances to the best and second best match, of seeds and of guided matches
-        (within their part of the epipolar band).
-    band_rel : float
-        Minimum half width of the epipolar band, relative to the long side; three standard deviations of the
-        epipolar line if that is more.
+    ratio : float
+        Maximum ratio of the distances to the best and second best match of a seed.
     neighbours : int
         Number of matches that define a local affine map.
-    affine_std : float
-        Prior standard deviation of an affine coefficient in the alignment.
     orientation : {"auto", "upright", "rotated"}
         Patches of the seeds: upright, rotated to their dominant gradient, or upright first and rotated if
         few upright ones agree with one F.
@@ -320,18 +314,13 @@ class SeedsAndGrowth:
     many_images : int
         Number of images above which pairs are first matched with fewer corners and seeds, since many images
         show each point, and with all only if these give few matches or the images form a long sequence.
-    many_share : float
-        Share of the corners and seeds that are matched first.
     oblique_pairs : int
         Number of pairs of each image outside the largest group of matched images that are matched again with
         seeds of simulated oblique views; 0 for none.
     """
 
     ratio: float = 0.8
-    band_rel: float = 0.002
-    grown_ratio: float = 0.8
     neighbours: int = 10
-    affine_std: float = 0.02
     orientation: Literal["auto", "upright", "rotated"] = "auto"
     support: Literal["auto", "always", "never"] = "auto"
     growth: bool = True
@@ -339,16 +328,22 @@ class SeedsAndGrowth:
     rematch: bool = True
     align: bool = True
     many_images: int = 40
-    many_share: float = 0.5
     oblique_pairs: int = 6
 
+    # Minimum half width of the epipolar band, relative to the long side; three standard deviations of the
+    # epipolar line if that is more.
+    band_rel = 0.002
+    # The ratio of guided matches, within their part of the epipolar band.
+    grown_ratio = 0.8
+    # Prior standard deviation of an affine coefficient in the alignment.
+    affine_std = 0.02
+    # Share of the corners and seeds that are matched first.
+    many_share = 0.5
+
     def __post_init__(self) -> None:
-        require_at_least(self, neighbours=1, oblique_pairs=0, affine_std=0)
-        for name in ("ratio", "grown_ratio", "band_rel"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be above 0; got {getattr(self, name)}")
-        if not 0.0 < self.many_share <= 1.0:
-            raise ValueError(f"many_share must be above 0 and at most 1; got {self.many_share}")
+        require_at_least(self, neighbours=1, oblique_pairs=0)
+        if not self.ratio > 0.0:
+            raise ValueError(f"ratio must be above 0; got {self.ratio}")
 
     def prepare(self, image: Image, features: Features) -> PreparedImage:
         """See `thesisrecon.config.Matcher.prepare`."""

@@ -158,32 +158,29 @@ class OverlapEstimate:
 
     Parameters
     ----------
-    all_up_to : int
-        Number of images up to which all pairs are taken.
-    min_evidence : float
-        Minimum -log10 of the number of false alarms.
     nearest : int
         Pairs of each image that are always taken.
     most, spread : int
         Numbers of pairs taken for each image among those with enough evidence: the best ones, and further
         ones evenly from the rest. The latter have wider baselines, so that many images from nearly the same
         place are also connected with others.
-    shortlist : int
-        Number of images that each is compared with.
-    words : int
-        Largest size of the vocabulary; an eighth of the patches of the images if that is less.
     """
 
-    all_up_to: int = 30
-    min_evidence: float = 0.5
     nearest: int = 3
     most: int = 10
     spread: int = 2
-    shortlist: int = 30
-    words: int = 65536
+
+    # Number of images up to which all pairs are taken.
+    all_up_to = 30
+    # Minimum -log10 of the number of false alarms.
+    min_evidence = 0.5
+    # Number of images that each is compared with.
+    shortlist = 30
+    # Largest size of the vocabulary; an eighth of the patches of the images if that is less.
+    words = 65536
 
     def __post_init__(self) -> None:
-        require_at_least(self, all_up_to=0, nearest=1, most=1, spread=0, shortlist=1, words=1)
+        require_at_least(self, nearest=1, most=1, spread=0)
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator

@@ -102,11 +102,7 @@ def _matched_in_turn(
     the pairs, and the kind of record of each.
     """
     features, matching = state.result.features, state.config.matching
-    if (
-        not isinstance(matching, SeedsAndGrowth)
-        or matching.many_share == 1.0
-        or len(features) <= matching.many_images
-    ):
+    if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
         return _matched(state, pairs, "", state.prepared_views), [""] * len(pairs)
     prepare = partial(_prepare_share, matching)
     found = _matched(state, pairs, FEWER, lambda: PreparedViews(prepare, state.given()))

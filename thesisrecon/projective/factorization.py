@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry._conditioning import normalizing_transform
 from thesisrecon.geometry._homography import homography_linear, homography_sampson_residuals
 from thesisrecon.geometry.camera_matrix import orient_signs
@@ -143,21 +143,19 @@ class Factorization:
 
     Parameters
     ----------
-    core_points, iterations, growth : int, int, IncrementalProjective
-        Minimum number of tracks seen in all views of the core; maximum number of depth updates, 0 for the
-        published algorithm of Sturm and Triggs; and the method that adds the other views.
+    iterations, growth : int, IncrementalProjective
+        Maximum number of depth updates, 0 for the published algorithm of Sturm and Triggs; and the method
+        that adds the other views.
     """
 
-    core_points: int = 100
     iterations: int = 50
     growth: IncrementalProjective = field(default_factory=IncrementalProjective)
 
+    # Minimum number of tracks seen in all views of the core.
+    core_points = 100
+
     def __post_init__(self) -> None:
-        if self.core_points < _MIN_POINTS or self.iterations < 0:
-            raise ValueError(
-                f"Factorization needs core_points >= {_MIN_POINTS} and iterations >= 0; got "
-                f"{self.core_points} and {self.iterations}"
-            )
+        require_at_least(self, iterations=0)
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.random import Generator
@@ -86,42 +87,35 @@ class IncrementalProjective:
 
     Parameters
     ----------
-    points_per_view, min_points : int
-        Approximate number of tracks per view, longest first (the metric stage uses all), and minimum number
-        of matches for resection (default: twice the six of a minimal sample).
-    outlier_sigmas, noise_floor_px : (float, float), float
-        Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
-    max_projection_std_rel : float, optional
-        Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
-        side; None accepts every camera.
-    min_epipolar_inlier_ratio, max_initial_pairs : float, int
-        Required share of verified matches on the epipolar lines of the finished model, and initial pairs
-        tried in one attempt while usable views are missing.
-    bundle_iterations, final_rounds : int
-        Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
-    global_bundle_growth, local_bundle_views : float, int
-        Growth factor of the number of cameras after which everything is adjusted, and number of views that
-        are adjusted with each new one.
+    points_per_view : int
+        Approximate number of tracks per view, longest first; the metric stage uses all.
     core_views : int
         Number of views above which only a core of this many well-connected views is reconstructed, twice as
         many at each further attempt; the metric stage registers the others. 0: all views are reconstructed.
     """
 
     points_per_view: int = 1500
-    min_points: int = 12
-    outlier_sigmas: tuple[float, float] = (12.0, 7.0)
-    noise_floor_px: float = 0.3
-    max_projection_std_rel: float | None = 0.01
-    min_epipolar_inlier_ratio: float = 0.5
-    bundle_iterations: int = 4
-    final_rounds: int = 3
-    global_bundle_growth: float = 1.2
-    local_bundle_views: int = 4
-    max_initial_pairs: int = 3
     core_views: int = 40
 
+    # Minimum number of matches for resection: twice the six of a minimal sample.
+    min_points = 12
+    # Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
+    outlier_sigmas, noise_floor_px = (12.0, 7.0), 0.3
+    # Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
+    # side; None accepts every camera.
+    max_projection_std_rel: ClassVar[float | None] = 0.01
+    # Required share of verified matches on the epipolar lines of the finished model.
+    min_epipolar_inlier_ratio = 0.5
+    # Levenberg-Marquardt steps after each camera; final rounds of triangulation, adjustment and filtering.
+    bundle_iterations, final_rounds = 4, 3
+    # Growth factor of the number of cameras after which everything is adjusted, and number of views that are
+    # adjusted with each new one.
+    global_bundle_growth, local_bundle_views = 1.2, 4
+    # Initial pairs tried in one attempt while usable views are missing.
+    max_initial_pairs = 3
+
     def __post_init__(self) -> None:
-        require_at_least(self, points_per_view=1, max_initial_pairs=1, core_views=0)
+        require_at_least(self, points_per_view=1, core_views=0)
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0

@@ -15,21 +15,21 @@ from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
+class _WithoutAdjustment(IncrementalProjective):
+    """Resection and triangulation alone, without a test of the new camera."""
+
+    outlier_sigmas = (12.0, 12.0)
+    max_projection_std_rel = None
+    bundle_iterations, final_rounds = 0, 0
+
+
 @dataclass(frozen=True)
 class SequentialProjective:
     """Projective reconstruction of one view after the other in image order (6.6).
 
     Starts with the pair of neighbours with most matches; each further view is resected, new points are
     triangulated and outliers removed. One bundle adjustment at the end replaces a lost chapter of the thesis.
-
-    Parameters
-    ----------
-    min_points, outlier_sigmas : int, float
-        Matches needed for resection, and inlier threshold in noise sigmas.
     """
-
-    min_points: int = 12
-    outlier_sigmas: float = 12.0
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
@@ -43,15 +43,9 @@ class SequentialProjective:
             raise StageFailure(
                 Notice("no-initial-pair"), f"{counted(len(candidates), 'image pair')} accepted"
             )
-        incremental = IncrementalProjective(
-            min_points=self.min_points,
-            outlier_sigmas=(self.outlier_sigmas, self.outlier_sigmas),
-            max_projection_std_rel=None,
-            bundle_iterations=0,
-            final_rounds=0,
-        )
+        incremental = _WithoutAdjustment()
         model = incremental.begin(tracks, candidates[attempt], sizes)
         while incremental.add_next_camera(model, rng) is not None:
             pass
-        adjust_all(model, 10, self.outlier_sigmas)
-        return to_reconstruction(model, self.min_points)
+        adjust_all(model, 10, incremental.outlier_sigmas[1])
+        return to_reconstruction(model, incremental.min_points)

@@ -71,16 +71,11 @@ class LinearAbsoluteConic:
 
 @dataclass(frozen=True)
 class FixedPlaneQuadric:
-    """Pollefeys' method: the nonlinear quadric with a fixed plane, over all unknown intrinsics.
+    """Pollefeys' method: the nonlinear quadric with a fixed plane, over all unknown intrinsics."""
 
-    Parameters
-    ----------
-    focal_range, starts : (float, float), int
-        Range of the starting focal lengths in long sides, and their number.
-    """
-
-    focal_range: tuple[float, float] = (0.3, 10.0)
-    starts: int = 9
+    # Range of the starting focal lengths in long sides, and their number.
+    focal_range = (0.3, 10.0)
+    starts = 9
 
     def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
         """See `thesisrecon.selfcalibration.absolute_conic.LinearAbsoluteConic.calibrations`."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure, require_at_least
+from thesisrecon.errors import StageFailure
 from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, Polytope, distinct_planes
 from thesisrecon.selfcalibration._frame import (
@@ -27,26 +27,16 @@ class CheiralitySearch:
 
     Each plane of the grid gives infinite homographies and, linearly, the image of the absolute conic; planes
     whose equations have exactly one solution are the candidates.
-
-    Parameters
-    ----------
-    steps : int
-        Grid steps per axis of the bounding box.
-    max_candidates : int
-        Maximum number of local minima.
-    refine_iterations : int
-        Descent steps from each of them; 0 for the grid alone.
-    max_points : int
-        Maximum number of points in the linear programs.
     """
 
-    steps: int = 16
-    max_candidates: int = 10
-    refine_iterations: int = 15
-    max_points: int = 2000
-
-    def __post_init__(self) -> None:
-        require_at_least(self, steps=1, max_candidates=1, refine_iterations=0, max_points=8)
+    # Grid steps per axis of the bounding box.
+    steps = 16
+    # Maximum number of local minima.
+    max_candidates = 10
+    # Descent steps from each of them.
+    refine_iterations = 15
+    # Maximum number of points in the linear programs.
+    max_points = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """Find candidate planes at infinity, best first.

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import require_at_least
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
@@ -47,34 +46,26 @@ class HypothesesAndRefinement:
 
     Parameters
     ----------
-    focal_range, focal_steps : (float, float), int
-        Range of the scanned focal lengths in long sides, and their number.
-    camera_subsets : int
-        Number of random camera subsets for the quadric.
-    max_refined, max_full_refined : int
-        Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
-    max_candidates : int
-        Maximum number of candidates for bundle adjustment.
-    min_in_front_ratio : float
-        Required share of observations with positive depth.
-    criterion : RotationCriterion
-        Criterion of the refinement.
+    focal_range : (float, float)
+        Range of the scanned focal lengths in long sides.
     search : CheiralitySearch, optional
         Hartley's search; None to omit it.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
-    focal_steps: int = 45
-    camera_subsets: int = 6
-    max_refined: int = 40
-    max_candidates: int = 3
-    max_full_refined: int = 8
-    min_in_front_ratio: float = 0.95
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
-    def __post_init__(self) -> None:
-        require_at_least(self, focal_steps=1, max_refined=1, max_candidates=1, max_full_refined=1)
+    # Number of scanned focal lengths.
+    focal_steps = 45
+    # Number of random camera subsets for the quadric.
+    camera_subsets = 6
+    # Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
+    max_refined, max_full_refined = 40, 8
+    # Maximum number of candidates for bundle adjustment.
+    max_candidates = 3
+    # Required share of observations with positive depth.
+    min_in_front_ratio = 0.95
+    criterion = RotationCriterion()
 
     @as_stage_failure
     def calibrate(

@@ -12,12 +12,12 @@ infinity does not appear: more motions are critical than for the quadric, but no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure, counted, require_at_least
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry._conditioning import pixel_from_unit, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -145,16 +145,8 @@ class KruppaEquations:
 
     Parameters
     ----------
-    focal_range, focal_steps : (float, float), int
-        Range of the scanned focal lengths in long sides, and their number.
-    starts : int
-        Number of minima to refine.
-    loss_scale : float
-        Residual of a pair beyond which it counts linearly (soft L1).
-    min_common_points : int
-        Minimum number of common observations of a pair.
-    criterion : RotationCriterion
-        Criterion that selects the candidate.
+    focal_range : (float, float)
+        Range of the scanned focal lengths in long sides.
 
     References
     ----------
@@ -162,14 +154,17 @@ class KruppaEquations:
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
-    focal_steps: int = 90
-    starts: int = 4
-    loss_scale: float = 0.02
-    min_common_points: int = 20
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    def __post_init__(self) -> None:
-        require_at_least(self, focal_steps=1, starts=1)
+    # Number of scanned focal lengths.
+    focal_steps = 90
+    # Number of minima to refine.
+    starts = 4
+    # Residual of a pair beyond which it counts linearly (soft L1).
+    loss_scale = 0.02
+    # Minimum number of common observations of a pair.
+    min_common_points = 20
+    # Criterion that selects the candidate.
+    criterion = RotationCriterion()
 
     @as_stage_failure
     def calibrate(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import StageFailure, counted, require_at_least
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.selfcalibration._cheirality import CheiralityRegion, distinct_planes
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration._refinement import minimize_batch
@@ -53,27 +53,16 @@ def _modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class ModulusConstraint:
-    """Plane at infinity by least squares of the modulus constraint over all pairs of one constant K.
+    """Plane at infinity by least squares of the modulus constraint over all pairs of one constant K."""
 
-    Parameters
-    ----------
-    starts : int
-        Number of planes drawn from the cheirality bounds of either orientation.
-    max_candidates : int
-        Maximum number of solutions: three views have up to 21, four or more have one.
-    max_wrong_side_ratio : float
-        Largest accepted share of points and cameras on the wrong side of a plane.
-    max_points : int
-        Maximum number of points in the linear programs.
-    """
-
-    starts: int = 300
-    max_candidates: int = 21
-    max_wrong_side_ratio: float = 0.02
-    max_points: int = 2000
-
-    def __post_init__(self) -> None:
-        require_at_least(self, starts=1, max_candidates=1, max_points=8)
+    # Number of planes drawn from the cheirality bounds of either orientation.
+    starts = 300
+    # Maximum number of solutions: three views have up to 21, four or more have one.
+    max_candidates = 21
+    # Largest accepted share of points and cameras on the wrong side of a plane.
+    max_wrong_side_ratio = 0.02
+    # Maximum number of points in the linear programs.
+    max_points = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""

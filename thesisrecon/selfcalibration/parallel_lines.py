@@ -252,32 +252,25 @@ class ParallelLines:
         Given points, each direction in at least two views; otherwise directions are detected in the images.
     images : tuple of Image
         One image per view.
-    detector : LineSegments
-        Segment detector.
     orthogonal_directions : bool
         The three best supported (of given points: first) directions are orthogonal: v_a' w v_b = 0 (HZ 8.6).
-    vanishing_points_per_image, max_directions : int
-        Maximum numbers of proposals per image and of directions.
-    samples : int
-        Number of segment pairs per proposal.
-    tolerance_px : float
-        Largest endpoint distance of a supporting segment.
-    max_wrong_side_ratio : float
-        Largest accepted share of points and cameras on the wrong side of a plane.
-    max_candidates : int
-        Maximum number of planes.
     """
 
     points: VanishingPoints | None = field(default=None, metadata={"given": True})
     images: tuple[Image, ...] = field(default=(), metadata={"given": True}, repr=False)
-    detector: LineSegments = field(default_factory=LineSegments)
     orthogonal_directions: bool = False
-    vanishing_points_per_image: int = 6
-    max_directions: int = 6
-    samples: int = 400
-    tolerance_px: float = 1.5
-    max_wrong_side_ratio: float = 0.02
-    max_candidates: int = 5
+
+    # Maximum numbers of proposals per image and of directions.
+    vanishing_points_per_image, max_directions = 6, 6
+    # Number of segment pairs per proposal.
+    samples = 400
+    # Largest endpoint distance of a supporting segment.
+    tolerance_px = 1.5
+    # Largest accepted share of points and cameras on the wrong side of a plane.
+    max_wrong_side_ratio = 0.02
+    # Maximum number of planes.
+    max_candidates = 5
+    detector = LineSegments()
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; one plane of given points."""

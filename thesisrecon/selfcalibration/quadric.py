@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.errors import require_at_least
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
@@ -31,8 +30,6 @@ class LinearQuadric:
     ----------
     normalising_focal : float
         In long sides; 1.67 is the 60 mm lens of Pollefeys et al. on 36 mm film.
-    criterion : RotationCriterion
-        Criterion that orders the candidates.
 
     Examples
     --------
@@ -46,7 +43,9 @@ class LinearQuadric:
     """
 
     normalising_focal: float = 1.67
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
+
+    # Criterion that orders the candidates.
+    criterion = RotationCriterion()
 
     @as_stage_failure
     def calibrate(
@@ -72,24 +71,20 @@ class NonlinearQuadric:
 
     Parameters
     ----------
-    focal_range, focal_steps : (float, float), int
-        Range and number of the normalizing focal lengths of the linear quadrics, in long sides.
-    starts : int
-        Number of hypotheses to refine over all unknown intrinsics.
-    loss_scale : float
-        Residual beyond which an entry counts linearly (Huber).
-    criterion : RotationCriterion
-        Criterion that selects the starts.
+    focal_range : (float, float)
+        Range of the normalizing focal lengths of the linear quadrics, in long sides.
     """
 
     focal_range: tuple[float, float] = (0.2, 40.0)
-    focal_steps: int = 45
-    starts: int = 5
-    loss_scale: float = 0.05
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    def __post_init__(self) -> None:
-        require_at_least(self, focal_steps=1, starts=1)
+    # Number of these focal lengths.
+    focal_steps = 45
+    # Number of hypotheses to refine over all unknown intrinsics.
+    starts = 5
+    # Residual beyond which an entry counts linearly (Huber).
+    loss_scale = 0.05
+    # Criterion that selects the starts.
+    criterion = RotationCriterion()
 
     @as_stage_failure
     def calibrate(

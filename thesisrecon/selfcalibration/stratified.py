@@ -9,7 +9,7 @@ from typing import TypeVar, cast
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.errors import StageFailure, require_at_least
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
@@ -42,23 +42,18 @@ class Stratified:
         Method for K.
     refine : bool
         Refine plane and intrinsics together by the nonlinear quadric.
-    max_candidates : int
-        Maximum number of candidates to return.
-    min_in_front_ratio : float
-        Required share of observations with positive depth.
-    criterion : RotationCriterion
-        Criterion for the standard deviations of the focal lengths.
     """
 
     plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
     calibration: LinearAbsoluteConic | FixedPlaneQuadric = field(default_factory=LinearAbsoluteConic)
     refine: bool = True
-    max_candidates: int = 1
-    min_in_front_ratio: float = 0.5
-    criterion: RotationCriterion = field(default_factory=RotationCriterion)
 
-    def __post_init__(self) -> None:
-        require_at_least(self, max_candidates=1)
+    # Maximum number of candidates to return.
+    max_candidates = 1
+    # Required share of observations with positive depth.
+    min_in_front_ratio = 0.5
+    # Criterion for the standard deviations of the focal lengths.
+    criterion = RotationCriterion()
 
     def with_images(self, images: Iterable[Image]) -> Stratified:
         """Return the same method with the images, if the plane is estimated from them.

@@ -272,10 +272,12 @@ class MultiViewStereo:
     sequence."""
     refinement: bool = True
     """Refine depth maps with slanted windows, and complete them from those of other views."""
-    min_comparison_views: int = 12  #: number of depth maps to compare with, if there are as many
     max_side: int = 1024  #: longest side of the depth maps in pixels
     match_side: int = 640
     """Longest side of the images for stereo matching; fronto-parallel windows find less in larger images."""
+
+    # Number of depth maps to compare with, if there are as many.
+    min_comparison_views = 12
 
     def __post_init__(self) -> None:
         if self.sequence_links < 0:

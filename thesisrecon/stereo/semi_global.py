@@ -76,7 +76,9 @@ class SemiGlobalMatching:
     support: bool = True
     """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
     smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
-    memory_mb: float = 256.0  #: limit for costs and path sums of one strip of rows
+
+    # Limit for costs and path sums of one strip of rows.
+    memory_mb = 256.0
 
     def __post_init__(self) -> None:
         if self.paths not in (4, 8):

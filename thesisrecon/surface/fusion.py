@@ -71,24 +71,22 @@ class VolumetricFusion:
 
     Parameters
     ----------
-    voxel_px, max_blocks : float, int
-        Voxel size in pixels of the depth maps at their median depth, and largest number of blocks of
-        8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
+    voxel_px : float
+        Voxel size in pixels of the depth maps at their median depth; larger if the model is too large.
     tolerance : float
         RMS distance by which the simplified surface may deviate from the faces it replaces, in standard
         deviations of the fused depths there (of at most a voxel); 0: no simplification.
     """
 
     voxel_px: float = 1.5
-    max_blocks: int = 250_000
     tolerance: float = 0.25
 
+    # Largest number of blocks of 8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
+    max_blocks = 250_000
+
     def __post_init__(self) -> None:
-        # A single depth may need eight blocks, however large the voxels are.
-        if not 0.0 < self.voxel_px < np.inf or self.max_blocks < 8:
-            raise ValueError(
-                f"voxel_px must be positive and max_blocks >= 8; got {self.voxel_px} and {self.max_blocks}"
-            )
+        if not 0.0 < self.voxel_px < np.inf:
+            raise ValueError(f"voxel_px must be positive; got {self.voxel_px}")
         if not 0.0 <= self.tolerance < np.inf:
             raise ValueError(f"tolerance must be finite and not negative; got {self.tolerance}")
 

@@ -20,8 +20,8 @@ class SurfaceModel:
 
     Parameters
     ----------
-    surface, fusion, atlas
-        Surface fitted to each depth map, fusion of these surfaces, and texture of the result.
+    surface, fusion
+        Surface fitted to each depth map, and fusion of these surfaces.
     max_glb_mb : float
         Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
         model-full.glb holds all of it, as do the tiles.
@@ -29,8 +29,9 @@ class SurfaceModel:
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
     fusion: VolumetricFusion | DepthSheets = field(default_factory=VolumetricFusion)
-    atlas: TextureAtlas = field(default_factory=TextureAtlas)
     max_glb_mb: float = 50.0
+
+    atlas = TextureAtlas()
 
     def __post_init__(self) -> None:
         if not self.max_glb_mb >= 5.0:

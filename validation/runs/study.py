@@ -51,8 +51,8 @@ OF_PAGES = {
     "growth-of-cost": [
         ["--colmap", "--sizes", "100", "300"],
         ["--sizes", "1000"],
-        ["--sizes", "100", "--set", "matching.many_share=1"],
-        ["--scene", "street", "--sizes", "100", "--set", "matching.many_share=1"],
+        ["--sizes", "100", "--set", "matching.many_images=1000"],
+        ["--scene", "street", "--sizes", "100", "--set", "matching.many_images=1000"],
         ["--scene", "street", "--sizes", "100", "1000"],
         ["--until", "model", "--sizes", "12", "48"],
     ],

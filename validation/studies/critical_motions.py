@@ -35,8 +35,15 @@ from validation.scenes.dinosaur import Dinosaur, load_dinosaur
 from validation.studies.calibration_coverage import MODES, Cameras
 
 OURS = "ours"
-CALIBRATOR = HypothesesAndRefinement(search=None, camera_subsets=0, focal_steps=17)
-"""The default with fewer hypotheses, because thousands of trials measure its report only."""
+
+
+class FewHypotheses(HypothesesAndRefinement):
+    """The default with fewer hypotheses, because thousands of trials measure its report only."""
+
+    camera_subsets, focal_steps = 0, 17
+
+
+CALIBRATOR = FewHypotheses(search=None)
 ZOOM = 0.3
 WRONG_FOCAL = 0.15
 PLANAR_OR_TURNTABLE = (Motion.TURNTABLE, Motion.PLANAR)

@@ -28,10 +28,14 @@ OURS, ORDINARY, SIFT, AFFINE_SIFT = "ours", "without simulated views", "SIFT", "
 RIGHT_REL = 0.003
 
 
+class _WithoutTilts(MultiScaleCorners):
+    oblique_tilts = ()
+
+
 def front_ends() -> dict[str, PipelineConfig]:
     """Our front end and two of OpenCV with the same estimator of F and verification."""
     ours = preset("default")
-    ordinary = replace(ours, features=MultiScaleCorners(oblique_tilts=()))
+    ordinary = replace(ours, features=_WithoutTilts())
     return {
         OURS: ours,
         ORDINARY: ordinary,

@@ -95,8 +95,8 @@ def test_an_object_may_stand_deep_in_a_stage():
     from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
     from thesisrecon.stereo.semi_global import SemiGlobalMatching
 
-    rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobalMatching(memory_mb=99.0)]})).rows
-    assert rows[1].setting.config.dense.pairs.matcher == SemiGlobalMatching(memory_mb=99.0)
+    rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobalMatching(truncation=99.0)]})).rows
+    assert rows[1].setting.config.dense.pairs.matcher == SemiGlobalMatching(truncation=99.0)
     words = plan_study(darts({"dense.pairs.matcher": ["maximum-likelihood-scanline"]})).rows
     assert words[1].setting.config.dense.pairs.matcher == MaximumLikelihoodScanline()
 
