@@ -23,11 +23,11 @@ STAGES = {
 FOUNDATIONS = {
     "_code_digest",
     "_threads",
+    "_numba",
     "arrays",
     "camera",
     "errors",
     "intrinsics",
-    "kernels",
     "records",
     "geometry",
     "numerics",
@@ -95,8 +95,8 @@ def test_a_stage_imports_only_foundations_and_itself():
 
 def test_foundations_import_only_foundations():
     used = {p: parts_used(p) - FOUNDATIONS for p in modules_of(FOUNDATIONS)}
-    # kernels.py warns where machine code cannot be kept.
-    barred = {p: {"random"} if home(p) == "kernels" else {"logging", "random"} for p in used}
+    # _numba.py warns where machine code cannot be kept.
+    barred = {p: {"random"} if home(p) == "_numba" else {"logging", "random"} for p in used}
     used |= {p: names | (barred[p] & imported_modules(p)) for p, names in used.items()}
     assert report(used) == []
 
@@ -113,8 +113,8 @@ def test_only_composers_import_several_stages():
 
 def test_mathematics_touches_no_file_and_no_global_randomness():
     found = {}
-    # kernels.py keeps machine code on disk, and errors.py reads the texts of messages.
-    for path in modules_of((FOUNDATIONS | STAGES) - {"errors", "kernels"}):
+    # _numba.py keeps machine code on disk, and errors.py reads the texts of messages.
+    for path in modules_of((FOUNDATIONS | STAGES) - {"errors", "_numba"}):
         called = {ast.unparse(node.func) for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)}
         found[path] = {name for name in called if name.split(".")[-1] in FILE_CALLS}
         found[path] |= {n for n in called if ".random." in n and n.split(".")[-1] in GLOBAL_RANDOMNESS}

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import kernel
 from thesisrecon.config import PipelineConfig
-from thesisrecon.kernels import kernel
 
 
 def defined(text, name="chosen"):

@@ -4,15 +4,14 @@ import subprocess
 import sys
 
 import pytest
-from numba.core import types
-from numba.core.dispatcher import Dispatcher
+from numba import types
 
-from thesisrecon import kernels
-from thesisrecon.kernels import copy_to, kernel
+from thesisrecon import _numba
+from thesisrecon._numba import Kernel, copy_to, kernel
 from thesisrecon.runtime import _precompilation
 from thesisrecon.runtime._precompilation import kernel_and_types, listed_kernels, precompile
 
-COPY = "kernels.copy_to(float64[::1], float64[::1],)"
+COPY = "_numba.copy_to(float64[::1], float64[::1],)"
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def test_the_list_names_kernels_with_the_types_of_their_arguments():
     assert len(listed_kernels("features")) < len(listed_kernels("metric")) < len(lines)
     for line in lines:
         kernel, arguments = kernel_and_types(line)
-        assert isinstance(kernel, Dispatcher), line
+        assert isinstance(kernel, Kernel), line
         assert arguments, line
         assert all(isinstance(kind, types.Type) for kind in arguments), line
 
@@ -45,12 +44,12 @@ def test_kernels_are_compiled_once_and_up_to_the_last_stage(listed, tmp_path):
     lines = ("[features]", COPY, "[matches]", COPY.replace("64", "32"))
     first = listed(*lines, until="features")
     assert (first[0], first[-1]) == (("kernels", 0, 1), ("kernels", 1, 1))
-    assert len(list((tmp_path / "cache").rglob("kernels.copy_to-*"))) == 1
+    assert len(list((tmp_path / "cache").rglob("_numba.copy_to-*"))) == 1
     kernel(copy_to.py_func).compile(kernel_and_types(COPY)[1])  # finds the entry of the worker's
-    assert len(list((tmp_path / "cache").rglob("kernels.copy_to-*"))) == 1
+    assert len(list((tmp_path / "cache").rglob("_numba.copy_to-*"))) == 1
     assert listed(*lines, until="features") == []
     assert listed(*lines)[-1] == ("kernels", 2, 2)
-    assert len(list((tmp_path / "cache").rglob("kernels.copy_to-*"))) == 2
+    assert len(list((tmp_path / "cache").rglob("_numba.copy_to-*"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -80,7 +79,7 @@ RUN = """
 import sys
 from thesisrecon import reconstruct
 from thesisrecon.io._images import demo_images
-from thesisrecon.kernels import KernelCache
+from thesisrecon._numba import KernelCache
 from thesisrecon.runtime._precompilation import kernel_and_types, listed_kernels
 
 load, asked = KernelCache.load_overload, []
@@ -116,17 +115,17 @@ def test_without_workers_this_process_compiles(monkeypatch, executable):
 
 def test_without_a_home_the_cache_is_an_own_folder(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
-    for name in (kernels.CACHE_VARIABLE, "HOME", "XDG_CACHE_HOME"):
+    for name in (_numba.CACHE_VARIABLE, "HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(kernels, "PACKAGE", tmp_path / "file")
+    monkeypatch.setattr(_numba, "PACKAGE", tmp_path / "file")
 
     def no_home():
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(kernels.Path, "home", no_home)
-    monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
-    own = kernels.cache_folder()
+    monkeypatch.setattr(_numba.Path, "home", no_home)
+    monkeypatch.setattr(_numba.tempfile, "gettempdir", lambda: str(tmp_path))
+    own = _numba.cache_folder()
     assert own.parent == tmp_path
     assert own.stat().st_mode & 0o777 == 0o700
     own.chmod(0o777)  # anybody may have put machine code there
-    assert kernels.cache_folder() == tmp_path / "file" / "__pycache__" / "kernels"
+    assert _numba.cache_folder() == tmp_path / "file" / "__pycache__" / "kernels"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
@@ -18,7 +19,6 @@ from thesisrecon.epipolar._planes import OFF_PLANE, find_dominant_plane, fundame
 from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.numerics._noise import student_factor
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 

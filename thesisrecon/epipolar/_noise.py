@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._noise import MAD_FACTOR
 
 # Standard deviation of the noise's tail, and lower bound of that of wrong residuals, relative to the noise.

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame
-from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._small_solvers import orthogonalize_columns, solve_damped
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, full, kernel
 from thesisrecon.arrays import F64, I64
-from thesisrecon.kernels import copy_to, empty, full, kernel
 
 LANES = 32
 # Rows of a solved batch: 0 and 9 the transforms to the bases (9 each), 18 the orientation of the first three

@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
 from thesisrecon.epipolar._noise import (
@@ -33,7 +34,6 @@ from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.geometry._homography import homography_sampson_residuals
 from thesisrecon.geometry._metric_frame import nearest_rotation
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
 from thesisrecon.numerics._small_solvers import solve_damped
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import FAST, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import FAST, empty, full, kernel, zeros
 
 
 @kernel(fastmath=FAST)

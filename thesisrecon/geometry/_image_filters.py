@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import FAST, empty, kernel, zeros
 
 
 @kernel(fastmath=FAST)

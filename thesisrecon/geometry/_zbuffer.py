@@ -8,10 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.kernels import empty, kernel
 
 _SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""

@@ -16,10 +16,10 @@ import math
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._conditioning import checked_unit, require_finite, require_shapes
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.kernels import empty, kernel
 
 _Two = tuple[float, float]
 _Four = tuple[float, float, float, float]

@@ -14,11 +14,11 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.kernels import copy_to, empty, kernel, zeros
 from thesisrecon.numerics._partial_bundle import minimize_reprojection
 from thesisrecon.numerics._small_solvers import orthogonalize_columns, shortest_column
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
+from thesisrecon._numba import FAST, copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import FAST, copy_to, empty, kernel, zeros
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,

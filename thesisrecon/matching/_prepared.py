@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.geometry._image_filters import halve, resample
-from thesisrecon.kernels import FAST, empty, kernel, zeros
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 
 SIDE = 15

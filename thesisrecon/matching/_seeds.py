@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import strongest_distinct
 from thesisrecon.matching._prepared import empty_matches, join_matches, select_matches
 from thesisrecon.numerics._nearest import nearest_neighbours

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,

@@ -12,9 +12,9 @@ from itertools import combinations
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import UsageError, require_at_least
-from thesisrecon.kernels import kernel
 from thesisrecon.matching._bag_of_words import word_weights
 from thesisrecon.matching._prepared import MapAll
 from thesisrecon.matching._seeds import mutual_best

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import align_matches
 from thesisrecon.matching._prepared import (
     SIDE,

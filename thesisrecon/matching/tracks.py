@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
-from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import MapAll, PreparedImage
 from thesisrecon.numerics._observations import cached_pair_order

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._metric_frame import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._metric_kernels import MetricCameras, MetricModel, image_points
 from thesisrecon.numerics._partial_bundle import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade

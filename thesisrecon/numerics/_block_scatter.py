@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.geometry._conditioning import scene_frame
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._covariance import fixed_coordinates, gauge_directions, invert_in_inner_gauge
 from thesisrecon.numerics._intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 from thesisrecon.numerics._observations import Jacobians
 from thesisrecon.numerics._small_solvers import invert_cholesky_3x3, multiply_transposed_3x3
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, I64
-from thesisrecon.kernels import empty, kernel
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics._small_solvers import away_from_zero, loss_curvature, loss_value, loss_weight
 

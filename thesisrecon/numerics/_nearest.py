@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import F64, I64
-from thesisrecon.kernels import empty, kernel, zeros
 
 
 @kernel

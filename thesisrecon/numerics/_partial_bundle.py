@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._conditioning import (
     SpaceFrame,
@@ -15,7 +16,6 @@ from thesisrecon.geometry._conditioning import (
     pixel_conditioning,
     whitening_transform,
 )
-from thesisrecon.kernels import copy_to, empty, kernel
 from thesisrecon.numerics._levenberg_marquardt import DenseSystem, invert_information, run_levenberg_marquardt
 from thesisrecon.numerics._metric_kernels import (
     MetricModel,

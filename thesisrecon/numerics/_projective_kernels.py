@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._observations import Jacobians, Observations, Weighting
 from thesisrecon.numerics._small_solvers import away_from_zero, loss_value, loss_weight
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64, I64
-from thesisrecon.kernels import kernel
 from thesisrecon.numerics._elimination import ReducedSums
 from thesisrecon.numerics._small_solvers import solve_positive
 

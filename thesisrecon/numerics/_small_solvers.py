@@ -7,8 +7,8 @@ import math
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel, zeros
 from thesisrecon.arrays import F64
-from thesisrecon.kernels import kernel, zeros
 
 TINY = 1e-12
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thesisrecon._numba import full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry._conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.kernels import full, kernel, zeros
 from thesisrecon.numerics._noise import noise_from_distances
 from thesisrecon.numerics._observations import Observations
 from thesisrecon.numerics._partial_bundle import refine_points

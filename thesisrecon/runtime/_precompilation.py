@@ -17,15 +17,15 @@ from platform import node
 from typing import Any
 
 import numba
-from numba.core import types
-from numba.core.registry import cpu_target
+from numba import types
 
-from thesisrecon.kernels import LIST, cache_folder
+from thesisrecon._numba import cache_folder, copy_to
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
 from thesisrecon.runtime._signals import kill_on_exit, starting_processes
 
 PACKAGE = Path(__file__).parent.parent
+LIST = PACKAGE / "kernels.txt"
 WORKER = f"""import sys
 sys.path.insert(0, {str(PACKAGE.parent)!r})
 from {__name__} import compile_requested
@@ -84,7 +84,7 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
 
 
 def _code_and_machine(lines: Sequence[str]) -> str:
-    processor = cpu_target.target_context.codegen().magic_tuple()
+    processor = copy_to.targetctx.codegen().magic_tuple()
     return key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
 
 

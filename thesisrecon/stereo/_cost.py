@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, I16, I32, U8, U16
-from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 
 LEVELS = 4
 """Integer steps of one grey level: resampled images have fractional levels."""

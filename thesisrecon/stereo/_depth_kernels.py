@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.kernels import kernel
 
 
 @kernel(error_model="numpy")

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import I16, U8, U64
-from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 
 Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
 

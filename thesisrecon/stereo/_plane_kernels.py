@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I64, U8, U32
-from thesisrecon.kernels import empty, kernel
 
 UNKNOWN = 4.0
 """Cost of a pixel without a plane; the largest cost of a plane is 2."""

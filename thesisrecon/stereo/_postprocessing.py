@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, I16, U8, U16
-from thesisrecon.kernels import copy_to, empty, full, kernel, zeros
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
 

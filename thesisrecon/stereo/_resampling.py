@@ -8,12 +8,12 @@ from functools import partial
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry._image_filters import cubic_weights
 from thesisrecon.geometry.camera_matrix import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.kernels import empty, kernel
 from thesisrecon.records import Image, PinholeView, Reconstruction
 
 MAX_TAPS = 24

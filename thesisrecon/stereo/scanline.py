@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
-from thesisrecon.kernels import empty, full, kernel, zeros
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import (
     LEVELS,

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.kernels import empty, full, kernel
 from thesisrecon.numerics._noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import components, max_depth_slope, same_surface

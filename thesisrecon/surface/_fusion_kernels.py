@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import F32, F64, I32, I64, U8
-from thesisrecon.kernels import empty, kernel, zeros
 
 SIDE = 8
 """Voxels per side of a block."""

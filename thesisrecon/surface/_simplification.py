@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I32, I64, U8
-from thesisrecon.kernels import empty, kernel, zeros
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface._mesh import face_areas, remove_unused_vertices, simplify_mesh
 

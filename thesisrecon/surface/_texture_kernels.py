@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.geometry._image_filters import weighted_median
-from thesisrecon.kernels import empty, kernel, zeros
 
 
 class ViewSurface(NamedTuple):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.geometry._zbuffer import (
@@ -16,7 +17,6 @@ from thesisrecon.geometry._zbuffer import (
     run_in_strips,
     sample_texture,
 )
-from thesisrecon.kernels import empty, kernel
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F32, F64, I16, I32, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry._zbuffer import run_in_strips
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.kernels import kernel
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, VirtualTensor, seed_of_two
 
