@@ -89,6 +89,18 @@ def test_the_package_imports_only_its_core_dependencies():
     assert report({p: names - OPTIONAL.get(home(p), set()) for p, names in foreign.items()}) == []
 
 
+def test_few_internals_of_numba_are_used():
+    # Each may change with a release: pyproject.toml has the range of versions that the tests ran with.
+    used = {name for path in MODULES for name in imported_modules(path) if name.startswith("numba.core.")}
+    modules = {name.rpartition(".")[0] for name in used}
+    assert sorted(used - modules) == [
+        "numba.core.compiler.CompileResult",
+        "numba.core.compiler_lock.global_compiler_lock",
+        "numba.core.registry.CPUDispatcher",
+        "numba.core.serialize.dumps",
+    ]
+
+
 def test_a_stage_imports_only_foundations_and_itself():
     assert report({p: parts_used(p) - FOUNDATIONS - {home(p)} for p in modules_of(STAGES)}) == []
 
