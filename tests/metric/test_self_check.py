@@ -7,7 +7,7 @@ import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric._adjustment import MetricAdjustment
+from thesisrecon.metric._adjustment import SETTLED, MetricAdjustment
 from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
 from thesisrecon.metric._model import (
     MetricEstimate,
@@ -18,6 +18,7 @@ from thesisrecon.metric._model import (
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
+    focal_std_of_deviations,
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
@@ -234,6 +235,29 @@ def test_two_similar_zooms_in_turn_are_detected(zoom):
     assert "shared focal length" in failed_checks[0]
     # The sentence holds at any size of the images.
     assert "px" not in failed_checks[0]
+
+
+@pytest.mark.parametrize("views", [3, 4])
+def test_deviations_of_few_images_are_learned_from_their_residuals(views):
+    """Own principal points of 1 % of the long side widen the interval by their effect; no ones do not."""
+    widths, sigmas = [], []
+    for own in (0.0, 0.01):
+        for seed in (2, 3):
+            scene = make_scene(views=views, points=300, sigma_px=0.3, seed=seed)
+            shift = own * scene.sizes[0].max() * np.random.default_rng(seed).normal(size=(views, 2))
+            model, adjustment = settled(changed(scene, np.ones(views), shift))
+            adjustment = replace(adjustment, inflation=adjustment.scatter(model).inflation)
+            model = adjustment.run(model, settled=SETTLED, keep_noise=True)[0]
+            widths.append(focal_std_of_deviations(model, adjustment, critical=False, contradicted=False))
+            noise = np.sqrt(adjustment.scatter(model).variance[0, 0])
+            focal = model.cameras.intrinsics[0, 0] / scene.K[0, 0, 0]
+            sigmas.append(np.log(focal) / np.hypot(noise, widths[-1]))
+    assert np.abs(sigmas).max() < 2.0
+    assert max(widths[:2]) < 0.007
+    assert min(widths[2:]) > 0.01
+    assert min(widths[2:]) > 3.0 * max(widths[:2])
+    # Contradicted by all images together, the deviations are not averaged over smaller ones.
+    assert focal_std_of_deviations(model, adjustment, critical=False, contradicted=True) > widths[-1]
 
 
 def test_harmless_differences_beyond_chance_widen_the_intervals():

@@ -28,7 +28,7 @@ from thesisrecon.metric._model import (
     reproject_observations,
 )
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
-from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.numerics._block_scatter import BlockScatter, linearise_fit
 from thesisrecon.numerics._metric_bundle import MetricBundleResult, refine_metric_bundle
 from thesisrecon.numerics._metric_kernels import MetricCameras, move_poses
 from thesisrecon.numerics._observations import Observations
@@ -42,6 +42,8 @@ MAX_VIEWS, RUN = 200, 20
 OWN_STD = 0.01
 """Deviations of single images that a camera model may leave out: principal points in long sides
 (stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
+SCALES = 50
+"""Number of standard deviations of own values over which the mean is taken."""
 FEW_VIEWS = 6
 """Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
 FALSE_ALARM_RATE = 1e-3
@@ -87,15 +89,19 @@ def subsample_inliers(model: MetricEstimate) -> Observations:
     return Observations(t.view_index[index], t.point_index[index], t.xy[index])
 
 
-def _adjust_per_view(
+_Case = tuple[MetricCameras, F64, Observations, B8, IntrinsicsPrior]
+"""Cameras, points and observations of an adjustment, the intrinsics that are free, and their prior."""
+
+
+def _per_view(
     model: MetricEstimate,
     adjustment: MetricAdjustment,
     columns: tuple[int, ...],
     *,
     focal_spread: float = np.inf,
     own_std: float = np.inf,
-) -> MetricBundleResult:
-    """Adjust the views with own values in some columns of intrinsics, with covariances.
+) -> _Case:
+    """Give the views own values in some columns of intrinsics.
 
     The own values are unknown, or within ``own_std`` of those of the model.
     """
@@ -120,47 +126,86 @@ def _adjust_per_view(
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-    options = replace(adjustment, inflation=1.0).options(model)
-    return refine_metric_bundle(
+    return (
         MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
         model.X,
         seen._replace(view_index=np.searchsorted(views, seen.view_index)),
-        free=free,
-        prior=known,
-        options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
+        free,
+        known,
     )
 
 
-def focal_change_by_richer_models(
-    model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool
-) -> float:
-    """Largest relative change of a focal length by richer camera models.
+def _adjust_per_view(
+    model: MetricEstimate,
+    adjustment: MetricAdjustment,
+    columns: tuple[int, ...],
+    *,
+    focal_spread: float = np.inf,
+) -> MetricBundleResult:
+    """Adjust the views with unknown own values in some columns of intrinsics, with covariances."""
+    cameras, X, seen, free, prior = _per_view(model, adjustment, columns, focal_spread=focal_spread)
+    options = replace(adjustment, inflation=1.0).options(model)
+    options = replace(options, covariance=True, noise_floor_px=model.sigma_px)
+    return refine_metric_bundle(cameras, X, seen, free=free, prior=prior, options=options)
 
-    If images have intrinsics of their own within ``OWN_STD``: of up to ``FEW_VIEWS`` images, and of a shared
-    focal length after a ``critical`` motion or if the images show own aspect ratios and skews, as unordered
-    images with a rolling shutter do. If the images are a video that shows a rolling shutter: by its readout.
+
+def focal_std_of_deviations(
+    model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool, contradicted: bool
+) -> float:
+    """Relative standard deviation of the focal lengths by deviations of the images from the camera model.
+
+    Images may have own aspect ratios and skews, as unordered images with a rolling shutter do; with up to
+    ``FEW_VIEWS`` images or after a ``critical`` motion own principal points too. These are then as large as
+    possible if the images have ``contradicted`` one camera. The images of a video may show a rolling shutter.
     """
     assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
-    is_shared, few = len(np.unique(focal)) < len(focal), len(focal) <= FEW_VIEWS
-    if not (is_shared or few):
+    few = len(focal) <= FEW_VIEWS
+    if not few and len(np.unique(focal)) == len(focal):
         return 0.0
-    model = runs_of_views(model)
-    before = _adjust_per_view(model, adjustment, ())
-    after = [_adjust_per_view(model, adjustment, (ASPECT, SKEW), own_std=OWN_STD)]
-    if few or critical:
-        after.append(_adjust_per_view(model, adjustment, CENTRE, own_std=OWN_STD))
-    elif not _beyond_chance(before.cost - after[0].cost, 2 * (len(focal) - 1)):
-        after = []
-    after += _adjust_rolling_shutter(model, adjustment, before)
-    focals = np.log([a.cameras.intrinsics[:, FOCAL] for a in (before, *after)])
-    return float(np.abs(focals - focals[0]).max())
+    model, weak = runs_of_views(model), few or critical
+    scales = np.ones(1) if weak and contradicted else (np.arange(SCALES) + 0.5) / SCALES
+    kinds = ((ASPECT, SKEW), CENTRE) if weak else ((ASPECT, SKEW),)
+    variance = sum(_variance_by_own_values(model, adjustment, columns, scales) for columns in kinds)
+    return float(np.hypot(np.sqrt(variance), _change_by_rolling_shutter(model, adjustment)))
 
 
-def _adjust_rolling_shutter(
-    model: MetricEstimate, adjustment: MetricAdjustment, before: MetricBundleResult
-) -> list[MetricBundleResult]:
-    """The adjustment with the readout time of a rolling shutter as one more unknown; empty without evidence.
+def _variance_by_own_values(
+    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...], scales: F64
+) -> float:
+    """Variance of the focal lengths (log) if the images have own values in ``columns``.
+
+    The own values are normal about the shared ones with the standard deviation s ``OWN_STD``; each s of the
+    ``scales`` has the same prior probability, and the result is the mean over the posterior one. In the
+    linearised adjustment let l be the eigenvalues of the information on the own values in units of
+    ``OWN_STD``, h their gradient and b the response of a focal length along the eigenvectors. With
+    w = s^2 / (1 + s^2 l) the logarithm of the marginal likelihood is sum (w h^2 - log(1 + s^2 l)) / 2, and
+    the focal length has the mean sum w b h and the variance sum w b^2.
+    """
+    noise = adjustment.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
+    fit = linearise_fit(*_per_view(model, adjustment, columns, own_std=OWN_STD), noise)
+    terms, number = fit.values.terms, fit.values.number
+    own, focals = (np.unique(number[:, c][number[:, c] >= 0]) for c in (columns, (FOCAL,)))
+    if not len(focals):
+        return 0.0
+    unit = np.diag(terms.information(fit.values.size))[own] ** -0.5
+    C = fit.solve(np.eye(fit.information.shape[0])[:, fit.first + own]) / unit
+    gradient = fit.system.J.T @ fit.system.residual
+    gradient[fit.first :] += terms.gradient(fit.start)
+    information = np.linalg.inv(C[fit.first + own] / unit[:, None])
+    eigenvalues, V = np.linalg.eigh(0.5 * (information + information.T))
+    eigenvalues = np.maximum(eigenvalues - 1.0, 0.0)
+    h = V.T @ information @ (C.T @ gradient)
+    b = C[fit.first + focals] @ information @ V
+    square = scales[:, None] ** 2
+    w = square / (1.0 + square * eigenvalues)
+    likelihood = 0.5 * (w @ h**2 - np.log1p(square * eigenvalues).sum(axis=1))
+    posterior = np.exp(likelihood - likelihood.max())
+    return float((posterior @ ((w @ (b * h).T) ** 2 + w @ (b**2).T)).max() / posterior.sum())
+
+
+def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
+    """Largest change of a focal length (log) by the readout time of a rolling shutter; 0 without evidence.
 
     A point in row y was seen when its camera had moved by (y / height - 1/2) of the readout, in times between
     consecutive images. This displacement is subtracted from the observations.
@@ -169,7 +214,7 @@ def _adjust_rolling_shutter(
     view = t.view_index[index]
     shift = _displacement_to_next(model, index)
     if np.median(np.linalg.norm(shift, axis=1) / model.sizes[view].max(axis=1)) > MAX_VIDEO_STEP:
-        return []
+        return 0.0
     shift *= (t.xy[index, 1] / model.sizes[view, 1] - 0.5)[:, None]
 
     def adjusted(readout: float) -> MetricBundleResult:
@@ -178,15 +223,19 @@ def _adjust_rolling_shutter(
         return _adjust_per_view(replace(model, tracks=replace(t, xy=xy)), adjustment, ())
 
     # The cost near 0 is a parabola: the score test decides without a search.
+    before = adjusted(0.0)
     low, high = adjusted(-READOUT_STEP).cost, adjusted(READOUT_STEP).cost
     slope, curvature = (high - low) / 2.0, high + low - 2.0 * before.cost
     if not (curvature > 0.0 and _beyond_chance(0.5 * slope**2 / curvature, 1)):
-        return []
+        return 0.0
     found = scipy.optimize.minimize_scalar(
         lambda readout: adjusted(readout).cost, bounds=(-1.0, 1.0), method="bounded", options={"xatol": 0.01}
     )
     after = adjusted(float(found.x))
-    return [after] if _beyond_chance(before.cost - after.cost, 1) else []
+    if not _beyond_chance(before.cost - after.cost, 1):
+        return 0.0
+    focals = (one.cameras.intrinsics[:, FOCAL] for one in (before, after))
+    return float(np.abs(np.subtract(*map(np.log, focals))).max())
 
 
 def _displacement_to_next(model: MetricEstimate, index: I64) -> F64:

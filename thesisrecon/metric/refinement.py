@@ -52,8 +52,8 @@ from thesisrecon.metric._shared_camera import (
     SharedCameraTest,
     check_shared_cameras,
     contradicted_focal_priors,
-    focal_change_by_richer_models,
     focal_decided_by_model,
+    focal_std_of_deviations,
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import (
@@ -95,6 +95,10 @@ NOT_EXPLAINED = (
 )
 
 
+_Finished = tuple[MetricEstimate, MetricAdjustment, PerCameraEstimates, BlockScatter]
+_Settled = tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]
+
+
 @dataclass(frozen=True)
 class MetricRefinement:
     """Metric refinement of a calibrated projective reconstruction (6.7)."""
@@ -121,33 +125,41 @@ class MetricRefinement:
             "" if model.registered[v] else rejected.get(v, "") for v in range(len(model.registered))
         )
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
-        final, sharing, enlarged, difference = settle_camera_model(finish_metric(model, adjustment))
-        model, adjustment, own, scatter = final
-        shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
-        intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
-        intervals = widen_unverified_focals(intervals, sharing.focal_std)
-        intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
-        complete = with_tracks(model, reconstruction.tracks)
-        returned = returned_cameras(complete)
-        critical = nearest_critical_motion(measure_motion(returned))[1] < 1.0
-        change = focal_change_by_richer_models(model, adjustment, critical=critical)
-        intervals = widen_by_camera_model(intervals, (change, 0.0), 1.0)
-        report = check_returned(model, adjustment, returned, intervals)
-        model = complete
-        check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
-        # An enlarged camera model replaces the prior that the images contradicted.
-        start = [] if enlarged else _contradiction(calibration)
-        failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
-        failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
-        failed_checks += inconsistent_principal_point(model, adjustment, scatter)
-        failed_checks += focal_decided_by_model(change)
-        views = np.flatnonzero(model.registered).tolist()
-        warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
-        poses = pose_std(final[0], adjustment.poses(final[0]), scatter, intervals)
-        return MetricResult(
-            _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
-            warnings, (*enlarged, *limitations), report, poses,
-        )  # fmt: skip
+        settled = settle_camera_model(finish_metric(model, adjustment))
+        return assess(settled, reconstruction.tracks, calibration, reasons)
+
+
+def assess(
+    settled: _Settled, tracks: Tracks, calibration: SelfCalibration, reasons: tuple[str, ...]
+) -> MetricResult:
+    """State the intervals of a final model with all ``tracks``, and check it."""
+    final, sharing, enlarged, difference = settled
+    model, adjustment, own, scatter = final
+    shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
+    intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
+    intervals = widen_unverified_focals(intervals, sharing.focal_std)
+    intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
+    complete = with_tracks(model, tracks)
+    returned = returned_cameras(complete)
+    critical = nearest_critical_motion(measure_motion(returned))[1] < 1.0
+    deviations = focal_std_of_deviations(model, adjustment, critical=critical, contradicted=bool(enlarged))
+    intervals = widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
+    report = check_returned(model, adjustment, returned, intervals)
+    model = complete
+    check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
+    # An enlarged camera model replaces the prior that the images contradicted.
+    start = [] if enlarged else _contradiction(calibration)
+    failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
+    failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
+    failed_checks += inconsistent_principal_point(model, adjustment, scatter)
+    failed_checks += focal_decided_by_model(deviations)
+    views = np.flatnonzero(model.registered).tolist()
+    warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
+    poses = pose_std(final[0], adjustment.poses(final[0]), scatter, intervals)
+    return MetricResult(
+        _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
+        warnings, (*enlarged, *limitations), report, poses,
+    )  # fmt: skip
 
 
 def _contradiction(calibration: SelfCalibration) -> list[str]:
@@ -180,12 +192,7 @@ def _start(
     return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
 
-_Finished = tuple[MetricEstimate, MetricAdjustment, PerCameraEstimates, BlockScatter]
-
-
-def settle_camera_model(
-    simple: _Finished,
-) -> tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]:
+def settle_camera_model(simple: _Finished) -> _Settled:
     """Choose between the shared camera model and richer ones if the images contradict shared intrinsics.
 
     A richer model, with one value per image, is adopted if it predicts held-out observations far better. If
