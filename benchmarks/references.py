@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.records import Similarity
 from validation.references.libraries import cv2, poselib, pycolmap
 
 

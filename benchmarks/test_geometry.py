@@ -11,7 +11,7 @@ from benchmarks.conftest import Bench
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model
 from validation.references.fundamental import SOLVERS
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial

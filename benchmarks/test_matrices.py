@@ -18,10 +18,10 @@ from benchmarks.references import (
     poselib_three_points,
 )
 from thesisrecon.api.cameras import triangulate
+from thesisrecon.camera import distort, project_camera, undistort
 from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.geometry._homography import homography_linear
-from thesisrecon.geometry.camera_matrix import distort, project_camera, undistort
+from thesisrecon.geometry.homography import homography_linear
 from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.geometry.similarity import estimate_similarity
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point

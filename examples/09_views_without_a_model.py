@@ -16,7 +16,7 @@ from PIL import Image
 
 import thesisrecon
 from thesisrecon.api.views import match_images, prepare_pair, prepare_trilinear_views
-from thesisrecon.views.trilinear import VirtualCamera
+from thesisrecon.views.tensor import VirtualCamera
 
 folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
 names = ["0005.jpg", "0007.jpg", "0006.jpg"]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import FundamentalFit, Image, Reconstruction, Tracks, TwoView
 

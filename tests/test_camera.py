@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._zbuffer import rasterize
+from thesisrecon.imaging.raster import rasterize
 
 K = np.array([[800.0, 2.0, 310.0], [0.0, 790.0, 245.0], [0.0, 0.0, 1.0]])
 

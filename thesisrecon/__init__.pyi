@@ -11,6 +11,7 @@ from thesisrecon.api.calibrate import upgrade_affine as upgrade_affine
 from thesisrecon.api.cameras import BundleAdjustment as BundleAdjustment
 from thesisrecon.api.cameras import bundle_adjust as bundle_adjust
 from thesisrecon.api.cameras import cheirality as cheirality
+from thesisrecon.api.cameras import reconstruction_from_cameras as reconstruction_from_cameras
 from thesisrecon.api.cameras import resect as resect
 from thesisrecon.api.cameras import triangulate as triangulate
 from thesisrecon.api.compare import compare_models as compare_models
@@ -65,7 +66,7 @@ from thesisrecon.records import SelfCalibration as SelfCalibration
 from thesisrecon.records import TexturedMesh as TexturedMesh
 from thesisrecon.records import Tracks as Tracks
 from thesisrecon.records import TwoView as TwoView
+from thesisrecon.results import ModelComparison as ModelComparison
 from thesisrecon.results import RunResult as RunResult
-from thesisrecon.sparse_model import ModelComparison as ModelComparison
 
 __version__: str

@@ -31,6 +31,7 @@ from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
+from numpy.typing import NDArray
 
 from thesisrecon._code_digest import code_digest
 
@@ -76,14 +77,16 @@ def kernel(function: Any = None, **options: Any) -> Any:
         The compiled function. It releases the global interpreter lock, and divides by zero as NumPy does.
     """
     if function is None:
-        return lambda function: kernel(function, **options)  # type: ignore[call-overload]
+        return lambda function: kernel(function, **options)
     if vars(numba.config)["DISABLE_JIT"]:
         return function
     return Kernel(function, targetoptions=OPTIONS | options)
 
 
-class Kernel(CPUDispatcher):  # type: ignore[misc] # numba has no types
+class Kernel(CPUDispatcher):
     """A function that numba compiles, or loads from the disk, for the types of its arguments."""
+
+    _cache: Any
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         # For a kernel that calls this one; numba would compile a version for each literal argument.
@@ -135,7 +138,8 @@ class KernelCache:
         with contextlib.suppress(OSError, ImportError, AttributeError):
             stored = self._path(sig, target_context.codegen()).read_bytes()
             if hashlib.sha256(stored[32:]).digest() == stored[:32]:
-                return CompileResult._rebuild(target_context, *pickle.loads(stored[32:]))
+                found: CompileResult = CompileResult._rebuild(target_context, *pickle.loads(stored[32:]))
+                return found
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -201,19 +205,19 @@ def cache_folder() -> Path:
 
 # numba compiles NumPy's own functions again in each kernel and for each shape; these once.
 @kernel
-def empty(shape: Any, dtype: Any = np.float64) -> Any:
+def empty(shape: Any, dtype: Any = np.float64) -> NDArray[Any]:
     """`numpy.empty` for kernels."""
     return np.empty(shape, dtype)
 
 
 @kernel
-def full(shape: Any, value: Any, dtype: Any = np.float64) -> Any:
+def full(shape: Any, value: Any, dtype: Any = np.float64) -> NDArray[Any]:
     """`numpy.full` for kernels."""
     return np.full(shape, value, dtype)
 
 
 @kernel
-def zeros(shape: Any, dtype: Any = np.float64) -> Any:
+def zeros(shape: Any, dtype: Any = np.float64) -> NDArray[Any]:
     """`numpy.zeros` for kernels."""
     return np.zeros(shape, dtype)
 

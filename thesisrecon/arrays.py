@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -25,3 +25,59 @@ def rows_of_views(view: I64, n_views: int) -> list[I64]:
     """The rows of ``view`` (K,) with each view, in their order."""
     ends = np.cumsum(np.bincount(view, minlength=n_views))
     return np.split(np.argsort(view, kind="stable"), ends[:-1])
+
+
+_TRIANGULAR = 1e-9
+"""Largest deviation of K from upper triangular with K33 = 1, by rounding."""
+_ORTHOGONAL = 2e-4
+"""Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
+
+
+def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]]) -> None:
+    """Raise ``ValueError`` if an array has a wrong shape; equal letters are equal sizes."""
+    sizes: dict[str, int] = {}
+    for array, shape in arrays.values():
+        actual = np.shape(array)
+        expected = (
+            sizes.setdefault(d, n) if isinstance(d, str) else d for d, n in zip(shape, actual, strict=False)
+        )
+        if len(actual) != len(shape) or tuple(expected) != actual:
+            break
+    else:
+        return
+    needed = ", ".join(f"{name} ({', '.join(map(str, shape))})" for name, (_, shape) in arrays.items())
+    got = ", ".join(str(np.shape(array)) for array, _ in arrays.values())
+    raise ValueError(f"{caller} needs {needed}; got {got}")
+
+
+def require_finite(caller: str, *arrays: F64) -> None:
+    """Raise ``ValueError`` if an entry is NaN or infinite."""
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"{caller} needs finite numbers; some are NaN or infinite")
+
+
+def require_calibration(caller: str, K: F64) -> None:
+    """Raise ``ValueError`` if K is not upper triangular with positive focal lengths and K33 = 1."""
+    require_shapes(caller, K=(K, (3, 3)))
+    require_finite(caller, K)
+    K = np.asarray(K, dtype=np.float64)
+    low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
+        needed = "K upper triangular with positive focal lengths and K33 = 1"
+        raise ValueError(f"{caller} needs {needed}; got {K.round(6).tolist()}")
+
+
+def require_rotations(caller: str, R: F64) -> None:
+    """Raise ``ValueError`` if a matrix of R (..., 3, 3) is no rotation."""
+    apart = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0))
+    if not apart <= _ORTHOGONAL:
+        raise ValueError(f"{caller} needs a rotation R; R'R deviates from the identity by {apart:.2g}")
+    if not (np.linalg.det(R) > 0.0).all():
+        raise ValueError(f"{caller} needs a rotation R; got a reflection, det R = -1")
+
+
+def resizing_transform(scale: float | F64) -> F64:
+    """Transform (3, 3) to the pixels of an image resized by s, one or (2,) for x and y: (x + 0.5) s - 0.5."""
+    T: F64 = np.diag(np.append(np.broadcast_to(scale, 2), 1.0))
+    T[:2, 2] = 0.5 * T.diagonal()[:2] - 0.5
+    return T

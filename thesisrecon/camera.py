@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import (
+from thesisrecon.arrays import (
+    B8,
+    F64,
     require_calibration,
     require_finite,
     require_rotations,
     require_shapes,
     resizing_transform,
 )
-from thesisrecon.geometry.camera_matrix import compose_camera, decompose_camera, project_camera, undistort
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,3 +182,165 @@ class Camera:
     @property
     def _coefficients(self) -> F64:
         return np.zeros(1) if self.distortion is None else np.asarray(self.distortion, dtype=np.float64)
+
+
+_CONVERGED = 1e-9
+"""Relative step at which Newton's method has converged to rounding: the next error is its square."""
+
+
+def compose_camera(K: F64, R: F64, t: F64) -> F64:
+    """Return P = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21).
+
+    Parameters
+    ----------
+    K, R, t : ndarray (..., 3, 3), (..., 3, 3) and (..., 3)
+        Calibration matrix, rotation world-to-camera and translation.
+
+    Returns
+    -------
+    ndarray (..., 3, 4)
+    """
+    return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
+
+
+def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
+    """Decompose P of any scale and sign into K, R and t (3.21).
+
+    Parameters
+    ----------
+    P : ndarray (3, 4)
+        Finite camera; a singular left 3x3 part is a ``ValueError``.
+
+    Returns
+    -------
+    K, R, t : ndarray (3, 3), (3, 3) and (3,)
+        K33 = 1, positive focal lengths, det R = 1.
+
+    Examples
+    --------
+    >>> K, R, t = decompose_camera(-3.0 * np.hstack([np.diag([2.0, 2.0, 1.0]), [[0.0], [0.0], [5.0]]]))
+    >>> np.allclose(K, np.diag([2.0, 2.0, 1.0])), np.allclose(R, np.eye(3)), np.allclose(t, [0.0, 0.0, 5.0])
+    (True, True, True)
+    """
+    P = P * np.sign(_left_determinant(P, "decompose_camera"))
+    K, R = rq(P[:, :3])
+    t = np.linalg.solve(K, P[:, 3])
+    return K / K[2, 2], R, np.asarray(t, dtype=np.float64)
+
+
+def _left_determinant(P: F64, caller: str) -> F64:
+    """det M (...) of cameras (..., 3, 4); ``ValueError`` if one is 0 to rounding."""
+    if not np.isfinite(P).all():
+        raise ValueError(f"{caller} needs finite cameras; some entries are NaN or infinite")
+    if not finite_cameras(P).all():
+        raise ValueError(f"{caller} needs a finite camera; the left 3x3 part of P is singular")
+    return np.asarray(np.linalg.det(P[..., :3]))
+
+
+def finite_cameras(P: F64) -> B8:
+    """Whether the centres of cameras are finite: their left 3x3 parts are not singular to rounding.
+
+    Parameters
+    ----------
+    P : ndarray (..., 3, 4)
+        Cameras; the scale of each row, and so the unit of the pixels, has no influence.
+
+    Returns
+    -------
+    ndarray (...) of bool
+    """
+    rows = np.linalg.norm(P[..., :3], axis=-1)
+    return np.asarray(np.abs(np.linalg.det(P[..., :3])) > 1e-14 * rows.prod(axis=-1))
+
+
+def rq(M: F64) -> tuple[F64, F64]:
+    """Factor M = K R with K upper triangular, of positive diagonal, and R orthogonal.
+
+    Parameters
+    ----------
+    M : ndarray (3, 3)
+        Matrix.
+
+    Returns
+    -------
+    K, R : ndarray (3, 3)
+        R is a rotation if det M > 0.
+    """
+    Q, U = np.linalg.qr(M[::-1].T)
+    K = U.T[::-1, ::-1]
+    R = Q.T[::-1]
+    signs = np.sign(np.diag(K))
+    signs[signs == 0] = 1.0
+    return K * signs, signs[:, None] * R
+
+
+def distort(xy_normalized: F64, distortion: float | F64) -> F64:
+    """Apply radial distortion (x, y) (1 + k1 r^2 + k2 r^4 + ...).
+
+    Parameters
+    ----------
+    xy_normalized, distortion : ndarray (N, 2); float or ndarray (C,) or (N, C)
+        Normalised image points and k1, or the coefficients k1, k2, ...
+
+    Returns
+    -------
+    ndarray (N, 2)
+    """
+    r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
+    return np.asarray(xy_normalized * _radial_factor(distortion, r2))
+
+
+def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
+    """Invert :func:`distort` by Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2.
+
+    Parameters
+    ----------
+    xy_normalized, distortion
+        As in :func:`distort`, distorted points.
+
+    Returns
+    -------
+    ndarray (N, 2)
+        Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
+    """
+    distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
+    k = np.atleast_1d(distortion)
+    slopes = k * np.arange(1, k.shape[-1] + 1)
+    r2 = distorted
+    with np.errstate(all="ignore"):
+        for _ in range(20):
+            factor = _radial_factor(k, r2)
+            slope = factor * (factor + 2.0 * (_radial_factor(slopes, r2) - 1.0))
+            step = (r2 * factor**2 - distorted) / slope
+            r2 = r2 - step
+            if np.all(np.abs(step) <= _CONVERGED * np.abs(r2)):
+                break
+        factor = _radial_factor(k, r2)
+        reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted
+    return np.asarray(xy_normalized / np.where(reached & (factor > 0.0), factor, 1.0))
+
+
+def _radial_factor(distortion: float | F64, r2: F64) -> F64:
+    k = np.atleast_1d(distortion)
+    factor = np.zeros_like(r2)
+    for n in reversed(range(k.shape[-1])):
+        factor = (factor + k[..., n : n + 1]) * r2
+    return 1.0 + factor
+
+
+def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 0.0) -> F64:
+    """Project space points with a metric camera and radial distortion.
+
+    Parameters
+    ----------
+    K, R, t, X : ndarray (3, 3), (3, 3), (3,) and (N, 3)
+        Calibration matrix, rotation world-to-camera, translation and points.
+    distortion : float or ndarray (C,) or (N, C)
+        Coefficients of :func:`distort`.
+
+    Returns
+    -------
+    ndarray (N, 2)
+    """
+    X = X @ R.T + t
+    return distort(X[:, :2] / X[:, 2:], distortion) @ K[:2, :2].T + K[:2, 2]

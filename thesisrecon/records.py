@@ -9,9 +9,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F32, F64, I64, Stratum
+from thesisrecon.arrays import B8, F32, F64, I64, Stratum, resizing_transform
 from thesisrecon.errors import Notice, counted
-from thesisrecon.geometry._conditioning import resizing_transform
 
 
 @dataclass(frozen=True)
@@ -291,50 +290,6 @@ class Reconstruction:
             reasons[view] = reasons[view] or (few if seen[view] else Notice("no-common-points"))
         return replace(self, reasons=tuple(reasons))
 
-    @classmethod
-    def from_cameras(
-        cls, *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
-        stratum: Stratum = "metric", sigma_px: float = 1.0,
-    ) -> Reconstruction:  # fmt: skip
-        """Return the reconstruction of plain arrays.
-
-        Parameters
-        ----------
-        *cameras : ndarray
-            P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
-        sizes : array_like (V, 2) or (2,)
-            Image width and height.
-        X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
-            Points, and their pixels, NaN where not observed; X None: triangulated from xy.
-        stratum, sigma_px : {"metric", "affine", "projective"}, float
-            Frame of P, and the noise of one image coordinate.
-
-        Returns
-        -------
-        Reconstruction
-            All views registered; ``ValueError`` if the arrays do not fit together, K is no calibration matrix
-            or R no rotation as in :class:`thesisrecon.Camera`, or pixels lie far outside their images.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from thesisrecon import Reconstruction
-        >>> K, R, t = np.diag([800.0, 800, 1]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [-1, 0, 0]])
-        >>> Reconstruction.from_cameras(K, R, t, sizes=(640, 480)).P[1].tolist()
-        [[800.0, 0.0, 0.0, -800.0], [0.0, 800.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-        """
-        # Imported on use: records are imported by all other modules.
-        from thesisrecon.geometry._from_arrays import checked_cameras, checked_points
-
-        P, K, sizes = checked_cameras(cameras, sizes, metric=stratum == "metric")
-        Xh, view, point, pixels = checked_points(P, sizes, X, xy, finite=stratum == "metric")
-        tracks = Tracks(view, point, pixels, len(P), len(Xh))
-        valid = np.any(Xh != 0.0, axis=1)
-        return cls(
-            stratum, P, Xh, np.ones(len(P), dtype=bool), valid, valid[point], tracks, sizes, sigma_px,
-            ("",) * len(P), K, None if K is None else np.zeros((len(P), 3)),
-        )  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Upgrade:
@@ -543,3 +498,63 @@ class StageReport:
     counts: Mapping[str, int] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+
+def require_mesh(caller: str, mesh: TexturedMesh) -> None:
+    """``ValueError`` unless it is a mesh whose faces, colours and texture coordinates fit its vertices.
+
+    Vertices that no face uses need not be finite.
+    """
+    if not isinstance(mesh, TexturedMesh):
+        given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
+        raise ValueError(f"{caller} needs a TexturedMesh; {given}")
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ValueError(f"{caller}: the faces refer to vertices that do not exist")
+    finite: B8 = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
+    if not finite[mesh.faces].all():
+        raise ValueError(f"{caller}: the vertices of faces must be finite")
+    if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
+        raise ValueError(f"{caller}: uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")
+    if mesh.uv is not None and not np.isfinite(mesh.uv).all():
+        raise ValueError(f"{caller}: uv must be finite")
+    if mesh.colors is not None and mesh.colors.shape != mesh.vertices.shape:
+        raise ValueError(f"{caller}: colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """The similarity y = scale R x + t.
+
+    Parameters
+    ----------
+    scale : float
+        Positive factor.
+    R, t : ndarray (3, 3), ndarray (3,)
+        Rotation and translation.
+    """
+
+    scale: float
+    R: F64
+    t: F64
+
+    def apply(self, X: F64) -> F64:
+        """Transform points.
+
+        Parameters
+        ----------
+        X : ndarray (N, 3)
+            Points.
+
+        Returns
+        -------
+        ndarray (N, 3)
+        """
+        return np.asarray(self.scale * X @ self.R.T + self.t)
+
+    @property
+    def matrix(self) -> F64:
+        """Transform of homogeneous points (4, 4)."""
+        G = np.eye(4)
+        G[:3, :3] = self.scale * self.R
+        G[:3, 3] = self.t
+        return G

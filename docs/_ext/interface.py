@@ -14,8 +14,9 @@ import typer
 from numpydoc.docscrape import NumpyDocString
 
 from _ext.code import write
-from thesisrecon import _settings, config
+from thesisrecon import config
 from thesisrecon.cli.main import app as command_line
+from thesisrecon.config import text
 
 
 def cell(text: Any) -> str:
@@ -100,13 +101,13 @@ def class_lines(path: str, kind: type[Any], value: Any) -> list[str]:
     doc = NumpyDocString(inspect.getdoc(kind) or "")
     lines = [reference(kind) + cell(" ".join(doc["Summary"])), ""]
     value = kind() if value is None and not required(kind) else value
-    names, inner = _settings._settings_of(kind), []
+    names, inner = text._settings_of(kind), []
     rows: dict[int, list[str]] = {}  # names that are described together stand in one row
-    hints, notes = _settings._hints(kind), field_notes(kind)
+    hints, notes = text._hints(kind), field_notes(kind)
     described = {name.strip(): p for p in doc["Parameters"] + doc["Attributes"] for name in p.name.split(",")}
     for name in names:
         default = getattr(value, name, None)
-        several = _settings._alternatives(typing.get_args(hints[name]))
+        several = text._alternatives(typing.get_args(hints[name]))
         classes = list(several.items()) or (
             [("", type(default))] if dataclasses.is_dataclass(default) else []
         )
@@ -160,7 +161,7 @@ def required(kind: type[Any]) -> bool:
 def toml(value: Any) -> str:
     """Return a value as it is written in a TOML file."""
     try:
-        return _settings._toml_value(_settings._plain(value))
+        return text._toml_value(text._plain(value))
     except (TypeError, ValueError):
         return str(value)
 

@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon import Camera, UsageError, align_to_positions, scaled
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 
 R0, T0, S0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), np.array([40.0, -7.0, 3.0]), 2.5
 

@@ -15,9 +15,10 @@ from tests.epipolar.pairs import make_pair
 from tests.pipeline import fake_stages as fakes
 from tests.synthetic import reconstruction_of, texture
 from thesisrecon.api.pairs import epipolar_lines
+from thesisrecon.camera import compose_camera
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, plane_homography
 from thesisrecon.intrinsics import IntrinsicsOptions

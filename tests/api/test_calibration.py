@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from tests.conftest import refuses
 from tests.synthetic import make_scene
-from thesisrecon import Reconstruction
 from thesisrecon.api.calibrate import METHODS
+from thesisrecon.api.cameras import reconstruction_from_cameras
+from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 
 G = np.eye(4) + 0.3 * np.random.default_rng(5).normal(size=(4, 4))
@@ -153,15 +153,15 @@ def test_vanishing_points_without_a_baseline_are_refused():
 def test_a_reconstruction_of_arrays_has_their_cameras_and_points():
     scene = make_scene(seed=4)
     xy = pixels(scene)
-    metric = Reconstruction.from_cameras(-2.0 * scene.P, sizes=scene.sizes, xy=xy)
+    metric = reconstruction_from_cameras(-2.0 * scene.P, sizes=scene.sizes, xy=xy)
     np.testing.assert_allclose(metric.K, scene.K, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(metric.P, scene.P, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(metric.X[:, :3], scene.X, atol=1e-6)
     np.testing.assert_array_equal(metric.tracks.xy, scene.tracks.xy)
-    of_parts = Reconstruction.from_cameras(scene.K[0], scene.R, scene.t, sizes=(1536, 1024), X=scene.X)
+    of_parts = reconstruction_from_cameras(scene.K[0], scene.R, scene.t, sizes=(1536, 1024), X=scene.X)
     np.testing.assert_allclose(of_parts.P, scene.P)
     assert len(of_parts.tracks.xy) == 0
-    build = Reconstruction.from_cameras
+    build = reconstruction_from_cameras
     refuses(ValueError, r"sizes are \(width, height\)", build, scene.P, sizes=scene.sizes[:, ::-1], xy=xy)
     refuses(ValueError, "needs P, or K, R and t", build, scene.K, scene.R, sizes=scene.sizes)
     refuses(ValueError, r"sizes \(V, 2\) or \(2,\)", build, scene.P, sizes=scene.sizes[:3])
@@ -191,7 +191,7 @@ def test_cameras_without_points_are_identifiable_in_any_frame():
 
 def test_the_way_out_of_a_wrong_call_is_named():
     scene = make_scene(seed=4)
-    metric = Reconstruction.from_cameras(scene.P, sizes=scene.sizes)
+    metric = reconstruction_from_cameras(scene.P, sizes=scene.sizes)
     way_out = "its calibration is its field K already; .* result.projective"
     refuses(ValueError, way_out, thesisrecon.self_calibrate, metric)
     refuses(ValueError, "needs the sizes", thesisrecon.self_calibrate, scene.P)

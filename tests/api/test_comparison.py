@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from tests.io.test_colmap import NAMES, SIZE, export, scene
 from thesisrecon import Camera, RunResult, UsageError, compare_models
-from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.io._models import read_model
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.records import Similarity
+from thesisrecon.results import SparseModel, SparseView
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap_reading import read_colmap_model
 

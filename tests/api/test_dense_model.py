@@ -16,7 +16,6 @@ from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon import (
     Camera,
     PipelineConfig,
-    Reconstruction,
     StageFailure,
     TexturedMesh,
     depth_maps,
@@ -24,10 +23,12 @@ from thesisrecon import (
     texture,
     write_mesh,
 )
+from thesisrecon.api.cameras import reconstruction_from_cameras
+from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry.camera_matrix import decompose_camera, project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.io._images import read_pixels
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
@@ -76,7 +77,7 @@ def test_arrays_of_cameras_and_reconstructions_give_the_same_maps(tmp_path):
     images, cameras = [image.rgb for image in scene.images], _cameras()[:3]
     one = depth_maps(images, cameras, depth_range=(4.0, 9.0), max_size=120)
     arrays = [np.array([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t")]
-    model = Reconstruction.from_cameras(*arrays, sizes=SIZE)
+    model = reconstruction_from_cameras(*arrays, sizes=SIZE)
     for given, sizes in ((tuple(arrays), SIZE), (model, None)):
         same = depth_maps(images, given, sizes=sizes, depth_range=np.array([[4.0, 9.0]] * 3), max_size=120)
         assert same[0].depth.shape == (90, 120)
@@ -84,7 +85,7 @@ def test_arrays_of_cameras_and_reconstructions_give_the_same_maps(tmp_path):
         # The last digits of the cameras change depths within their noise.
         assert np.nanmedian(np.abs(same[1].depth - one[1].depth)) < 0.01
     # Points that no image observes give neither range nor neighbours.
-    lidar = Reconstruction.from_cameras(*arrays, sizes=SIZE, X=scene.reconstruction.X[:, :3])
+    lidar = reconstruction_from_cameras(*arrays, sizes=SIZE, X=scene.reconstruction.X[:, :3])
     alike = [depth_maps(images, given, max_size=120) for given in (lidar, model)]
     np.testing.assert_array_equal(alike[0][1].depth, alike[1][1].depth)
     assert np.isfinite(alike[0][1].depth).any()
@@ -143,7 +144,7 @@ def test_observations_are_in_the_pixels_of_the_reduced_images(monkeypatch, walle
     xy = np.stack([camera.project(X) for camera in cameras])
     xy[~((xy >= 0.0) & (xy <= np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
     arrays = (np.stack([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
-    given = Reconstruction.from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
+    given = reconstruction_from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
     refuses(StageFailure, "seen", depth_maps, [image.rgb for image in walled.images], given, max_size=120)
     (reduced,) = seen
     tracks = reduced.tracks

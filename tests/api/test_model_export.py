@@ -17,11 +17,11 @@ from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.cli.main import run_command
+from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._images import read_image
 from thesisrecon.io._pixels import MemoryBudget
-from thesisrecon.sparse_model import SparseModel, SparseView
-from thesisrecon.stereo._resampling import undistort_image
+from thesisrecon.results import SparseModel, SparseView
 
 SIZE = (160, 120)
 NAMES = ["a b.png", "sub/c.png", "d.tif", "é.png"]

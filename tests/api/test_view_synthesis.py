@@ -14,7 +14,7 @@ from thesisrecon.cli.view_files import interpolate_images, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
-from thesisrecon.views.trilinear import VirtualCamera, camera_at
+from thesisrecon.views.tensor import VirtualCamera, camera_at
 from validation.scenes.real import load_fixture_scene
 
 SCENE = load_fixture_scene()

@@ -4,9 +4,10 @@ import re
 
 import numpy as np
 
+from thesisrecon.camera import decompose_camera
 from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
-from thesisrecon.geometry._conditioning import normalizing_transform
-from thesisrecon.geometry._homography import homography_linear
+from thesisrecon.geometry.conditioning import normalizing_transform
+from thesisrecon.geometry.homography import homography_linear
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
 from thesisrecon.geometry.similarity import estimate_similarity
@@ -41,7 +42,7 @@ def spoilt(array, value):
 def test_numbers_that_are_not_finite_are_rejected():
     for v in (np.nan, np.inf):
         calls = [
-            (camera_matrix.decompose_camera, spoilt(P, v)),
+            (decompose_camera, spoilt(P, v)),
             (two_view.fundamental_from_cameras, P, spoilt(OTHER, v)), (two_view.epipoles, spoilt(F, v)),
             (two_view.enforce_rank_two, spoilt(F, v)), (homography_linear, spoilt(XY, v), XY),
             (normalizing_transform, spoilt(XY, v)), (two_view.infinite_homography, P, spoilt(OTHER, v)),
@@ -60,7 +61,7 @@ def test_numbers_that_are_not_finite_are_rejected():
 
 def test_singular_and_empty_arrays_are_rejected():
     calls = [
-        (camera_matrix.decompose_camera, np.zeros((3, 4))),
+        (decompose_camera, np.zeros((3, 4))),
         (camera_matrix.normalize_camera, np.zeros((3, 4))),
         (two_view.fundamental_from_cameras, np.zeros((3, 4)), P),
         (two_view.fundamental_from_cameras, np.ones((3, 4)), P),

@@ -17,11 +17,11 @@ from tests.bad_input.files import SUMMARY as WHOLE
 from tests.io.test_colmap import export, scene
 from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
-from thesisrecon._settings import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.api.export import write_mesh
 from thesisrecon.api.models import read_cameras
 from thesisrecon.cli.main import run_command
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.text import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_json, read_pairs, read_text
 from thesisrecon.io._images import read_images

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from tests.pipeline.fake_stages import kept_bytes, read
-from thesisrecon._settings import build_config
 from thesisrecon.cli import common, runs
 from thesisrecon.cli.main import run_command
 from thesisrecon.cli.runs import _duration, _intrinsic_lines
+from thesisrecon.config.text import build_config
 from thesisrecon.io import _images
 
 ROOT = Path(__file__).parents[2]

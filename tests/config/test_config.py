@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from thesisrecon._settings import (
+from thesisrecon.api.reconstruct import _exif_warnings
+from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
+from thesisrecon.config.text import (
     _parse,
     _toml_lines,
     as_config,
@@ -19,8 +21,6 @@ from thesisrecon._settings import (
     tables_from_settings,
     toml_from_config,
 )
-from thesisrecon.api.reconstruct import _exif_warnings
-from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
 from thesisrecon.errors import UsageError
 from thesisrecon.intrinsics import INTRINSICS, IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow

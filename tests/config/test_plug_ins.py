@@ -17,9 +17,9 @@ from tests.conftest import refuses
 from tests.pipeline.fake_stages import photographs
 from tests.synthetic import one_by_one
 from thesisrecon import match_pair, reconstruct
-from thesisrecon._plug_ins import FunctionFundamental, FunctionMatcher
-from thesisrecon._settings import build_config, config_from_toml, tables_from_config, toml_from_config
 from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config.plug_ins import FunctionFundamental, FunctionMatcher
+from thesisrecon.config.text import build_config, config_from_toml, tables_from_config, toml_from_config
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure, UsageError

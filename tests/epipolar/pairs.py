@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.camera import compose_camera
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 

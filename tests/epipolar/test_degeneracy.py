@@ -16,8 +16,8 @@ from thesisrecon.epipolar._degeneracy import NEIGHBOURS, _contradicted_ratios, a
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import unit_norm
-from thesisrecon.geometry._homography import (
+from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homography import (
     homography_linear,
     homography_residuals,
     homography_sampson_residuals,

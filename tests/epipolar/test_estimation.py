@@ -10,7 +10,7 @@ from tests.conftest import refuses
 from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
 from thesisrecon.epipolar.estimation import Method
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import plane_homography
 

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair, oriented
-from thesisrecon.epipolar import _refinement as rank2
 from thesisrecon.epipolar import _sampling as kernels
+from thesisrecon.epipolar import criteria as rank2
 from thesisrecon.epipolar import linear
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
+from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
-from thesisrecon.numerics._small_solvers import solve_damped
 
 seeds = st.integers(0, 2**31)
 

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon.api.pairs import estimate_trifocal
-from thesisrecon.epipolar.trifocal_estimation import (
+from thesisrecon.camera import decompose_camera
+from thesisrecon.epipolar.three_view_estimation import (
     NO_SEGMENTS,
     _line_moves,
     _minimize_algebraic_error,
@@ -20,12 +21,7 @@ from thesisrecon.epipolar.trifocal_estimation import (
     _TensorEquations,
 )
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import (
-    calibration_matrix,
-    camera_from_centre,
-    decompose_camera,
-    project,
-)
+from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre, project
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
 from thesisrecon.geometry.three_view import (
     cameras_from_tensor,

@@ -16,8 +16,8 @@ from thesisrecon.epipolar.verification import (
     _plane_homographies,
     homography_inlier_ratio,
 )
-from thesisrecon.geometry._homography import homography_residuals
 from thesisrecon.geometry.camera_matrix import project
+from thesisrecon.geometry.homography import homography_residuals
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.records import FundamentalFit, Matches
 

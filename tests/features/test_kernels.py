@@ -4,7 +4,7 @@ from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordina
 
 from tests.synthetic import texture
 from thesisrecon.features import _kernels as kernels
-from thesisrecon.geometry._image_filters import gaussian_taps
+from thesisrecon.imaging.filters import gaussian_taps
 
 
 def moments_twin(channels, derivative, taps):

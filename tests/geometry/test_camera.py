@@ -6,6 +6,7 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from tests.geometry.properties import holds_for_every, incidence_sine, random_camera, random_points
+from thesisrecon.camera import compose_camera, decompose_camera, finite_cameras, project_camera, rq
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
@@ -23,16 +24,16 @@ def test_3_16_and_3_17_the_calibration_matrix_takes_image_to_pixel_coordinates(r
 def test_3_18_to_3_21_cameras_from_and_to_their_parts(rng):
     P, K, R, centre = random_camera(rng)
     X = rng.normal(size=(5, 3))
-    np.testing.assert_allclose(matrix.project(P, X), matrix.project_camera(K, R, -R @ centre, X))
+    np.testing.assert_allclose(matrix.project(P, X), project_camera(K, R, -R @ centre, X))
     # The thesis' rotation is the transpose of ours: P = K [R' | -R'C] (3.21).
     thesis_R = R.T
     np.testing.assert_allclose(P, K @ np.column_stack([thesis_R.T, -thesis_R.T @ centre]), atol=1e-9)
     scale = rng.choice([-2.0, 0.5])
-    K_found, R_found, t_found = matrix.decompose_camera(scale * P)
+    K_found, R_found, t_found = decompose_camera(scale * P)
     np.testing.assert_allclose(K_found, K, atol=1e-6)
     np.testing.assert_allclose(R_found, R, atol=1e-9)
     np.testing.assert_allclose(-R_found.T @ t_found, centre, atol=1e-8)
-    np.testing.assert_allclose(matrix.compose_camera(K_found, R_found, t_found), P, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(compose_camera(K_found, R_found, t_found), P, rtol=1e-6, atol=1e-6)
     many = matrix.camera_from_centre(np.stack([K, K]), np.stack([R, R]), np.stack([centre, centre]))
     np.testing.assert_allclose(many, np.stack([P, P]))
 
@@ -79,9 +80,9 @@ def test_3_5_1_normalised_cameras_have_a_centre_with_last_entry_one(rng):
 def test_3_5_1_cameras_at_infinity_cannot_be_normalised():
     with pytest.raises(ValueError, match="singular"):
         matrix.normalize_camera(np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]]))
-    _, R = matrix.rq(np.diag([2.0, 1.0, 0.0]))
+    _, R = rq(np.diag([2.0, 1.0, 0.0]))
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-    for refuse in (matrix.normalize_camera, matrix.decompose_camera):
+    for refuse in (matrix.normalize_camera, decompose_camera):
         refuses(ValueError, "finite", refuse, np.full((3, 4), np.nan))
 
 
@@ -93,8 +94,8 @@ def test_whether_a_camera_is_finite_does_not_depend_on_the_unit_of_the_pixels(un
         rows = np.diag([1.0, 1.0, unit])
         at_infinity = P.copy()
         at_infinity[2, :3] = 0.3 * P[0, :3] - 0.2 * P[1, :3]
-        assert matrix.finite_cameras(np.stack([rows @ P, rows @ at_infinity])).tolist() == [True, False]
-        np.testing.assert_allclose(matrix.decompose_camera(rows @ P)[1], R, atol=1e-6)
+        assert finite_cameras(np.stack([rows @ P, rows @ at_infinity])).tolist() == [True, False]
+        np.testing.assert_allclose(decompose_camera(rows @ P)[1], R, atol=1e-6)
 
 
 @holds_for_every()

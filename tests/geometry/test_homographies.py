@@ -6,9 +6,9 @@ import pytest
 import thesisrecon
 from tests.geometry.properties import gap, holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry import two_view
-from thesisrecon.geometry._homography import homography_residuals
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
+from thesisrecon.geometry.homography import homography_residuals
 from thesisrecon.geometry.strata import transform
 from validation.scenes.transforms import random_transform
 

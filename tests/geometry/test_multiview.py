@@ -10,12 +10,12 @@ from tests.conftest import refuses
 from tests.epipolar.pairs import angle_between, make_pair
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import two_view
-from thesisrecon.geometry._homography import (
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.homography import (
     homography_linear,
     homography_residuals,
     require_parallax_of_matches,
 )
-from thesisrecon.geometry.homogeneous import cross_matrix
 
 seeds = st.integers(0, 2**31)
 

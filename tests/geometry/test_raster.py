@@ -7,9 +7,9 @@ from scipy.ndimage import convolve1d
 from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._image_filters import cubic_weights, gaussian_taps, halve, resample, smooth
-from thesisrecon.geometry._zbuffer import Raster, rasterize
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.imaging.filters import cubic_weights, gaussian_taps, halve, resample, smooth
+from thesisrecon.imaging.raster import Raster, rasterize
 
 
 def test_smoothing_equals_its_numpy_twin():

@@ -5,8 +5,9 @@ import pytest
 
 import thesisrecon
 from tests.conftest import refuses
+from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.camera_matrix import project
 
 K = np.array([[900.0, 2.0, 400.0], [0.0, 910.0, 290.0], [0.0, 0.0, 1.0]])
 R = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]

@@ -11,15 +11,9 @@ from tests.geometry import properties as twins
 from tests.geometry.properties import holds_for_every, random_camera
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.api.cameras import triangulate
-from thesisrecon.geometry._conditioning import pixel_conditioning
-from thesisrecon.geometry.camera_matrix import (
-    camera_centre,
-    compose_camera,
-    distort,
-    orient_signs,
-    project,
-    undistort,
-)
+from thesisrecon.camera import compose_camera, distort, undistort
+from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs, project
+from thesisrecon.geometry.conditioning import pixel_conditioning
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.polynomial_triangulation import (
     _conditioning,
@@ -31,7 +25,7 @@ from thesisrecon.geometry.polynomial_triangulation import (
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.geometry.triangulation import _jacobi_least, triangulate_observations
 from thesisrecon.geometry.two_view import epipolar_distances, fundamental_from_cameras
-from thesisrecon.numerics._partial_bundle import minimize_reprojection
+from thesisrecon.optimize.bundle.partial import minimize_reprojection
 
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
 

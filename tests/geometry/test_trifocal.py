@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from tests.conftest import refuses
 from tests.geometry.properties import gap, holds_for_every, random_camera
 from thesisrecon.api.pairs import _check_triplets
-from thesisrecon.epipolar.trifocal_estimation import _tensor_equations
+from thesisrecon.epipolar.three_view_estimation import _tensor_equations
 from thesisrecon.geometry import three_view
-from thesisrecon.geometry._conditioning import unit_tensor
 from thesisrecon.geometry.camera_matrix import camera_centre, project
+from thesisrecon.geometry.conditioning import unit_tensor
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals

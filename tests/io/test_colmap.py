@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.io._colmap_writing import write_colmap_model
 from thesisrecon.records import Reconstruction, Tracks
 from validation.references.colmap_reading import read_colmap_model

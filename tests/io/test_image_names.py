@@ -15,7 +15,7 @@ from thesisrecon.io._images import images_folder, read_images
 from thesisrecon.io._models import read_model
 from thesisrecon.pipeline._given import views_of
 from thesisrecon.records import Image
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 
 OUTSIDE = [
     "/a/x.png", "../x.png", "a/../../x.png", "a/..", "..", "", ".", "a/", "C:\\x.png", "C:x.png", "\\x.png",

@@ -6,7 +6,6 @@ from tests.constants import with_constants
 from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.matching._alignment import _align_windows
 from thesisrecon.matching._prepared import _corner_patches, prepare_image
 from thesisrecon.matching._seeds import _scan_correlations, _update_largest_of_columns
 from thesisrecon.matching.growth import _fit_local_affines, _match_guided
@@ -15,6 +14,7 @@ from thesisrecon.matching.strength import (
     _relative_difference_weight,
     _strength_of_match,
 )
+from thesisrecon.matching.track_alignment import _align_windows
 from thesisrecon.matching.tracks import _chain_affines, _union_corners
 from thesisrecon.records import Features, Image
 

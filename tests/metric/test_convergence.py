@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from tests.metric.test_metric_refinement import run
 from tests.synthetic import TrueScene, make_scene
+from thesisrecon.camera import project_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import project_camera
 from thesisrecon.records import Tracks
 
 SIZE, FOCAL, K1 = (1000, 750), 850.0, -0.12

@@ -9,7 +9,7 @@ from tests.metric.test_population import refine
 from tests.synthetic import make_scene
 from thesisrecon.metric._adjustment import tail_width
 from thesisrecon.metric._uncertainty import FocalShrinkage, lack_of_fit
-from thesisrecon.numerics._block_scatter import BlockScatter
+from thesisrecon.optimize.bundle.scatter import BlockScatter
 
 
 def test_deviations_are_of_the_stated_size_on_normal_noise():

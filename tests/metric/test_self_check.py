@@ -22,8 +22,8 @@ from thesisrecon.metric._shared_camera import (
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
-from thesisrecon.numerics._block_scatter import BlockScatter
-from thesisrecon.numerics._metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.scatter import BlockScatter
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3

@@ -15,9 +15,10 @@ import PIL.Image
 
 from tests.synthetic import reconstruction_of
 from thesisrecon import records
+from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.stereo.depth import MultiViewScene, SparsePoints
 
 

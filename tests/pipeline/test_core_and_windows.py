@@ -10,8 +10,8 @@ from tests.synthetic import TrueScene, make_scene, true_pairs, with_poses
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.numerics import _schur
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle import schur
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.projective._track_selection import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
 from thesisrecon.records import Tracks
@@ -160,7 +160,7 @@ def test_fixed_cameras_stay_and_the_others_converge():
 
 def test_threads_do_not_change_the_adjustment():
     walk = make_walk(150, "street", np.random.default_rng(0), denser=3)
-    assert len(walk.seen.xy) > 3 * _schur.CHUNK
+    assert len(walk.seen.xy) > 3 * schur.CHUNK
     cameras, X = walk.start(np.random.default_rng(1))
     fits = [
         refine_metric_bundle(

@@ -15,7 +15,6 @@ from tests.metric.test_metric_refinement import centre_error
 from tests.pipeline.test_core_and_windows import street, with_repeated_windows
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.pipeline import _parts
@@ -30,7 +29,7 @@ from thesisrecon.pipeline._parts import (
     reconstruct_part,
 )
 from thesisrecon.pipeline._second_pass import cameras_on_tracks, pairs_of_missing
-from thesisrecon.records import Image, MetricResult
+from thesisrecon.records import Image, MetricResult, Similarity
 from thesisrecon.runtime._run import _StageLog, start_run
 
 VIEWS, PART = 72, 45

@@ -30,7 +30,8 @@ FOUNDATIONS = {
     "intrinsics",
     "records",
     "geometry",
-    "numerics",
+    "imaging",
+    "optimize",
 }
 COMPOSERS = {
     "__init__", "config", "api", "pipeline",

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from tests.constants import with_constants
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.api.cameras import triangulate
+from thesisrecon.camera import project_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import pixel_from_unit
-from thesisrecon.geometry.camera_matrix import project, project_camera
-from thesisrecon.geometry.robust_resection import resect_projective
+from thesisrecon.geometry.camera_matrix import project
+from thesisrecon.geometry.conditioning import pixel_from_unit
+from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
 from thesisrecon.projective._track_selection import (
     initial_cameras,

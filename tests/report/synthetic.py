@@ -15,7 +15,7 @@ from PIL import ImageDraw
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from tests.surface.sphere import K as SPHERE_K
 from tests.synthetic import looking_along, reconstruction_of
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report._data import ReportData

@@ -8,8 +8,8 @@ import pytest
 from tests.io.test_colmap import export, scene
 from tests.report import synthetic
 from thesisrecon import compare_models
-from thesisrecon.geometry.similarity import Similarity
 from thesisrecon.io._models import read_model
+from thesisrecon.records import Similarity
 from thesisrecon.report._comparison import comparison_page
 
 pytestmark = pytest.mark.browser

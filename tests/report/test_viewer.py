@@ -11,7 +11,7 @@ from PIL import Image as PillowImage
 
 from tests.report import synthetic
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.camera import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import _viewer
 from thesisrecon.report._figures import upright_rotation

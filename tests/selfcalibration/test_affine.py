@@ -11,7 +11,7 @@ from tests.selfcalibration.stratified_scenes import CENTRED, prior_for
 from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import pixel_from_unit
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.pipeline._outputs import write_affine
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint

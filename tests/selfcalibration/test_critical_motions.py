@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
-from thesisrecon.geometry._critical_motions import (
+from thesisrecon.geometry.critical_motions import (
     UpgradedCameras,
     _infinite_homography_shift,
     _planarity_ratio,
@@ -18,7 +18,7 @@ from thesisrecon.geometry._critical_motions import (
 )
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.numerics._identifiability import (
+from thesisrecon.optimize.bundle.identifiability import (
     MAX_FOCAL_STD,
     MAX_NOISE_RATIO,
     MIN_INFINITY_SHIFT,

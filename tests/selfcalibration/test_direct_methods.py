@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
-from thesisrecon.records import Reconstruction
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
@@ -148,7 +148,7 @@ def test_given_focals_are_kept_by_cameras_on_a_sphere(method, focal_std):
     xh = np.einsum("vij,nj->vni", scene.P, np.column_stack([scene.X, np.ones(len(scene.X))]))
     sizes = np.tile([1536, 1024], (6, 1))
     P = scene.P @ np.linalg.inv(np.random.default_rng(2).normal(size=(4, 4)))
-    reconstruction = Reconstruction.from_cameras(
+    reconstruction = reconstruction_from_cameras(
         P, sizes=sizes, xy=xh[..., :2] / xh[..., 2:], stratum="projective"
     )
     mean = np.tile([scene.K[0, 0, 0], 1.0, 0.0, *scene.K[0, :2, 2], 0.0], (6, 1))

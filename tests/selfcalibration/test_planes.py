@@ -8,10 +8,9 @@ import pytest
 from tests.constants import with_constants
 from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CONSTANT, prior_for, setup
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import pixel_from_unit
-from thesisrecon.records import Reconstruction
-from thesisrecon.selfcalibration._cheirality import CheiralityRegion, _plane_box
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, _local_minima
@@ -21,6 +20,7 @@ from thesisrecon.selfcalibration.modulus import (
     _modulus_residuals,
     _pairs_of_constant_cameras,
 )
+from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion, _plane_box
 from thesisrecon.selfcalibration.stratified import Stratified
 
 PAIRS = [
@@ -183,7 +183,7 @@ def test_copies_of_one_point_set_no_bounds():
     X = np.tile([0.1, 0.2, 0.3, 1.0], (50, 1))
     xh = np.einsum("vij,nj->vni", scene.P, X)
     H = np.random.default_rng(0).normal(size=(4, 4))
-    one = Reconstruction.from_cameras(
+    one = reconstruction_from_cameras(
         scene.P @ np.linalg.inv(H), sizes=scene.sizes, X=X @ H.T, xy=xh[..., :2] / xh[..., 2:],
         stratum="projective",
     )  # fmt: skip

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.selfcalibration.test_direct_methods import adjusted, at_distance, prior_for, reprojected
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.numerics._noise import soft_l1
+from thesisrecon.optimize.noise import soft_l1
 from thesisrecon.selfcalibration import _refinement
 from thesisrecon.selfcalibration._candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns

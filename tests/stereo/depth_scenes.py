@@ -7,6 +7,7 @@ from scipy.ndimage import map_coordinates
 
 from tests.synthetic import looking_along, photograph, reconstruction_of, texture
 from thesisrecon.arrays import F64
+from thesisrecon.camera import decompose_camera, distort, undistort
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image, Reconstruction, Tracks
@@ -60,10 +61,8 @@ def photograph_scene(P, rectangles, *, sizes=None, noise=1.0, points=400, seed=0
     for view, (camera, size) in enumerate(zip(P, sizes or [(200, 150)] * len(P), strict=True)):
         shape = size[::-1]
         xy = np.indices(shape)[::-1].reshape(2, -1).T.astype(float)
-        K = matrix.decompose_camera(camera)[0]
-        straight = (
-            matrix.undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
-        )
+        K = decompose_camera(camera)[0]
+        straight = undistort((xy - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T, lens) @ K[:2, :2].T + K[:2, 2]
         gray = trace(camera, rectangles, straight)[1].reshape(shape)
         images.append(photograph(gray + noise * rng.normal(size=shape), f"{view}.png"))
         depth, _, textured = trace(camera, rectangles, xy)
@@ -98,7 +97,7 @@ def trace(P, rectangles, xy):
 
 def observed_points(P, depths, X, lens):
     """A metric reconstruction of points X (N, 3), observed by every view whose depth map shows them."""
-    K = np.stack([matrix.decompose_camera(camera)[0] for camera in P])
+    K = np.stack([decompose_camera(camera)[0] for camera in P])
     views, points, seen_at = [], [], []
     for k, (camera, depth) in enumerate(zip(P, depths, strict=True)):
         z = X @ camera[2, :3] + camera[2, 3]
@@ -111,7 +110,7 @@ def observed_points(P, depths, X, lens):
         views.append(np.full(len(n), k))
         points.append(n)
         normalized = (xy[n] - K[k, :2, 2]) @ np.linalg.inv(K[k, :2, :2]).T
-        seen_at.append(matrix.distort(normalized, lens) @ K[k, :2, :2].T + K[k, :2, 2])
+        seen_at.append(distort(normalized, lens) @ K[k, :2, :2].T + K[k, :2, 2])
     view, point = np.concatenate(views), np.concatenate(points)
     order = np.lexsort((view, point))
     tracks = Tracks(view[order], point[order], np.concatenate(seen_at)[order], len(P), len(X))

@@ -13,9 +13,9 @@ from tests.stereo.depth_scenes import RADIAL, make_walled, on_arc
 from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.records import Image
 from thesisrecon.stereo import correspondence, depth
-from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.stereo.correspondence import PairMatching
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.semi_global import SemiGlobalMatching

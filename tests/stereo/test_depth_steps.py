@@ -9,12 +9,12 @@ from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap
 from thesisrecon.stereo._depth_fusion import _concatenated, _measured
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._planar import common_orientation
 from thesisrecon.stereo._polar import polar
-from thesisrecon.stereo._resampling import pinhole_view
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import (
     _complete_depths,

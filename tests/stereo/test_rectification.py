@@ -10,6 +10,7 @@ from tests.stereo.rectification_scenes import MOTIONS, PLANAR, SIZE, make_pair
 from tests.synthetic import texture
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
+from thesisrecon.imaging.resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 from thesisrecon.stereo import _planar as planar
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._epipolar_pair import (
@@ -21,7 +22,6 @@ from thesisrecon.stereo._epipolar_pair import (
 )
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._rectification_quality import jacobians, matches_in_frame, measure_quality
-from thesisrecon.stereo._resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
 from thesisrecon.stereo.rectification import (
     RectifiedImages,
     disparity_range,

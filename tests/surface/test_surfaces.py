@@ -12,7 +12,7 @@ from tests.constants import with_constants
 from tests.surface.sphere import SHAPE, K, looking_at_origin, ring_of, sphere_map
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._zbuffer import rasterize
+from thesisrecon.imaging.raster import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface import fusion
 from thesisrecon.surface._mesh import connected_parts, face_areas, remove_small_parts

@@ -12,7 +12,7 @@ from thesisrecon.api.export import write_mesh
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._zbuffer import rasterize
+from thesisrecon.imaging.raster import rasterize
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import _texture_kernels as kernels

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("pycolmap")
 
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.scenes.walks import SIZE, make_walk
 from validation.stages.bundle import FOCAL_K1

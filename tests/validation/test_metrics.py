@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import reconstruction_of
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
+from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from thesisrecon.views._image_similarity import GREY
 from validation.metrics.cameras import (

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.synthetic import texture
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.camera import compose_camera
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import DisparityMap
 from thesisrecon.views import _interpolation_kernels as kernels

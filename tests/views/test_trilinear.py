@@ -6,13 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import unit_tensor
-from thesisrecon.geometry.camera_matrix import calibration_matrix, compose_camera, project
+from thesisrecon.geometry.camera_matrix import calibration_matrix, project
+from thesisrecon.geometry.conditioning import unit_tensor
 from thesisrecon.geometry.three_view import tensor_from_cameras
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.views import trilinear
-from thesisrecon.views.trilinear_synthesis import _transfer_rows
+from thesisrecon.views import tensor
+from thesisrecon.views.tensor_synthesis import _transfer_rows
 
 exact = settings(derandomize=True, deadline=None, max_examples=60)
 
@@ -43,7 +44,7 @@ def _pair(turn, baseline, f1=1000.0, f2=1200.0):
     K1, _ = _camera((0, 0, 0), f1, (500.0, 350.0))
     K2, R = _camera(turn, f2, (480.0, 370.0))
     t = np.array(baseline[:3]) * (-1.0 if baseline[3] else 1.0)
-    return trilinear.CalibratedPair(K1, K2, R, t / np.linalg.norm(t))
+    return tensor.CalibratedPair(K1, K2, R, t / np.linalg.norm(t))
 
 
 def _images(pair, X):
@@ -57,7 +58,7 @@ def test_the_virtual_camera_sees_the_scene_projected_again(turn, baseline, R, t,
     K, R = _camera(R, f, middle)
     X2 = X @ pair.R.T + pair.t
     X3 = X2 @ R.T + t
-    virtual = trilinear.seed_of_two(pair).moved(R, np.array(t), K=K)
+    virtual = tensor.seed_of_two(pair).moved(R, np.array(t), K=K)
     xy, inverse_depth = virtual.transfer(*_images(pair, X))
     np.testing.assert_allclose(xy, project(K @ np.eye(3, 4), X3), rtol=1e-10, atol=1e-8)
     np.testing.assert_allclose(inverse_depth, 1.0 / X3[:, 2], rtol=1e-9)
@@ -68,7 +69,7 @@ def test_the_virtual_camera_sees_the_scene_projected_again(turn, baseline, R, t,
 def test_the_tensor_is_that_of_the_three_cameras(turn, baseline, R, t):
     pair = _pair(turn, baseline)
     R = Rotation.from_rotvec(R).as_matrix()
-    virtual = trilinear.seed_of_two(pair).moved(R, np.array(t))
+    virtual = tensor.seed_of_two(pair).moved(R, np.array(t))
     third = compose_camera(pair.K2, R @ pair.R, R @ pair.t + t)
     cameras = tensor_from_cameras(pair.K1 @ np.eye(3, 4), compose_camera(pair.K2, pair.R, pair.t), third)
     ours = unit_tensor(virtual.T)
@@ -85,7 +86,7 @@ def _fundamental(pair):
 def test_the_pair_of_f_is_the_one_that_made_it(turn, baseline):
     pair = _pair(turn, baseline)
     xy1, xy2 = _images(pair, _scene(1))
-    found = trilinear.pair_from_fundamental(-_fundamental(pair), xy1, xy2, K1=pair.K1, K2=pair.K2)
+    found = tensor.pair_from_fundamental(-_fundamental(pair), xy1, xy2, K1=pair.K1, K2=pair.K2)
     np.testing.assert_allclose(found.R, pair.R, atol=1e-9)
     np.testing.assert_allclose(found.t, pair.t, atol=1e-9)
 
@@ -96,11 +97,11 @@ def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(small):
     pair = _pair((0.02, -0.1, 0.03), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(1))
     F, guess = _fundamental(pair), calibration_matrix(1300.0, 1300.0, 499.5, 349.5)
-    found = trilinear.pair_from_fundamental(F, xy1, xy2, K1=guess, K2=guess, small_rotation=small)
+    found = tensor.pair_from_fundamental(F, xy1, xy2, K1=guess, K2=guess, small_rotation=small)
     again = _fundamental(found)
     np.testing.assert_allclose(again * np.sign(np.sum(again * F)), F, atol=1e-9)
     # As it stands where the first photograph was taken, and where the second one was.
-    seed = trilinear.seed_of_two(found)
+    seed = tensor.seed_of_two(found)
     back = seed.moved(found.R.T, found.centre2, K=found.K1)
     np.testing.assert_allclose(back.transfer(xy1, xy2)[0], xy1, atol=1e-6)
     np.testing.assert_allclose(seed.transfer(xy1, xy2)[0], xy2, atol=1e-6)
@@ -111,7 +112,7 @@ def test_wrong_intrinsics_leave_f_and_both_photographs_as_they_are(small):
 def test_small_rotations_are_right_to_second_order(degrees):
     pair = _pair(np.radians(degrees) * np.array([0.6, -0.64, 0.48]), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(1))
-    found = trilinear.pair_from_fundamental(
+    found = tensor.pair_from_fundamental(
         _fundamental(pair), xy1, xy2, K1=pair.K1, K2=pair.K2, small_rotation=True
     )
     off = np.degrees((Rotation.from_matrix(found.R) * Rotation.from_matrix(pair.R).inv()).magnitude())
@@ -122,7 +123,7 @@ def test_small_rotations_are_right_to_second_order(degrees):
 def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_goes():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     xy1, xy2 = _images(pair, _scene(2))
-    virtual = trilinear.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
+    virtual = tensor.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, 0.1]))
     lines = virtual._perpendicular_lines(xy1, xy2)
     across = np.stack([lines[:, 1], -lines[:, 0]], axis=1)
     np.testing.assert_allclose(
@@ -132,7 +133,7 @@ def test_matches_beside_their_epipolar_lines_go_where_their_nearest_place_on_it_
 
 def test_disparities_of_nearness_are_their_differences():
     pair, X = _pair((0.05, -0.2, 0.1), (0.5, 0.2, 0.6, False)), _scene(8)
-    virtual = trilinear.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -1.0]))
+    virtual = tensor.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -1.0]))
     xy1, xy2 = _images(pair, X)
     inverse_depth = virtual.transfer(xy1, xy2)[1]
     xy1_again, farther = _images(pair, 1.0001 * X)
@@ -146,7 +147,7 @@ def test_points_behind_the_virtual_camera_have_no_place():
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
     X = _scene(4)
     xy, inverse_depth = (
-        trilinear.seed_of_two(pair).moved(np.eye(3), np.array([0.0, 0.0, -6.0])).transfer(*_images(pair, X))
+        tensor.seed_of_two(pair).moved(np.eye(3), np.array([0.0, 0.0, -6.0])).transfer(*_images(pair, X))
     )
     behind = (X @ pair.R.T + pair.t)[:, 2] < 6.0
     assert 5 < behind.sum() < 55
@@ -162,7 +163,7 @@ def test_inverse_depth_orders_pixels_as_mcmillan_paints_them(ahead, sign):
     centre = np.array([0.2, -0.1, ahead])
     X = centre + np.linspace(3.0, 8.0, 9)[:, None] * np.array([0.1, 0.15, 1.0])
     xy1, xy2 = _images(pair, X)
-    virtual = trilinear.seed_of_two(pair).moved(np.eye(3), -pair.R @ centre - pair.t)
+    virtual = tensor.seed_of_two(pair).moved(np.eye(3), -pair.R @ centre - pair.t)
     xy, inverse_depth = virtual.transfer(xy1, xy2)
     np.testing.assert_allclose(xy, np.broadcast_to(xy[0], xy.shape), atol=1e-6)
     from_epipole = np.linalg.norm(xy1 - project(pair.K1 @ np.eye(3, 4), centre[None]), axis=1)
@@ -173,7 +174,7 @@ def test_inverse_depth_orders_pixels_as_mcmillan_paints_them(ahead, sign):
 def test_the_kernel_is_its_numpy_twin():
     rng = np.random.default_rng(5)
     pair = _pair((0.05, -0.2, 0.1), (0.7, 0.1, 0.2, False))
-    virtual = trilinear.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -2.0]))
+    virtual = tensor.seed_of_two(pair).moved(np.eye(3), np.array([0.2, 0.3, -2.0]))
     places = rng.uniform(0, 600, (20, 30, 2)).astype(np.float32)
     places[3, 4] = np.nan
     xy, inverse_depth = np.empty((20, 30, 2)), np.empty((20, 30), np.float32)
@@ -211,7 +212,7 @@ def _bad_pair(problem):
 )
 def test_pairs_that_cannot_work_are_refused_with_a_sentence(problem, sentence):
     with pytest.raises(StageFailure, match=sentence) as failure:
-        trilinear.pair_from_fundamental(**_bad_pair(problem))
+        tensor.pair_from_fundamental(**_bad_pair(problem))
     assert "\n" not in str(failure.value)
 
 
@@ -220,8 +221,8 @@ def test_a_half_turn_is_not_a_small_rotation():
     xy1, xy2 = _images(pair, _scene(1))
     F = _fundamental(pair)
     with pytest.raises(StageFailure):
-        trilinear.pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2, small_rotation=True)
-    found = trilinear.pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2)
+        tensor.pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2, small_rotation=True)
+    found = tensor.pair_from_fundamental(F, xy1, xy2, K1=pair.K1, K2=pair.K2)
     np.testing.assert_allclose(found.R, pair.R, atol=1e-9)
 
 
@@ -238,9 +239,9 @@ def test_a_half_turn_is_not_a_small_rotation():
 )
 def test_invalid_motions_are_value_errors(rotation, translation, K, sentence):
     with pytest.raises(ValueError, match=sentence):
-        trilinear.VirtualCamera(rotation, translation, np.eye(3) if K is None else K, (640, 480))
+        tensor.VirtualCamera(rotation, translation, np.eye(3) if K is None else K, (640, 480))
 
 
 def test_intrinsics_are_guessed_from_the_size():
-    K = trilinear.default_intrinsics((1000, 700))
+    K = tensor.default_intrinsics((1000, 700))
     np.testing.assert_array_equal(K, [[1000.0, 0.0, 499.5], [0.0, 1000.0, 349.5], [0.0, 0.0, 1.0]])

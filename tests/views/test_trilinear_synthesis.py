@@ -9,8 +9,8 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known
-from thesisrecon.views.trilinear import CalibratedPair, VirtualCamera, camera_at, seed_of_two
-from thesisrecon.views.trilinear_synthesis import _extrapolate_inverse_depth, prepare_synthesis
+from thesisrecon.views.tensor import CalibratedPair, VirtualCamera, camera_at, seed_of_two
+from thesisrecon.views.tensor_synthesis import _extrapolate_inverse_depth, prepare_synthesis
 
 SIZE = (160, 120)
 K = calibration_matrix(150.0, 150.0, 81.0, 58.0)

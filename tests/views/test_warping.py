@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._zbuffer import rasterize, sample_texture
+from thesisrecon.imaging.raster import rasterize, sample_texture
 from thesisrecon.views._warping import DIRECTIONS, STRETCH, fill_holes, forward_map, sample
 from thesisrecon.views.render import Light, Shading, _average_blocks, _shade
 

@@ -6,11 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from thesisrecon._settings import Config, as_config
-from thesisrecon.arrays import F64, I64
+from thesisrecon.api.cameras import reconstruction_from_cameras
+from thesisrecon.arrays import F64, I64, require_finite, require_shapes
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
+from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
-from thesisrecon.geometry._conditioning import pixel_from_unit, require_finite, require_shapes
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
@@ -50,8 +51,8 @@ def self_calibrate(
     sizes : array_like (V, 2) or (2,)
         Image width and height, for plain P.
     X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
-        Points and their pixels for plain P, as in :meth:`Reconstruction.from_cameras`. Without them the world
-        may be mirrored, and noise is not considered.
+        Points and their pixels for plain P, as in :func:`thesisrecon.reconstruction_from_cameras`. Without
+        them the world may be mirrored, and noise is not considered.
     method : str or SelfCalibrator, optional
         "hypotheses-and-refinement", "nonlinear-quadric", "linear-quadric", "kruppa-equations", "stratified";
         "cheirality-search", "modulus-constraint" or "parallel-lines", which are "stratified" with this method
@@ -78,7 +79,7 @@ def self_calibrate(
 
     >>> import numpy as np
     >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, Reconstruction, self_calibrate
+    >>> from thesisrecon import Camera, reconstruction_from_cameras, self_calibrate
     >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
     >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5], [5, 40, -15]])
     >>> R = Rotation.from_euler("xyz", angles).as_matrix()
@@ -87,7 +88,7 @@ def self_calibrate(
     >>> xy = np.stack([camera.project(X) for camera in cameras])
     >>> H = np.random.default_rng(1).normal(size=(4, 4))
     >>> P = np.array([camera.P for camera in cameras]) @ np.linalg.inv(H)
-    >>> projective = Reconstruction.from_cameras(P, sizes=(640, 480), xy=xy, stratum="projective")
+    >>> projective = reconstruction_from_cameras(P, sizes=(640, 480), xy=xy, stratum="projective")
     >>> round(self_calibrate(projective).K[0, 0, 0])
     800
     >>> round(self_calibrate(P, (640, 480), method="nonlinear-quadric").K[0, 0, 0])
@@ -260,16 +261,16 @@ def _projective(
     """The projective reconstruction that was given, or that of plain cameras."""
     if not isinstance(given, Reconstruction):
         if sizes is None:
-            way = "Reconstruction.from_cameras(P, sizes=sizes, stratum='projective')"
+            way = "reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
             raise ValueError(
                 f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
             )
-        return Reconstruction.from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
+        return reconstruction_from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
     if given.stratum == "projective":
         return given
     advice = (
         "its calibration is its field K already; to estimate it again pass the projective one, such as "
-        "result.projective, or from_cameras(P, sizes=sizes, stratum='projective')"
+        "result.projective, or reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
         if given.stratum == "metric"
         else "pass the projective one that it was made from"
     )

@@ -9,17 +9,23 @@ from typing import get_args
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.api.arguments import (
+    CameraInput,
+    as_cameras,
+    checked_cameras,
+    checked_points,
+    radial_coefficients,
+    require_inside,
+)
+from thesisrecon.arrays import B8, F64, I64, Stratum, require_calibration, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry._conditioning import require_calibration, require_finite, require_shapes
-from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_inside
-from thesisrecon.geometry.robust_resection import Resection, resect_robust
-from thesisrecon.geometry.triangulation import Method, triangulate_points
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
-from thesisrecon.numerics._metric_kernels import POSE_DOF, MetricCameras
-from thesisrecon.numerics._observations import Observations, sort_observations
+from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations, sort_observations
+from thesisrecon.optimize.robust_resection import Resection, resect_robust
+from thesisrecon.optimize.triangulation import Method, triangulate_points
 from thesisrecon.records import Reconstruction, Tracks
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {
@@ -454,3 +460,44 @@ def _checked_views(P: F64, xy: F64) -> tuple[F64, F64]:
     if np.isinf(xy).any():
         raise ValueError("triangulate needs finite pixels, or NaN for not seen; some are infinite")
     return P, xy
+
+
+def reconstruction_from_cameras(
+    *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
+    stratum: Stratum = "metric", sigma_px: float = 1.0,
+) -> Reconstruction:  # fmt: skip
+    """Return the reconstruction of plain arrays.
+
+    Parameters
+    ----------
+    *cameras : ndarray
+        P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
+    sizes : array_like (V, 2) or (2,)
+        Image width and height.
+    X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
+        Points, and their pixels, NaN where not observed; X None: triangulated from xy.
+    stratum, sigma_px : {"metric", "affine", "projective"}, float
+        Frame of P, and the noise of one image coordinate.
+
+    Returns
+    -------
+    Reconstruction
+        All views registered; ``ValueError`` if the arrays do not fit together, K is no calibration matrix
+        or R no rotation as in :class:`thesisrecon.Camera`, or pixels lie far outside their images.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import reconstruction_from_cameras
+    >>> K, R, t = np.diag([800.0, 800, 1]), np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 0], [-1, 0, 0]])
+    >>> reconstruction_from_cameras(K, R, t, sizes=(640, 480)).P[1].tolist()
+    [[800.0, 0.0, 0.0, -800.0], [0.0, 800.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
+    """
+    P, K, sizes = checked_cameras(cameras, sizes, metric=stratum == "metric")
+    Xh, view, point, pixels = checked_points(P, sizes, X, xy, finite=stratum == "metric")
+    tracks = Tracks(view, point, pixels, len(P), len(Xh))
+    valid = np.any(Xh != 0.0, axis=1)
+    return Reconstruction(
+        stratum, P, Xh, np.ones(len(P), dtype=bool), valid, valid[point], tracks, sizes, sigma_px,
+        ("",) * len(P), K, None if K is None else np.zeros((len(P), 3)),
+    )  # fmt: skip

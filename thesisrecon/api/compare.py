@@ -13,10 +13,17 @@ from thesisrecon.api.models import as_sparse_model
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words
-from thesisrecon.geometry._conditioning import scene_frame
-from thesisrecon.geometry.similarity import Similarity, estimate_similarity, rotation_errors_deg
-from thesisrecon.results import RunResult
-from thesisrecon.sparse_model import THRESHOLDS, ModelComparison, PointDistances, SparseModel, SparseView
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.geometry.similarity import estimate_similarity, rotation_errors_deg
+from thesisrecon.records import Similarity
+from thesisrecon.results import (
+    THRESHOLDS,
+    ModelComparison,
+    PointDistances,
+    RunResult,
+    SparseModel,
+    SparseView,
+)
 
 _LINE = 0.01
 """Extent of the centres across a line, relative to that along it, below which they are almost collinear."""

@@ -13,9 +13,10 @@ import numpy as np
 from thesisrecon._threads import ThreadPool
 from thesisrecon.api.models import as_sparse_model
 from thesisrecon.arrays import F64, rows_of_views
+from thesisrecon.camera import undistort
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.geometry.camera_matrix import undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io import _export_formats as formats
 from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._export_formats import calibration, coefficients
@@ -34,10 +35,8 @@ from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.records import TexturedMesh
-from thesisrecon.results import RunResult
+from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
-from thesisrecon.sparse_model import SparseModel, SparseView
-from thesisrecon.stereo._resampling import undistort_image
 
 _MAX_GROWTH = 0.5
 """Largest extension of an undistorted image beyond each side of the original, as a fraction of the side."""

@@ -12,8 +12,8 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from thesisrecon._settings import Config, Settings, build_config
 from thesisrecon.arrays import F64, I64
+from thesisrecon.config.text import Config, Settings, build_config
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap_reading import read_database
 from thesisrecon.io._images import images_folder

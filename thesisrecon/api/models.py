@@ -16,15 +16,15 @@ from scipy.special import gammaincinv
 from thesisrecon.arrays import B8, F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, unknown_word
-from thesisrecon.geometry.similarity import Similarity, estimate_similarity
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model
 from thesisrecon.io._positions import read_positions
 from thesisrecon.pipeline._loading import load_run
 from thesisrecon.pipeline._outputs import folder_with, save_result
-from thesisrecon.results import SUMMARY, RunResult
+from thesisrecon.records import Similarity
+from thesisrecon.results import SUMMARY, RunResult, SparseModel
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
-from thesisrecon.sparse_model import SparseModel
 
 _MAX_TRIPLES = 1000
 """All triples up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong."""

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from thesisrecon._settings import Config, as_config
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import F64, U8, require_finite, require_shapes
+from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._frame import MAX_PX
 from thesisrecon.epipolar.estimation import FundamentalEstimate, Method, fit_all, fit_seven
 from thesisrecon.epipolar.homography import HomographyFit, fit_homography
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.trifocal_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
+from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
 from thesisrecon.errors import Notice, StageFailure, unknown_word
-from thesisrecon.geometry._conditioning import require_finite, require_shapes, unit_norm
+from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.two_view import lines_of_points
 from thesisrecon.io._images import read_image, read_pixels
 from thesisrecon.pipeline._image_pair import ImageInput, match_images

@@ -8,8 +8,8 @@ from typing import Unpack
 
 import numpy as np
 
-from thesisrecon._settings import Config, Pairs, Settings, build_config
 from thesisrecon.arrays import F64
+from thesisrecon.config.text import Config, Pairs, Settings, build_config
 from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._frames import FrameSource

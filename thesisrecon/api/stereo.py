@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon._settings import Config, as_config
 from thesisrecon.arrays import F64
+from thesisrecon.config.text import Config, as_config
 from thesisrecon.io._images import is_rgba, read_levels
 from thesisrecon.pipeline._image_pair import ImageInput
 from thesisrecon.records import (

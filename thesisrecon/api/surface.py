@@ -8,18 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon._settings import Config, as_config
 from thesisrecon._threads import ThreadPool
-from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.api.arguments import CameraInput, as_cameras, radial_coefficients
+from thesisrecon.arrays import F32, F64, I64, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
+from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
-from thesisrecon.geometry._conditioning import resizing_transform
-from thesisrecon.geometry._from_arrays import CameraInput, as_cameras, radial_coefficients, require_mesh
+from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.io._images import list_images, read_image, rotation_words
 from thesisrecon.pipeline._image_pair import ImageInput
-from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks
-from thesisrecon.stereo._resampling import pinhole_view
+from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks, require_mesh
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
 from thesisrecon.surface.model import SurfaceModel
 

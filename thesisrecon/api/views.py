@@ -11,27 +11,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thesisrecon._settings import Config, as_config
 from thesisrecon.api.pairs import match_pair
-from thesisrecon.arrays import F32, F64, U8
+from thesisrecon.arrays import F32, F64, U8, require_calibration
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.geometry._conditioning import require_calibration
-from thesisrecon.geometry._from_arrays import require_mesh
-from thesisrecon.geometry._homography import require_parallax_of_matches
 from thesisrecon.geometry.camera_matrix import calibration_matrix
+from thesisrecon.geometry.homography import require_parallax_of_matches
 from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.intrinsics import prior_from_options
 from thesisrecon.io._images import read_image, read_levels, read_pixels
-from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView
+from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, require_mesh
 from thesisrecon.stereo._planar import PlanarRectification
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 from thesisrecon.views.render import Shading, render_mesh
-from thesisrecon.views.trilinear import VirtualCamera, default_intrinsics, pair_from_fundamental
-from thesisrecon.views.trilinear_synthesis import TensorSynthesis, prepare_synthesis
+from thesisrecon.views.tensor import VirtualCamera, default_intrinsics, pair_from_fundamental
+from thesisrecon.views.tensor_synthesis import TensorSynthesis, prepare_synthesis
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""

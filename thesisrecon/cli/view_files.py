@@ -37,7 +37,7 @@ from thesisrecon.runtime._run import Progress
 from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading
-from thesisrecon.views.trilinear import camera_at
+from thesisrecon.views.tensor import camera_at
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
 PATHS = ("orbit", "interpolate")

@@ -16,10 +16,10 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
 from thesisrecon.epipolar._planes import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
-from thesisrecon.epipolar._refinement import SAMPSON, refine
 from thesisrecon.epipolar._sampling import sampson_distances
+from thesisrecon.epipolar.criteria import SAMPSON, refine
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.numerics._noise import student_factor
+from thesisrecon.optimize.noise import student_factor
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 NEIGHBOURS = 5

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry.conditioning import unit_norm
 
 # Ratio of the spread across to the spread along the main direction below which points count as collinear.
 COLLINEAR = 1e-9

@@ -10,7 +10,7 @@ import scipy
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._noise import MAD_FACTOR
+from thesisrecon.optimize.noise import MAD_FACTOR
 
 # Standard deviation of the noise's tail, and lower bound of that of wrong residuals, relative to the noise.
 TAIL, _SEPARATION = 4.0, 12.0

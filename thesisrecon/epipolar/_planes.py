@@ -11,7 +11,7 @@ from numpy.random import Generator
 
 from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.numerics._small_solvers import orthogonalize_columns, shortest_column
+from thesisrecon.geometry.small_matrices import orthogonalize_columns, shortest_column
 
 # H is singular at a match if det J J' is below the first times its squared trace; it then has the second
 # squared distance.

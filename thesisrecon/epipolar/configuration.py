@@ -29,13 +29,13 @@ from thesisrecon.epipolar._planes import (
     plane_covariance,
     refine_plane,
 )
-from thesisrecon.epipolar._refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.epipolar._sampling import sampson_distances
-from thesisrecon.geometry._homography import homography_sampson_residuals
-from thesisrecon.geometry._metric_frame import nearest_rotation
+from thesisrecon.epipolar.criteria import SAMPSON, UNBOUNDED, refine
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics._small_solvers import solve_damped
+from thesisrecon.geometry.homography import homography_sampson_residuals
+from thesisrecon.geometry.similarity import nearest_rotation
+from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.optimize.least_squares import minimize_residuals
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
 FOCALS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._refinement import fundamental_covariance
+from thesisrecon.epipolar.criteria import fundamental_covariance
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 

@@ -11,14 +11,14 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.epipolar._noise import noise_width
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry._conditioning import unit_norm
-from thesisrecon.geometry._homography import (
+from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homography import (
     homography_linear,
     homography_residuals,
     homography_sampson_residuals,
 )
-from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics._noise import VARIANCE_OF_INLIERS, next_inlier_limit
+from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
 
 _SAMPLE, _PARAMETERS = 4, 8
 _BATCH, _MAX_BATCHES, _SCORED = 128, 16, 1000

@@ -8,7 +8,7 @@ from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar._frame import MIN_PX, PairFrame, as_matches, check_matches
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import normalizing_transform, unit_norm
+from thesisrecon.geometry.conditioning import normalizing_transform, unit_norm
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two
 

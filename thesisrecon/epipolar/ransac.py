@@ -12,8 +12,8 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._frame import PairFrame, check_matches
 from thesisrecon.epipolar._noise import noise_scale
-from thesisrecon.epipolar._refinement import fundamental_covariance
 from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
+from thesisrecon.epipolar.criteria import fundamental_covariance
 from thesisrecon.epipolar.linear import seven_point
 from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
 from thesisrecon.errors import StageFailure

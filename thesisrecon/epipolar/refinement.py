@@ -13,7 +13,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar._refinement import (
+from thesisrecon.epipolar.criteria import (
     EPIPOLAR_DISTANCE,
     REPROJECTION,
     SAMPSON,
@@ -22,9 +22,9 @@ from thesisrecon.epipolar._refinement import (
     residuals_and_derivatives,
 )
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry._conditioning import unit_norm
+from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
+from thesisrecon.optimize.least_squares import minimize_residuals
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
 Parameters = Literal["orthonormal", "row", "row-and-column"]

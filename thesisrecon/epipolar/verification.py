@@ -11,8 +11,8 @@ from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homography
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry._conditioning import unit_norm
-from thesisrecon.geometry._homography import homography_linear, homography_residuals
+from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homography import homography_linear, homography_residuals
 from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 

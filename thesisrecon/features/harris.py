@@ -17,7 +17,7 @@ from thesisrecon.features._kernels import (
     fit_maxima,
     squared_suppression_radii,
 )
-from thesisrecon.geometry._image_filters import gaussian_taps, smooth
+from thesisrecon.imaging.filters import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
 # det / trace (grey levels squared) below which corners are quantisation and compression noise.

@@ -13,7 +13,7 @@ from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, select_spread
 from thesisrecon.features.oblique import ObliqueView, oblique_views
-from thesisrecon.geometry._image_filters import halve, resample, smooth
+from thesisrecon.imaging.filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 PATCH_SIDE = 8

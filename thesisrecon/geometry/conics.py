@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import checked_inverse, checked_unit, require_finite
+from thesisrecon.arrays import F64, require_finite
+from thesisrecon.geometry.conditioning import checked_inverse, checked_unit
 
 ABSOLUTE_CONIC = np.eye(3)
 """Omega on the plane at infinity of a metric frame (3.2)."""

@@ -17,8 +17,8 @@ import math
 import numpy as np
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import checked_unit, require_finite, require_shapes
+from thesisrecon.arrays import F64, require_finite, require_shapes
+from thesisrecon.geometry.conditioning import checked_unit
 from thesisrecon.geometry.homogeneous import cross_matrix
 
 _Two = tuple[float, float]

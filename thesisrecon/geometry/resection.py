@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry._conditioning import normalizing_transform, require_finite
+from thesisrecon.arrays import F64, I64, require_finite
+from thesisrecon.geometry.conditioning import normalizing_transform
 
 
 def resect_linear(X: F64, xy: F64) -> F64:

@@ -2,52 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import require_finite, require_shapes
-from thesisrecon.geometry._metric_frame import nearest_rotation
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """The similarity y = scale R x + t.
-
-    Parameters
-    ----------
-    scale : float
-        Positive factor.
-    R, t : ndarray (3, 3), ndarray (3,)
-        Rotation and translation.
-    """
-
-    scale: float
-    R: F64
-    t: F64
-
-    def apply(self, X: F64) -> F64:
-        """Transform points.
-
-        Parameters
-        ----------
-        X : ndarray (N, 3)
-            Points.
-
-        Returns
-        -------
-        ndarray (N, 3)
-        """
-        return np.asarray(self.scale * X @ self.R.T + self.t)
-
-    @property
-    def matrix(self) -> F64:
-        """Transform of homogeneous points (4, 4)."""
-        G = np.eye(4)
-        G[:3, :3] = self.scale * self.R
-        G[:3, 3] = self.t
-        return G
+from thesisrecon.arrays import F64, require_finite, require_shapes
+from thesisrecon.records import Similarity
 
 
 def estimate_similarity(source: F64, target: F64) -> Similarity:
@@ -114,3 +72,9 @@ def rotation_errors_deg(R: F64, R_true: F64) -> F64:
     # The chord keeps its digits at small angles, where arccos of the trace loses half of them.
     chord = np.linalg.norm(difference - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
     return np.asarray(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))))
+
+
+def nearest_rotation(A: F64) -> F64:
+    """The rotation nearest to A (3, 3) in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(A)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import checked_unit, require_finite, unit_norm, unit_tensor
+from thesisrecon.arrays import F64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.conditioning import checked_unit, unit_norm, unit_tensor
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 

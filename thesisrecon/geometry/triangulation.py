@@ -10,7 +10,6 @@ References: Hartley and Sturm, "Triangulation", CVIU 68(2), 1997.
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import numpy as np
 
@@ -18,11 +17,9 @@ from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.numerics._partial_bundle import minimize_reprojection
-from thesisrecon.numerics._small_solvers import orthogonalize_columns, shortest_column
+from thesisrecon.geometry.small_matrices import orthogonalize_columns, shortest_column
 
-_PASSES = 10
+PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
 _AT_REST = 1e-6
 """Relative change of all depths at which the iterated linear method has converged."""
@@ -183,22 +180,8 @@ def _triangulate_each_linear(
             copy_to(X[j], y)
 
 
-Method = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
-_SortedPixels = tuple[I64, I64, F64]
+SortedPixels = tuple[I64, I64, F64]
 """Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
-
-
-def triangulate_points(P: F64, xy: F64, *, method: Method | None = None) -> F64:
-    """Triangulate points by a method of section 6.3; see :func:`thesisrecon.triangulate`."""
-    method = method or ("polynomial" if len(P) == 2 else "optimal")
-    if method == "polynomial":
-        return triangulate_polynomial(P, xy)
-    listed = _listed(xy)
-    if method == "midpoint":
-        return _midpoint(P, listed)
-    if method == "optimal":
-        return _optimal(P, listed)
-    return _linear(P, listed, _PASSES if method == "iterated" else 0)
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
@@ -219,7 +202,7 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
         view, point, xy = view[order], point[order], xy[order]
     start = np.searchsorted(point, np.arange(n_points + 1)).astype(np.int64)
     listed = (start, np.ascontiguousarray(view, dtype=np.int64), np.ascontiguousarray(xy, dtype=np.float64))
-    return _linear(P, listed, 0)
+    return triangulate_linear(P, listed, 0)
 
 
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
@@ -245,7 +228,7 @@ def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: 
     return angles
 
 
-def _listed(xy: F64) -> _SortedPixels:
+def sort_by_point(xy: F64) -> SortedPixels:
     """List the observations of xy (V, N, 2) that are not NaN, point by point."""
     n_points = xy.shape[1]
     point, view = np.nonzero(~np.isnan(xy[:, :, 0] + xy[:, :, 1]).T)
@@ -253,7 +236,7 @@ def _listed(xy: F64) -> _SortedPixels:
     return start, np.ascontiguousarray(view), xy.reshape(-1, 2).take(view * n_points + point, axis=0)
 
 
-def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
+def triangulate_linear(P: F64, listed: SortedPixels, passes: int) -> F64:
     """Linear method (6.3.1): least sum of squares of u p3'X - p1'X and v p3'X - p2'X over unit X.
 
     The rows of a view are divided by the norm of the first two rows of M (in a metric frame the focal
@@ -273,7 +256,7 @@ def _linear(P: F64, listed: _SortedPixels, passes: int) -> F64:
     return X
 
 
-def _midpoint(P: F64, listed: _SortedPixels) -> F64:
+def triangulate_midpoint(P: F64, listed: SortedPixels) -> F64:
     """Point nearest to all rays (6.3.2), meaningful in a metric frame only; zeros for parallel rays."""
     start, view, xy = listed
     M = P[:, :, :3]
@@ -294,12 +277,3 @@ def _midpoint(P: F64, listed: _SortedPixels) -> F64:
     X = np.zeros((len(start) - 1, 4))
     X[good] = homogenize(np.linalg.solve(A[good], b[good])[:, :, 0] + origin)
     return X
-
-
-def _optimal(P: F64, listed: _SortedPixels) -> F64:
-    """Local minimum of the reprojection error by Levenberg-Marquardt from the linear result."""
-    start, view, pixels = listed
-    point = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    X = minimize_reprojection(P, _linear(P, listed, 0), view, point, pixels)
-    sizes = np.linalg.norm(X, axis=1, keepdims=True)
-    return np.asarray(X / np.where(sizes > 0.0, sizes, 1.0))

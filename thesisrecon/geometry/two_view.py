@@ -7,14 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import (
-    checked_unit,
-    require_finite,
-    require_shapes,
-    unit_norm,
-)
+from thesisrecon.arrays import F64, require_finite, require_shapes
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.conditioning import checked_unit, unit_norm
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_normals
 
 

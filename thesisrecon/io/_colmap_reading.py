@@ -21,7 +21,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._colmap_writing import PIXEL_CENTRE, POINT_2D
 from thesisrecon.io._files import first_repeated, read_bytes, require_image_name
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 
 _FILES = ("cameras", "images", "points3D")
 _MAX_BYTES = 2**32

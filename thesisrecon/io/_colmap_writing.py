@@ -17,10 +17,10 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64, U8, rows_of_views
-from thesisrecon.geometry.camera_matrix import project_camera
+from thesisrecon.camera import project_camera
 from thesisrecon.io._files import write_atomically
 from thesisrecon.records import Reconstruction
-from thesisrecon.sparse_model import SparseModel
+from thesisrecon.results import SparseModel
 
 PIXEL_CENTRE = 0.5
 _SKEW_REL = 1e-9

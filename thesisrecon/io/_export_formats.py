@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64, rows_of_views
-from thesisrecon.geometry.camera_matrix import undistort
+from thesisrecon.camera import undistort
 from thesisrecon.io._colmap_writing import PIXEL_CENTRE, colors_of
 from thesisrecon.io._exports import write_point_cloud
 from thesisrecon.io._files import write_atomically, write_json, write_text
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 
 _LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 """From axes x right, y down, z forward to x right, y up, z back."""

@@ -17,9 +17,8 @@ import PIL.Image
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry._from_arrays import require_mesh
 from thesisrecon.io._files import read_bytes
-from thesisrecon.records import TexturedMesh
+from thesisrecon.records import TexturedMesh, require_mesh
 
 _TEXTURE_FORMATS = ("JPEG", "PNG")
 _MAX_TEXELS = 2**26

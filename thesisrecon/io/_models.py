@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._colmap_reading import MAX_SIDE_PX, is_colmap_model, read_colmap_model
 from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name
-from thesisrecon.sparse_model import SparseModel, SparseView
+from thesisrecon.results import SparseModel, SparseView
 
 _ROUNDING = 1e-3
 """Deviation from a rotation that the printed digits of a pose may leave."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.geometry._image_filters import halve, resample
+from thesisrecon.imaging.filters import halve, resample
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 
 SIDE = 15

@@ -11,9 +11,9 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._alignment import strongest_distinct
 from thesisrecon.matching._prepared import empty_matches, join_matches, select_matches
-from thesisrecon.numerics._nearest import nearest_neighbours
+from thesisrecon.matching.track_alignment import strongest_distinct
+from thesisrecon.optimize.nearest_neighbours import nearest_neighbours
 from thesisrecon.records import Features, Matches, Seeds
 
 BLOCK, LANES = 64, 64

@@ -12,7 +12,6 @@ from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.matching._alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
@@ -31,7 +30,8 @@ from thesisrecon.matching._prepared import (
     window_raster,
 )
 from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
-from thesisrecon.numerics._nearest import nearest_neighbours
+from thesisrecon.matching.track_alignment import align_corners, align_matches, strongest_distinct
+from thesisrecon.optimize.nearest_neighbours import nearest_neighbours
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Two corners of an image closer than this, in pixels of their scale, may be one scene point.

@@ -10,7 +10,6 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._alignment import align_matches
 from thesisrecon.matching._prepared import (
     SIDE,
     EstimateFundamental,
@@ -19,6 +18,7 @@ from thesisrecon.matching._prepared import (
     one_to_one,
     prepare_image,
 )
+from thesisrecon.matching.track_alignment import align_matches
 from thesisrecon.records import Features, Image, Matches
 
 # Tolerance of the relative difference of two displacements.

@@ -13,9 +13,9 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
-from thesisrecon.matching._alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.matching._prepared import MapAll, PreparedImage
-from thesisrecon.numerics._observations import cached_pair_order
+from thesisrecon.matching.track_alignment import AFFINE_STD, MIN_CORRELATION, align_corners
+from thesisrecon.optimize.bundle.observations import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0

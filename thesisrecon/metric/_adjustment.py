@@ -10,7 +10,14 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
-from thesisrecon.numerics._block_scatter import (
+from thesisrecon.optimize.bundle.metric import (
+    MAX_ITERATIONS,
+    BundleOptions,
+    MetricBundleResult,
+    refine_metric_bundle,
+)
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.scatter import (
     BlockScatter,
     LinearisedFit,
     PoseUncertainty,
@@ -18,14 +25,7 @@ from thesisrecon.numerics._block_scatter import (
     linearise_fit,
     pose_uncertainty,
 )
-from thesisrecon.numerics._metric_bundle import (
-    MAX_ITERATIONS,
-    BundleOptions,
-    MetricBundleResult,
-    refine_metric_bundle,
-)
-from thesisrecon.numerics._noise import best_huber_width, noise_from_distances
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.noise import best_huber_width, noise_from_distances
 
 MIN_OBSERVATIONS = 40
 MAX_LOSS_SIGMAS = 20.0

@@ -18,7 +18,7 @@ from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
-from thesisrecon.numerics._block_scatter import point_blocks
+from thesisrecon.optimize.bundle.scatter import point_blocks
 
 FOLDS = 5
 """In each view one of this number of blocks of the scene is held out."""

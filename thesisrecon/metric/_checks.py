@@ -21,9 +21,9 @@ from thesisrecon.metric._model import (
     residual_norms,
 )
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
-from thesisrecon.numerics._metric_bundle import MAX_SIGMAS_TO_MINIMUM
-from thesisrecon.numerics._noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.numerics._partial_bundle import refine_pose
+from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
+from thesisrecon.optimize.bundle.partial import refine_pose
+from thesisrecon.optimize.noise import MAD_FACTOR, noise_from_distances
 from thesisrecon.records import IntrinsicInterval, SelfCalibration
 
 OWN = 2

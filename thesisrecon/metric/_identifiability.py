@@ -7,18 +7,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from thesisrecon.arrays import I64
-from thesisrecon.geometry._critical_motions import UpgradedCameras
+from thesisrecon.geometry.critical_motions import UpgradedCameras
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import FOCAL, MetricEstimate
 from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
-from thesisrecon.numerics._identifiability import (
+from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
     excess_equations,
     identifiability_report,
 )
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.records import IdentifiabilityReport, IntrinsicInterval
 
 MIN_OBSERVATIONS = 10

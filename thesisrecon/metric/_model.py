@@ -8,12 +8,12 @@ import numpy as np
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._metric_frame import upgrade_cameras, upgrade_points
-from thesisrecon.geometry.camera_matrix import undistort
+from thesisrecon.camera import undistort
+from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._metric_kernels import MetricCameras, MetricModel, image_points
-from thesisrecon.numerics._partial_bundle import refine_points
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, MetricModel, image_points
+from thesisrecon.optimize.bundle.partial import refine_points
 from thesisrecon.records import Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.

@@ -8,7 +8,6 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice, counted
-from thesisrecon.geometry.robust_resection import resect_calibrated
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
 from thesisrecon.metric._confirmed_pose import confirmed_pose
 from thesisrecon.metric._model import (
@@ -24,7 +23,8 @@ from thesisrecon.metric._model import (
     retriangulate_tracks,
     seen_views,
 )
-from thesisrecon.numerics._partial_bundle import refine_pose
+from thesisrecon.optimize.bundle.partial import refine_pose
+from thesisrecon.optimize.robust_resection import resect_calibrated
 
 ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
 """Factors tried on the focal length of a camera that shares it with no registered view."""

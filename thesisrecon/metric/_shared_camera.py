@@ -28,10 +28,10 @@ from thesisrecon.metric._model import (
     reproject_observations,
 )
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
-from thesisrecon.numerics._block_scatter import BlockScatter, linearise_fit
-from thesisrecon.numerics._metric_bundle import MetricBundleResult, refine_metric_bundle
-from thesisrecon.numerics._metric_kernels import MetricCameras, move_poses
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric import MetricBundleResult, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, move_poses
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.scatter import BlockScatter, linearise_fit
 
 CENTRE_STD = 0.1
 """Prior of free principal points in long sides; images may be crops."""

@@ -1,7 +1,7 @@
 """Standard deviations of the intrinsics, and the hierarchical prior of cameras of the same kind.
 
 The covariance of bundle adjustment assumes independent noise and an exact camera model. It is inflated by the
-disagreement of blocks of the scene (:mod:`thesisrecon.numerics._block_scatter`). Errors common to all blocks
+disagreement of blocks of the scene (:mod:`thesisrecon.optimize.bundle.scatter`). Errors common to all blocks
 do not show there; a floor stands for them, applied only if the data show lack of fit.
 
 Images of the same size are likely from the same kind of lens. With per-camera estimates q_i of variance s_i^2
@@ -21,8 +21,8 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
-from thesisrecon.numerics._block_scatter import BlockScatter, PoseUncertainty
-from thesisrecon.numerics._noise import MAD_FACTOR, student_factor
+from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
+from thesisrecon.optimize.noise import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry._critical_motions import measure_motion, nearest_critical_motion
+from thesisrecon.geometry.critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
@@ -67,9 +67,9 @@ from thesisrecon.metric._uncertainty import (
     widen_by_camera_model,
     widen_unverified_focals,
 )
-from thesisrecon.numerics._block_scatter import BlockScatter
-from thesisrecon.numerics._identifiability import excess_noise
-from thesisrecon.numerics._noise import noise_from_distances
+from thesisrecon.optimize.bundle.identifiability import excess_noise
+from thesisrecon.optimize.bundle.scatter import BlockScatter
+from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
 
 MIN_CHANGE = 0.002

@@ -19,7 +19,7 @@ from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
 from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
-from thesisrecon.numerics._observations import Observations, sort_observations
+from thesisrecon.optimize.bundle.observations import Observations, sort_observations
 from thesisrecon.pipeline._image_pair import values_at, verify_matches
 from thesisrecon.pipeline._matching_stages import finish_matches
 from thesisrecon.pipeline._parts import tracks_of_part

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon._plug_ins import FunctionMatcher, matches_of
 from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
+from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import StageFailure
 from thesisrecon.matching._prepared import Found, select_found, select_matches
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView

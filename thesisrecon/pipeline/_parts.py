@@ -14,16 +14,15 @@ import scipy
 
 from thesisrecon._code_digest import code_digest
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
+from thesisrecon.camera import project_camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._metric_frame import nearest_rotation
-from thesisrecon.geometry.camera_matrix import project_camera
-from thesisrecon.geometry.similarity import Similarity
+from thesisrecon.geometry.similarity import nearest_rotation
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.matching._repeated_structure import strong_pairs
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.records import Reconstruction, Tracks, TwoView
+from thesisrecon.records import Reconstruction, Similarity, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, stream
 
 MAX_CUT = 0.1

@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.numerics._on_demand import OnDemand
+from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
 from thesisrecon.pipeline._parts import cameras_from_parts
 from thesisrecon.pipeline._second_pass import from_metric, register_more

@@ -13,10 +13,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.imaging.on_demand import RecentlyUsed
 from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
-from thesisrecon.numerics._observations import cached_pair_order
-from thesisrecon.numerics._on_demand import RecentlyUsed
+from thesisrecon.optimize.bundle.observations import cached_pair_order
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Run

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon._settings import tables_from_config
 from thesisrecon.arrays import F64
+from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet

@@ -8,12 +8,12 @@ import numpy as np
 
 from thesisrecon._numba import full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._conditioning import centred_frame, whitening_transform
+from thesisrecon.geometry.conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.numerics._noise import noise_from_distances
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._partial_bundle import refine_points
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.partial import refine_points
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
+from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.projective._track_selection import observation_cells
 from thesisrecon.records import Reconstruction, Tracks
 

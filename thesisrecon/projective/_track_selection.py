@@ -11,9 +11,9 @@ import scipy.sparse
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry._conditioning import pixel_from_unit
-from thesisrecon.geometry.triangulation import triangulate_points
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
+from thesisrecon.optimize.triangulation import triangulate_points
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.

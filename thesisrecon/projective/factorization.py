@@ -14,12 +14,12 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
-from thesisrecon.geometry._conditioning import normalizing_transform
-from thesisrecon.geometry._homography import homography_linear, homography_sampson_residuals
 from thesisrecon.geometry.camera_matrix import orient_signs
+from thesisrecon.geometry.conditioning import normalizing_transform
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homography import homography_linear, homography_sampson_residuals
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.numerics._noise import noise_from_distances
+from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
 from thesisrecon.projective._track_selection import (
     NO_PARALLAX,

@@ -15,9 +15,9 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
-from thesisrecon.geometry.robust_resection import resect_projective
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
-from thesisrecon.numerics._partial_bundle import refine_camera
+from thesisrecon.optimize.bundle.partial import refine_camera
+from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
     ProjectiveModel,

@@ -11,7 +11,7 @@ from thesisrecon import __version__
 from thesisrecon.report._assessment import count_of
 from thesisrecon.report._figures import model_scene, scene_figure, upright_rotation
 from thesisrecon.report._page import figure_content, page_resource, render_page
-from thesisrecon.sparse_model import THRESHOLDS, ModelComparison
+from thesisrecon.results import THRESHOLDS, ModelComparison
 
 COLORS = {"a": ("#ff9f43", "#ffc78a"), "b": ("#3fb8ff", "#9fd8f7")}
 """Cameras and points of each model."""

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64, U8, rows_of_views
+from thesisrecon.camera import distort
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import distort, project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import (
     HeldOut,

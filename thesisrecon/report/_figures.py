@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import camera_centre, decompose_camera, finite_cameras
+from thesisrecon.camera import decompose_camera, finite_cameras
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Reconstruction, TwoView
-from thesisrecon.sparse_model import SparseModel
+from thesisrecon.results import SparseModel
 
 MAX_POINTS = 25_000
 _BINS = 28

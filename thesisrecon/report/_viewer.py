@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.camera import decompose_camera
 from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import pictured
 from thesisrecon.report._drawing import embed_jpeg

@@ -84,7 +84,8 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
 
 
 def _code_and_machine(lines: Sequence[str]) -> str:
-    processor = copy_to.targetctx.codegen().magic_tuple()
+    dispatcher: Any = copy_to
+    processor = dispatcher.targetctx.codegen().magic_tuple()
     return key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
 
 

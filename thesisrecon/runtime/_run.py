@@ -14,8 +14,8 @@ from typing import Any, Literal, TypedDict, get_args
 import numpy as np
 
 from thesisrecon._code_digest import code_digest
-from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.errors import Notice, OutputError, UsageError, WorkersLost, unknown_word
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads

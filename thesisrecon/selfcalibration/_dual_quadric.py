@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics._noise import huber
+from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.noise import huber
 from thesisrecon.selfcalibration._candidates import FOCAL_LIMITS, Candidate
 from thesisrecon.selfcalibration._frame import ReferenceFrame, SolverUnknowns
 from thesisrecon.selfcalibration._refinement import central_differences, dual_image_residuals, quadratic_rows

@@ -11,7 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import pixel_from_unit
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Reconstruction
 

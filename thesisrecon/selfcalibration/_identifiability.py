@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry._critical_motions import nearest_critical_motion, projective_infinity_shifts
-from thesisrecon.geometry._metric_frame import upgrade_cameras, upgrade_points
+from thesisrecon.geometry.critical_motions import nearest_critical_motion, projective_infinity_shifts
+from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._identifiability import (
+from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
     excess_equations,
     identifiability_report,
     identifiability_sentences,
 )
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._noise import noise_from_distances
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
 from thesisrecon.selfcalibration._frame import build_frame
 

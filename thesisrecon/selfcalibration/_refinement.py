@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._noise import soft_l1
+from thesisrecon.optimize.noise import soft_l1
 from thesisrecon.selfcalibration._frame import ReferenceFrame
 
 UPPER = np.triu_indices(3)

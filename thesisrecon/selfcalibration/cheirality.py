@@ -9,7 +9,6 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Reconstruction
-from thesisrecon.selfcalibration._cheirality import CheiralityRegion, Polytope, distinct_planes
 from thesisrecon.selfcalibration._frame import (
     ConicConstraints,
     PlaneCandidates,
@@ -19,6 +18,7 @@ from thesisrecon.selfcalibration._frame import (
 )
 from thesisrecon.selfcalibration._image_conic import solve_conic_batch
 from thesisrecon.selfcalibration._refinement import minimize_batch
+from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion, Polytope, distinct_planes
 
 
 @dataclass(frozen=True)

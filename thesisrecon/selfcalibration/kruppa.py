@@ -18,11 +18,11 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry._conditioning import pixel_from_unit, unit_norm
+from thesisrecon.geometry.conditioning import pixel_from_unit, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.numerics._levenberg_marquardt import minimize_residuals
-from thesisrecon.numerics._noise import soft_l1
+from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.noise import soft_l1
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     Candidate,

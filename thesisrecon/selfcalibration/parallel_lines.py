@@ -14,9 +14,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.numerics._noise import MAD_FACTOR
+from thesisrecon.optimize.noise import MAD_FACTOR
 from thesisrecon.records import Image
-from thesisrecon.selfcalibration._cheirality import CheiralityRegion
 from thesisrecon.selfcalibration._frame import (
     PlaneCandidates,
     ProjectiveScene,
@@ -25,6 +24,7 @@ from thesisrecon.selfcalibration._frame import (
 )
 from thesisrecon.selfcalibration._line_segments import LineSegments
 from thesisrecon.selfcalibration._refinement import minimize_batch
+from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion
 
 # Segments within this many tolerances of a direction are not used for another one.
 _NEAR_TOLERANCES = 4.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry._conditioning import pixel_from_unit
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.records import Image, Reconstruction, SelfCalibration

@@ -13,9 +13,9 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.imaging.resampling import bilinear_samples
 from thesisrecon.records import PinholeView
 from thesisrecon.stereo._depth_kernels import fuse_inverse_depths, inverse_depths, update_kalman
-from thesisrecon.stereo._resampling import bilinear_samples
 from thesisrecon.stereo.correspondence import Correspondence
 
 Correspond = Callable[[int, int], Correspondence | None]

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, resizing_transform
 from thesisrecon.errors import Notice, StageFailure
-from thesisrecon.geometry._conditioning import resizing_transform
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.resampling import Rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
@@ -31,7 +31,6 @@ from thesisrecon.stereo._rectification_quality import (
     homography_jacobians,
     singular_values,
 )
-from thesisrecon.stereo._resampling import Rectification
 
 SEARCH = 96
 """Lines at infinity that are tried before the best is refined."""

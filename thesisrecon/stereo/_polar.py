@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.imaging.resampling import Rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
@@ -22,7 +23,6 @@ from thesisrecon.stereo._epipolar_pair import (
     image_corners,
 )
 from thesisrecon.stereo._rectification_quality import disparity_gradients, matches_in_frame
-from thesisrecon.stereo._resampling import Rectification
 
 ANGLES = 4096
 """Number of half-planes at which the row spacing is computed."""

@@ -9,8 +9,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.imaging.resampling import Rectification
 from thesisrecon.stereo._epipolar_pair import EpipolarPair, Size
-from thesisrecon.stereo._resampling import Rectification
 
 STEP_PX = 0.01
 """Half step of numerical derivatives."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.errors import StageFailure
+from thesisrecon.imaging.resampling import Rectification, bilinear_samples
 from thesisrecon.records import DisparityMap, Image, PinholeView
 from thesisrecon.stereo._cost import MAX_DISPARITIES
 from thesisrecon.stereo._postprocessing import match_both_sides
-from thesisrecon.stereo._resampling import Rectification, bilinear_samples
 from thesisrecon.stereo.rectification import METHODS, PLANAR, disparity_range, rectify_cameras, rectify_pair
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching

@@ -14,13 +14,13 @@ from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.numerics._on_demand import MappingOnDemand
+from thesisrecon.imaging.on_demand import MappingOnDemand
+from thesisrecon.imaging.resampling import pinhole_frame, pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
 from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
 from thesisrecon.stereo._frustum_samples import frustum_samples, project_inside
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
-from thesisrecon.stereo._resampling import pinhole_frame, pinhole_view
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
 BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0

@@ -10,6 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import Notice, StageFailure
+from thesisrecon.imaging.resampling import Rectification
 from thesisrecon.stereo._epipolar_pair import (
     EpipolarPair,
     Size,
@@ -20,7 +21,6 @@ from thesisrecon.stereo._epipolar_pair import (
 from thesisrecon.stereo._planar import common_orientation, hartley, loop_zhang, minimum_distortion
 from thesisrecon.stereo._polar import PolarRectification, polar
 from thesisrecon.stereo._rectification_quality import RectificationQuality, matches_in_frame, measure_quality
-from thesisrecon.stereo._resampling import Rectification
 
 MAX_TURN_DEG, MAX_ASPECT = 5.0, 0.1
 """Limits of the midline angle's deviation from 90 degrees, and of the change of the aspect ratio."""

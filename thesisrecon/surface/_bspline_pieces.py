@@ -15,7 +15,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.numerics._noise import MAD_FACTOR
+from thesisrecon.optimize.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import components, max_depth_slope, same_surface
 from thesisrecon.surface.linear import GRAZING_DEG

@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.camera import decompose_camera
 from thesisrecon.records import TexturedMesh
 
 RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))

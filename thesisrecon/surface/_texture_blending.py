@@ -12,8 +12,8 @@ import scipy
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._zbuffer import rasterize, rasterize_corners
-from thesisrecon.numerics._on_demand import OnDemand
+from thesisrecon.imaging.on_demand import OnDemand
+from thesisrecon.imaging.raster import rasterize, rasterize_corners
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import components, halve_surface, vertex_normals
 from thesisrecon.surface._texture_kernels import (

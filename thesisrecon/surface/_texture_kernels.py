@@ -8,7 +8,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64, U8
-from thesisrecon.geometry._image_filters import weighted_median
+from thesisrecon.imaging.filters import weighted_median
 
 
 class ViewSurface(NamedTuple):

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I32
-from thesisrecon.numerics._noise import MAD_FACTOR
+from thesisrecon.optimize.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._bspline_pieces import (
     SplinePieces,

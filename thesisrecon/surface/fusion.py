@@ -19,8 +19,9 @@ import scipy
 
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64
+from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import decompose_camera, project
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._fusion_kernels import (
     SIDE,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.camera import decompose_camera
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._mesh import (
     FALLING,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from thesisrecon._threads import ThreadPool
-from thesisrecon.numerics._on_demand import OnDemand
+from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion

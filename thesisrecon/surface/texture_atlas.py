@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.arrays import F64, I64, U8, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, StageFailure
-from thesisrecon.geometry._conditioning import resizing_transform
-from thesisrecon.geometry._image_filters import resample, smooth
-from thesisrecon.numerics._on_demand import OnDemand
+from thesisrecon.imaging.filters import resample, smooth
+from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.records import PinholeView, TexturedMesh
 from thesisrecon.surface._mesh import connected_parts, face_neighbours, select_faces
 from thesisrecon.surface._texture_blending import (

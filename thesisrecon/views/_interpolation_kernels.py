@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64
-from thesisrecon.geometry._image_filters import weighted_median
+from thesisrecon.imaging.filters import weighted_median
 
 ONE_SURFACE_PX = 1.0
 """Neighbouring disparities that differ by more belong to different surfaces."""

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I16, I32
-from thesisrecon.geometry._image_filters import cubic_weights
-from thesisrecon.geometry._zbuffer import run_in_strips
+from thesisrecon.imaging.filters import cubic_weights
+from thesisrecon.imaging.raster import run_in_strips
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle extends beyond its edges, so that rounding leaves no gaps."""

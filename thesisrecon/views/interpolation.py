@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.geometry._zbuffer import run_in_strips
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.raster import run_in_strips
 from thesisrecon.records import DisparityMap
 from thesisrecon.views._interpolation_kernels import (
     ONE_SURFACE_PX,

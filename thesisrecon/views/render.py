@@ -10,13 +10,7 @@ import numpy as np
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.geometry._zbuffer import (
-    Raster,
-    image_corners,
-    rasterize_rows,
-    run_in_strips,
-    sample_texture,
-)
+from thesisrecon.imaging.raster import Raster, image_corners, rasterize_rows, run_in_strips, sample_texture
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16

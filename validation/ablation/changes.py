@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from thesisrecon._settings import config_from_tables, dataclass_from_table
 from thesisrecon.config import KINDS, PipelineConfig, preset
+from thesisrecon.config.text import config_from_tables, dataclass_from_table
 from thesisrecon.errors import UsageError, unknown_word
 from validation.ablation.own import is_own, load_own
 from validation.ablation.study import FunctionTask

@@ -16,8 +16,8 @@ from typing import Any
 
 import thesisrecon
 from thesisrecon._code_digest import code_digest
-from thesisrecon._settings import table_from_dataclass, tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
+from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from thesisrecon._settings import table_from_dataclass, tables_from_config
+from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.io._files import write_json
 from thesisrecon.io._outputs import join_claim
 from validation.ablation.plan import Plan, PlannedRow, plan_study

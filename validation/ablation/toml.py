@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from thesisrecon._settings import config_from_tables, dataclass_from_table
 from thesisrecon.config import preset
+from thesisrecon.config.text import config_from_tables, dataclass_from_table
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.io._files import read_bytes
 from validation.ablation.own import is_own, load_own

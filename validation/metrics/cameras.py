@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import camera_centre, project_camera
+from thesisrecon.camera import project_camera
+from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.similarity import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import Reconstruction
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import scene_frame
-from thesisrecon.numerics._covariance import gauge_directions
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.optimize.bundle.covariance import gauge_directions
 from thesisrecon.records import MetricResult
 
 NAMES = ("focal_px", "principal_x_px", "principal_y_px")

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._conditioning import scene_frame
+from thesisrecon.geometry.conditioning import scene_frame
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.numerics._covariance import gauge_directions
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.covariance import gauge_directions
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from validation.references.libraries import pycolmap
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
 from thesisrecon.io._models import read_model
 from thesisrecon.records import Reconstruction, Tracks
 

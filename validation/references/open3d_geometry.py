@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.camera import Camera
-from thesisrecon.geometry.camera_matrix import decompose_camera
+from thesisrecon.camera import Camera, decompose_camera
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
 

@@ -14,8 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from thesisrecon.api.views import render
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.camera import Camera
-from thesisrecon.geometry.camera_matrix import project_camera, undistort
+from thesisrecon.camera import Camera, project_camera, undistort
 from thesisrecon.records import TexturedMesh
 from validation.scenes.materials import Material
 from validation.scenes.pose import Pose, look_at

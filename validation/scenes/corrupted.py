@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.arrays import F64, I64
 from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import MetricEstimate, camera_rows
-from thesisrecon.numerics._metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.records import Reconstruction
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.pose import UP, look_at, turntable
 from validation.scenes.rigs import observe

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.camera import compose_camera
 from validation.scenes.pose import look_at
 from validation.scenes.two_views import TwoViews
 

@@ -12,8 +12,8 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
-from thesisrecon.views.trilinear import CalibratedPair, default_intrinsics
-from thesisrecon.views.trilinear_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
+from thesisrecon.views.tensor import CalibratedPair, default_intrinsics
+from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.scenes.image_files import read_rgb
 from validation.scenes.stereo import read_disparity, stereo_folder
 

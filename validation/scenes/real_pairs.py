@@ -18,7 +18,7 @@ from PIL import Image
 
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.camera import compose_camera
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io._files import write_atomically

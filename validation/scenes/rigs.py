@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import compose_camera, project_camera
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube
 from validation.scenes.pose import look_at

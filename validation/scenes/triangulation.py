@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.camera_matrix import compose_camera
+from thesisrecon.camera import compose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import Group
 from validation.scenes.rigs import Rig, make_cloud

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from validation.scenes.pose import perturb
 
 Kind = Literal["street", "loop"]

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.records import Reconstruction
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task

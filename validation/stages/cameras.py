@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 import thesisrecon
-from thesisrecon._settings import config_from_tables
 from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.config.text import config_from_tables
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import read_json
 from thesisrecon.records import Reconstruction

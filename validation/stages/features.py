@@ -10,9 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thesisrecon.arrays import F64
+from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.features.harris import HarrisCorners
-from thesisrecon.geometry.camera_matrix import compose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io._images import read_images
 from thesisrecon.pipeline._image_pair import match_views

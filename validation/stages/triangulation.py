@@ -15,8 +15,8 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
 from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
 from validation.runs.rows import each, plot, read_arrays, row, scatter

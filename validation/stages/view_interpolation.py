@@ -11,7 +11,7 @@ import PIL.Image
 from thesisrecon.api.views import prepare_rectified_pair
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.views.trilinear import camera_at
+from thesisrecon.views.tensor import camera_at
 from validation.metrics.image_similarity import psnr_db, ssim
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal

@@ -13,9 +13,9 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.numerics._metric_bundle import BundleOptions, refine_metric_bundle
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.runs.processes import call_apart, timed
 from validation.runs.study import Part

@@ -22,8 +22,8 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.projective._track_selection import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement

@@ -15,9 +15,9 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.numerics._observations import Observations
-from thesisrecon.numerics._partial_bundle import refine_points
-from thesisrecon.numerics._projective_bundle import refine_projective_bundle
+from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.partial import refine_points
+from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks
 from thesisrecon.runtime._run import stream

@@ -6,8 +6,8 @@ import pytest
 
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.numerics._metric_kernels import MetricCameras
-from thesisrecon.numerics._observations import Observations
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from validation.references.ceres import cameras_from_colmap, colmap_model
 from validation.references.colmap import match_with_pycolmap
 from validation.references.colmap_reading import read_colmap_model

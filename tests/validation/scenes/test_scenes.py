@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from thesisrecon.geometry.camera_matrix import compose_camera, project
+from thesisrecon.camera import compose_camera
+from thesisrecon.geometry.camera_matrix import project
 from validation.runs.records import ReportOptions
 from validation.runs.scenes import load_images
 from validation.scenes.courtyard import build_courtyard

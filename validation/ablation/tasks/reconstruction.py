@@ -12,8 +12,8 @@ import numpy as np
 
 import thesisrecon
 from thesisrecon._code_digest import code_digest
-from thesisrecon._settings import tables_from_config
 from thesisrecon.config import KINDS, PipelineConfig
+from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Until

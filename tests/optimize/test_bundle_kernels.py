@@ -1,0 +1,448 @@
+"""Kernels of bundle adjustment against their NumPy twins, and adjustment of many cameras in blocks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy
+from scipy.spatial.transform import Rotation
+
+from tests.optimize.bundle_scenes import make_block, perturbed, project_block
+from thesisrecon.geometry.small_matrices import floored_diagonal
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.optimize import least_squares
+from thesisrecon.optimize.bundle import metric_kernels, scatter, schur
+from thesisrecon.optimize.bundle import projective_kernels as kernels
+from thesisrecon.optimize.bundle import reduced_solvers as solvers
+from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points, sum_leverages
+from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
+from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting, sort_observations
+from thesisrecon.optimize.bundle.scatter import _gram_matrix, block_scatter, linearise_fit, pose_uncertainty
+from thesisrecon.optimize.bundle.schur import BundleSystem, build_layout
+from thesisrecon.optimize.least_squares import invert_information
+from thesisrecon.optimize.noise import huber
+from validation.scenes.walks import make_walk
+
+
+def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):
+    c, n = block.cameras, len(xy)
+    width = c.intrinsics.shape[1]
+    J = Jacobians.empty(n, 6, width)
+    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, weighting = Observations(block.view, block.point, xy), Weighting(sigma, delta)
+    own = np.zeros(0, dtype=np.int64)
+    cost = metric_kernels.linearize_metric(model, seen, weighting, own, np.arange(width), J)
+    assert metric_kernels.metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
+    return cost, J
+
+
+def _moved(cameras, pose, intrinsics):
+    turn = Rotation.from_rotvec(pose[:, :3]).as_matrix()
+    q = cameras.intrinsics + intrinsics
+    q[:, 0] = cameras.intrinsics[:, 0] * np.exp(intrinsics[:, 0])
+    t = np.einsum("vab,vb->va", turn, cameras.t) + pose[:, 3:]
+    return metric_kernels.MetricCameras(turn @ cameras.R, t, q, cameras.group)
+
+
+@pytest.mark.parametrize("lens", [(), (-0.03, 0.02)])
+def test_metric_jacobians_match_finite_differences(lens):
+    block = make_block(k1=0.05, lens=lens, groups=2)
+    _, J = _linearized_metric(block, block.xy + 3.0)
+    V, G, h = len(block.cameras.R), 2, 1e-6
+
+    def difference(pose, intrinsics, X):
+        ends = [
+            project_block(
+                _moved(block.cameras, s * h * pose, s * h * intrinsics),
+                block.X + s * h * X,
+                block.view,
+                block.point,
+            )
+            for s in (1.0, -1.0)
+        ]
+        return (ends[0] - ends[1]) / (2.0 * h)
+
+    C = 6 + len(lens)
+    none = np.zeros((V, 6)), np.zeros((G, C)), np.zeros_like(block.X)
+    for c in range(6):
+        unit = np.eye(6)[c]
+        np.testing.assert_allclose(J.A[:, :, c], difference(none[0] + unit, *none[1:]), rtol=2e-5, atol=2e-4)
+    for c in range(C):
+        unit = np.eye(C)[c]
+        np.testing.assert_allclose(
+            J.E[:, :, c], difference(none[0], none[1] + unit, none[2]), rtol=2e-5, atol=2e-4
+        )
+    for c in range(3):
+        np.testing.assert_allclose(
+            J.B[:, :, c], difference(none[0], none[1], none[2] + np.eye(3)[c]), rtol=2e-5, atol=2e-4
+        )
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 5e-5, 1e-3, 1.0, 3.0])
+def test_poses_move_by_the_exponential_map(size):
+    rng = np.random.default_rng(3)
+    R, t = Rotation.random(9, random_state=rng).as_matrix(), rng.normal(size=(9, 3))
+    step = size * rng.normal(size=(9, 6))
+    R_out, t_out = np.empty_like(R), np.empty_like(t)
+    metric_kernels.move_poses(R, t, step, R_out, t_out)
+    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+    np.testing.assert_allclose(R_out, turn @ R, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], rtol=1e-14, atol=2e-15)
+
+
+def test_projective_jacobians_match_finite_differences():
+    rng = np.random.default_rng(4)
+    P = rng.normal(size=(3, 12))
+    X = rng.normal(size=(7, 4))
+    P /= np.linalg.norm(P, axis=1, keepdims=True)
+    X /= np.linalg.norm(X, axis=1, keepdims=True)
+    view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
+    xy = rng.normal(size=(21, 2))
+    J, state = Jacobians.empty(21, 11, 0), kernels.UnitState.at(P, X)
+    seen, weighting = Observations(view, point, xy), Weighting(1.0, np.inf)
+    cost = kernels.linearize_projective(state, seen, weighting, J)
+    assert kernels.projective_cost(state, seen, weighting) == pytest.approx(cost, rel=1e-12)
+    z = np.einsum("kab,kb->ka", P.reshape(3, 3, 4)[view], X[point])
+    np.testing.assert_allclose(J.residual, z[:, :2] / z[:, 2:] - xy, rtol=1e-12)
+    assert cost == pytest.approx(0.5 * np.sum(J.residual**2))
+
+    def residual(sP, sX):
+        moved_P, moved_X = np.empty_like(P), np.empty_like(X)
+        kernels.tangent_step(P, state.vP, state.bP, sP, moved_P)
+        kernels.tangent_step(X, state.vX, state.bX, sX, moved_X)
+        u = np.einsum("kab,kb->ka", moved_P.reshape(3, 3, 4)[view], moved_X[point])
+        return u[:, :2] / u[:, 2:]
+
+    h = 1e-7
+    for c in range(11):
+        step = h * np.tile(np.eye(11)[c], (3, 1))
+        slope = (residual(step, np.zeros((7, 3))) - residual(-step, np.zeros((7, 3)))) / (2 * h)
+        np.testing.assert_allclose(J.A[:, :, c], slope, rtol=1e-4, atol=1e-5 * np.abs(J.A).max())
+    for c in range(3):
+        step = h * np.tile(np.eye(3)[c], (7, 1))
+        slope = (residual(np.zeros((3, 11)), step) - residual(np.zeros((3, 11)), -step)) / (2 * h)
+        np.testing.assert_allclose(J.B[:, :, c], slope, rtol=1e-4, atol=1e-5 * np.abs(J.B).max())
+
+
+def test_the_loss_of_the_kernels_is_that_of_numpy():
+    block = make_block()
+    noise = np.random.default_rng(0).normal(size=block.xy.shape) * 2.0
+    cost, J = _linearized_metric(block, block.xy - noise, 1.5, 2.0)
+    s = np.sum((noise / 2.0) ** 2, axis=1)
+    rho, weight = huber(s, 1.5)
+    assert cost == pytest.approx(0.5 * rho.sum())
+    np.testing.assert_allclose(J.residual, np.sqrt(weight)[:, None] * noise / 2.0, rtol=1e-9, atol=1e-9)
+
+
+def _full_jacobian(J, layout):
+    """All columns of one problem side by side: blocks of the views, border, points."""
+    o, index, C = layout.observations, layout.index, layout.width
+    edge = C * len(index.pair)
+    seen = o.seen
+    full = np.zeros((2 * len(seen.xy), layout.size + 3 * (len(o.start) - 1)))
+    for k in range(len(seen.xy)):
+        rows, v, j = slice(2 * k, 2 * k + 2), index.block[seen.view_index[k]], seen.point_index[k]
+        if v >= 0:
+            full[rows, C * v : C * v + C] = J.A[k]
+        for f, column in enumerate(index.common[seen.view_index[k]]):
+            if column >= 0:
+                full[rows, edge + column] += J.E[k, :, f]
+        full[rows, layout.size + 3 * j : layout.size + 3 * j + 3] = J.B[k]
+    return full
+
+
+@pytest.mark.parametrize("solver", ["chosen", "banded"])
+@pytest.mark.parametrize("twice", [False, True])
+def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
+    block = make_block(views=6, points=30, groups=2)
+    rng = np.random.default_rng(2)
+    view = block.view.copy()
+    if twice:
+        view[1] = view[0]
+    seen = Observations(view, block.point, block.xy + rng.normal(size=block.xy.shape))
+    o = sort_observations(seen, 6, 30)
+    c = block.cameras
+    # View 0 is fixed; focals are per view, the rest belongs to two groups, one without third coefficient.
+    own, common = np.array([0]), np.arange(1, 6)
+    columns = np.arange(5) + 5 * c.group[:, None]
+    columns[c.group == 1, 4] = -1
+    layout = build_layout(o, np.arange(6) - 1, width=7, common=columns, border=9)
+    assert layout.solver is None
+    if solver == "banded":
+        layout = replace(layout, solver=solvers.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
+    J = layout.jacobians()
+    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    cost = metric_kernels.linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
+    gradient = np.zeros(layout.size)
+    gradient[[6, 40]] = [3.0, -3.0]
+    prior = np.array([6, 40, 38]), np.array([40, -1, 42]), np.array([2e4, 5e3, 3e4]), gradient
+    system = BundleSystem(cost, layout, J, prior)
+    (camera_step, point_step), gain, of_cameras = system.solve(1e-3)
+
+    full, r, D = _full_jacobian(J, layout), J.residual.ravel(), layout.size
+    H, g = full.T @ full, full.T @ r
+    H[np.ix_([38, 42], [38, 42])] += [[3e4, -3e4], [-3e4, 3e4]]
+    H[6, 6] += 2e4
+    H[40, 40] += 2.5e4
+    H[6, 40] -= 2e4
+    H[40, 6] -= 2e4
+    g[:D] += gradient
+    damped = H + 1e-3 * np.diag(floored_diagonal(np.diag(H)))
+    expected = np.linalg.solve(damped, -g)
+    np.testing.assert_allclose(camera_step, expected[:D], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(point_step.ravel(), expected[D:], rtol=1e-5, atol=1e-8)
+    assert gain == pytest.approx(-g @ expected - 0.5 * expected @ H @ expected, rel=1e-5)
+    # The gain of the cameras is without that of the points alone.
+    of_points = g[D:] @ np.linalg.solve(damped[D:, D:], g[D:])
+    assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
+
+
+def test_image_points_are_those_of_the_residuals_with_their_depths():
+    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=50)
+    c = block.cameras
+    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen = Observations(block.view, block.point, block.xy)
+    xy, depth = metric_kernels.image_points(model, block.view, block.point)
+    np.testing.assert_allclose(xy - block.xy, metric_kernels.project_metric(model, seen), atol=1e-9)
+    wanted = np.einsum("kb,kb->k", c.R[block.view, 2], block.X[block.point]) + c.t[block.view, 2]
+    np.testing.assert_allclose(depth, wanted)
+
+
+def test_chunks_give_the_sums_of_the_whole(monkeypatch):
+    block = make_block(views=6, points=200, groups=1)
+    cameras, X = perturbed(block)
+    seen, free = Observations(block.view, block.point, block.xy), ~np.isin(np.arange(6), [1, 2, 5])
+    whole = refine_metric_bundle(cameras, X, seen, free=free)
+    monkeypatch.setattr(schur, "CHUNK", 100)
+    np.testing.assert_allclose(refine_metric_bundle(cameras, X, seen, free=free).X, whole.X, atol=1e-6)
+
+
+def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
+    rng = np.random.default_rng(5)
+    row, column = np.array([0, 0, 1, 2, 2, 3]), np.array([0, 2, 1, 2, 3, 3])
+    blocks = rng.normal(size=(6, 2, 2))
+    blocks[row == column] += np.swapaxes(blocks[row == column], 1, 2)
+    border, corner = rng.normal(size=(4, 2, 3)), rng.normal(size=(3, 3))
+    corner += corner.T
+    dense = np.zeros((11, 11))
+    for i in range(6):
+        dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
+    dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
+    full = np.triu(dense) + np.triu(dense, 1).T
+    system = solvers.ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
+    more, pair = np.arange(11.0), np.full((4, 4), -1)
+    pair[row, column] = np.arange(6)
+    solvers.add_diagonal(blocks, pair, corner, more)
+    full += np.diag(more)
+    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
+    place = np.array([1, 3, 0, 2])
+    band = np.zeros((8, 6))
+    solvers.fill_band(blocks, row, column, place, band)
+    order = (2 * np.argsort(place)[:, None] + np.arange(2)).ravel()
+    moved = full[np.ix_(order, order)]
+    for i in range(8):
+        for j in range(i, min(8, i + 6)):
+            assert band[i, j - i] == moved[j, i]
+
+
+@pytest.mark.parametrize("solve", [solvers.solve_dense, solvers.BandedCholesky(np.arange(3), 2).solve])
+@pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
+@pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
+def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
+    row, column = np.array([0, 0, 1, 1, 2]), np.array([0, 1, 1, 2, 2])
+    blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
+    blocks[row == column] = np.eye(2)
+    sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
+    system = solvers.ReducedSystem(row, column, sums)
+    full = np.triu(system.dense()) + np.triu(system.dense(), 1).T
+    np.testing.assert_allclose(full @ solve(system), 1.0)
+    what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
+    what *= value
+    if spoiled != "rhs" or np.isnan(value):
+        assert solve(system) is None
+
+
+def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
+    def chosen(n, pairs):
+        i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))
+        return solvers.choose_solver(i, j, n, 6, 4)
+
+    near = {(i, j) for i in range(400) for j in range(i, min(i + 8, 400))}
+    ring = near | {(j, i + 400) for i in range(-8, 0) for j in range(i + 8)}
+    rng = np.random.default_rng(0)
+    wild = {tuple(sorted(rng.integers(0, 2000, 2))) for _ in range(20000)} | {(i, i) for i in range(2000)}
+    every = {(i, j) for i in range(150) for j in range(i, 150)}
+    assert chosen(400, near).reach == 7
+    assert isinstance(chosen(400, ring), solvers.BandedCholesky)
+    assert chosen(2000, wild) is None
+    assert chosen(150, every) is None
+
+
+def test_a_bending_loss_keeps_the_gradient_and_bends_the_curvature():
+    block = make_block()
+    c, n = block.cameras, len(block.xy)
+    xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
+    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    seen, own, common = Observations(block.view, block.point, xy), np.array([0, 3]), np.array([4, 5])
+    plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
+    for J, least in ((plain, 1.0), (bent, 0.2)):
+        metric_kernels.linearize_metric(model, seen, Weighting(1.0, 1.1, least), own, common, J)
+    for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
+        gradient = np.einsum("kic,ki->kc", a, plain.residual)
+        np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)
+    # Curvature of rho along the residual e over that of plain reweighting, by differences of its slope in s.
+    e = project_block(c, block.X, block.view, block.point) - xy
+    s = np.sum(e**2, axis=1)
+    slope = (huber(s * 1.00001, 1.1)[1] - huber(s * 0.99999, 1.1)[1]) / (2e-5 * s)
+    expected = np.maximum(1.0 + 2.0 * s * slope / huber(s, 1.1)[1], 0.2)
+    along = np.einsum("kic,ki->kc", plain.A, e)[:, 4] ** 2, np.einsum("kic,ki->kc", bent.A, e)[:, 4] ** 2
+    np.testing.assert_allclose(along[1] / along[0], expected, rtol=2e-3, atol=2e-3)
+
+
+def test_leverages_are_the_diagonal_of_the_projection_onto_the_points():
+    rng = np.random.default_rng(0)
+    start, B, leverage = np.array([0, 3, 3, 7]), rng.normal(size=(7, 2, 3)), np.empty((7, 2))
+    sum_leverages(start, B, leverage)
+    for s, e in ((0, 3), (3, 7)):
+        J = B[s:e].reshape(-1, 3)
+        np.testing.assert_allclose(leverage[s:e].ravel(), np.diag(J @ np.linalg.pinv(J)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("d", [3, 4])
+def test_steps_of_points_across_a_focal_plane_are_undone(d):
+    before, row = np.ones((3, d)), np.array([[0.0, 0.0, 1.0, 0.5]])
+    after = before * [[2.0], [-2.0], [-2.0]]
+    revert_crossing_points(np.arange(4), np.zeros(3, dtype=np.int64), row, row, before, after)
+    np.testing.assert_array_equal(after, before * [[2.0], [1.0], [1.0]])
+
+
+FREE = np.array([True, False, False, True, True, True])
+SIGMA = 0.5
+
+
+def _scatter(block, xy, *, free=FREE, loss=20.0, std=np.inf):
+    seen = Observations(block.view, block.point, xy)
+    q = block.cameras.intrinsics
+    prior = IntrinsicsPrior.unshared(q, np.full_like(q, 1.0) * std)
+    options = BundleOptions(sigma_px=SIGMA, loss_px=loss * SIGMA, max_iterations=30, covariance=True)
+    fit = refine_metric_bundle(block.cameras, block.X, seen, free=free, prior=prior, options=options)
+    noise = (SIGMA, loss * SIGMA)
+    return fit, block_scatter(linearise_fit(fit.cameras, fit.X, seen, free, prior, noise))
+
+
+def test_the_variance_is_that_of_bundle_adjustment():
+    block = make_block(points=200)
+    xy = block.xy + SIGMA * np.random.default_rng(0).normal(size=block.xy.shape)
+    fit, scatter = _scatter(block, xy)
+    scale = SIGMA / fit.sigma_px
+    expected = scale**2 * np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2)
+    expected[:, 0] /= fit.cameras.intrinsics[:, 0] ** 2
+    np.testing.assert_allclose(scatter.variance, expected, rtol=0.02)
+    np.testing.assert_allclose(scatter.shared_variance, scatter.variance[0], rtol=1e-6)
+    np.testing.assert_array_equal(np.isnan(scatter.ratio[0]), ~FREE)
+    assert scatter.blocks >= 8
+
+
+def test_independent_noise_of_any_distribution_has_ratio_one():
+    block = make_block(points=400)
+    rng = np.random.default_rng(1)
+    normal, heavy = [], []
+    for _ in range(12):
+        noise = SIGMA * rng.normal(size=block.xy.shape)
+        normal.append(_scatter(block, block.xy + noise)[1])
+        noise *= np.where(rng.random(len(noise)) < 0.2, 4.0, 1.0)[:, None]
+        heavy.append(_scatter(block, block.xy + noise, loss=1.5)[1])
+    assert np.mean([s.median_ratio for s in normal]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean([s.overdispersion for s in normal]) == pytest.approx(1.0, abs=0.12)
+    assert np.mean([s.overdispersion for s in heavy]) == pytest.approx(1.0, abs=0.15)
+    # Four times as wide in a fifth of the matches: more than the size of the core says.
+    assert np.mean([s.median_ratio for s in heavy]) > 1.3
+
+
+def test_noise_that_neighbours_share_is_seen():
+    block = make_block(points=400)
+    rng = np.random.default_rng(2)
+    # A smooth field of errors in each image beside a little noise.
+    wave = rng.normal(size=(len(block.cameras.R), 2, 2))
+    field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
+    _, scatter = _scatter(block, block.xy + 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field)
+    assert scatter.overdispersion > 2.0
+
+
+def test_the_gram_matrix_of_sparse_rows_is_that_of_dense_ones():
+    A = scipy.sparse.random_array((300, 40), density=0.2, format="csr", rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(_gram_matrix(A), (A.T @ A).toarray())
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
+    rng, views = np.random.default_rng(0), 120
+    walk = make_walk(views, "street", rng)
+    cameras, free = walk.cameras, np.array([True, False, False, False, False, True])
+    if own:
+        cameras = replace(
+            cameras, intrinsics=np.tile(cameras.intrinsics, (views, 1)), group=np.arange(views), shared=None
+        )
+    prior = IntrinsicsPrior.unshared(
+        cameras.intrinsics, np.tile([100.0, 0, 0, 0, 0, 0.1], (len(cameras.intrinsics), 1))
+    )
+    options = BundleOptions(sigma_px=0.5, loss_px=1.0, max_iterations=15)
+    fit = refine_metric_bundle(cameras, walk.X, walk.seen, free=free, prior=prior, options=options)
+    monkeypatch.setattr(scatter, "_MANY", 100)
+    found = []
+    for share in (0.0, 0.5):
+        monkeypatch.setattr(scatter, "_SPARSE", share)
+        found.append(block_scatter(linearise_fit(fit.cameras, fit.X, walk.seen, free, prior, (0.5, 1.0))))
+    dense, sparse = found
+    np.testing.assert_allclose(sparse.variance, dense.variance, rtol=1e-5)
+    np.testing.assert_allclose(sparse.shared_variance, dense.shared_variance, rtol=1e-5)
+    np.testing.assert_allclose(sparse.ratio, dense.ratio, rtol=1e-4)
+    assert sparse.overdispersion == pytest.approx(dense.overdispersion, rel=1e-4)
+
+
+def test_large_information_is_inverted_like_small(monkeypatch):
+    A = np.random.default_rng(0).normal(size=(300, 60))
+    information, flat = A.T @ A, np.diag([1.0, 1.0, 0.0])
+    small = [invert_information(S) for S in (information, flat)]
+    monkeypatch.setattr(least_squares, "_MANY", 2)
+    np.testing.assert_allclose(invert_information(information), small[0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(invert_information(flat), small[1])
+
+
+def test_the_variance_of_poses_is_that_of_bundle_adjustment_and_grows_with_the_intrinsics():
+    block = make_block(points=200)
+    xy = block.xy + SIGMA * np.random.default_rng(0).normal(size=block.xy.shape)
+    fit, scatter = _scatter(block, xy)
+    seen = Observations(block.view, block.point, xy)
+    prior = IntrinsicsPrior.unshared(fit.cameras.intrinsics, np.full_like(fit.cameras.intrinsics, np.inf))
+    poses = pose_uncertainty(linearise_fit(fit.cameras, fit.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA)))
+    own = np.sqrt(np.diag(poses.covariance))
+    np.testing.assert_allclose(own, np.sqrt(scatter.variance[0][FREE]), rtol=1e-6)
+    R, covariance = fit.cameras.R, (SIGMA / fit.sigma_px) ** 2 * fit.pose_covariance
+    centre = np.einsum("vba,vbc,vcd->vad", R, covariance[:, 3:, 3:], R)
+    expected = np.concatenate([np.diagonal(c, axis1=1, axis2=2) for c in (covariance[:, :3, :3], centre)], 1)
+    np.testing.assert_allclose(poses.variances(1.0, own, 0.0), expected, rtol=0.03)
+    wider = poses.variances(1.0, 3.0 * own, 0.0) - poses.variances(1.0, own, 0.0)
+    np.testing.assert_allclose(wider, 8.0 * (poses.variances(1.0, own, 0.0) - poses.variance), rtol=1e-6)
+
+
+def test_faults_of_the_camera_model_move_the_poses_as_an_adjustment_does():
+    block, eps = make_block(points=200), 1e-4
+    q = block.cameras.intrinsics[block.cameras.group[block.view]]
+    exact, _ = _scatter(block, block.xy)
+    x, y = ((block.xy - q[:, 3:5]) / q[:, :1]).T
+    fields = [(0 * x, y), (y, 0 * x), (3 * x**2 + y**2, 2 * x * y), (2 * x * y, x**2 + 3 * y**2)]
+    seen = Observations(block.view, block.point, block.xy)
+    prior = IntrinsicsPrior.unshared(q[:1], np.full_like(q[:1], np.inf))
+    poses = pose_uncertainty(linearise_fit(exact.cameras, exact.X, seen, FREE, prior, (SIGMA, 20.0 * SIGMA)))
+    for n, field in enumerate(fields):
+        moved, _ = _scatter(block, block.xy + eps * q[:, :1] * np.array(field).T)
+        turned = np.swapaxes(moved.cameras.R, 1, 2) @ exact.cameras.R
+        angle = np.degrees(Rotation.from_matrix(turned).as_rotvec())
+        stated = np.degrees(eps * np.einsum("vba,vb->va", exact.cameras.R, poses.fault[:, :3, n]))
+        # Without the rotation of the whole, which no image determines.
+        assert np.abs(angle).max() > 0.0
+        np.testing.assert_allclose(
+            stated - stated.mean(axis=0), -(angle - angle.mean(axis=0)), atol=0.03 * np.abs(stated).max()
+        )

@@ -1,0 +1,510 @@
+"""The configuration: one field per stage, each holding the object that does its work.
+
+Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis). Its text form, TOML and
+``--set``, is read and written by :mod:`thesisrecon.config.text`.
+"""
+
+from __future__ import annotations
+
+import logging
+import typing
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Protocol
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.config.plug_ins import FunctionMatcher, as_method
+from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.epipolar.verification import PairVerification
+from thesisrecon.errors import UsageError, in_words, unknown_word
+from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
+from thesisrecon.matching._prepared import EstimateFundamental, MapAll
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
+from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.projective.factorization import Factorization
+from thesisrecon.projective.incremental import IncrementalProjective
+from thesisrecon.projective.sequential import SequentialProjective
+from thesisrecon.records import (
+    DepthMap,
+    DisparityMap,
+    Features,
+    FundamentalFit,
+    Image,
+    Matches,
+    MetricResult,
+    PairChoice,
+    PinholeView,
+    Reconstruction,
+    SelfCalibration,
+    TexturedMesh,
+    Tracks,
+    TwoView,
+)
+from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.kruppa import KruppaEquations
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
+from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
+from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo
+from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
+from thesisrecon.surface.bspline import BSplineSurface
+from thesisrecon.surface.fusion import DepthSheets
+from thesisrecon.surface.model import SurfaceModel
+
+PRECISE_SIGMAS = 2.5
+"""Inlier gate of the default estimator: tracks are built from precise matches only."""
+
+# Stage -> word in text -> class. A new method is one line here.
+KINDS: Mapping[str, Mapping[str, type[Any]]] = {
+    "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
+    "pairs": {
+        "all-pairs": AllPairs,
+        "overlap-estimate": OverlapEstimate,
+        "sequence-window": SequenceWindow,
+        "listed-pairs": ListedPairs,
+    },
+    "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
+    "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
+    "verification": {"pair-verification": PairVerification},
+    "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
+    "projective": {
+        "incremental-projective": IncrementalProjective,
+        "sequential-projective": SequentialProjective,
+        "factorization": Factorization,
+    },
+    "selfcalibration": {
+        "hypotheses-and-refinement": HypothesesAndRefinement,
+        "stratified": Stratified,
+        "linear-quadric": LinearQuadric,
+        "nonlinear-quadric": NonlinearQuadric,
+        "kruppa-equations": KruppaEquations,
+    },
+    "metric": {"metric-refinement": MetricRefinement},
+    "dense": {"multi-view-stereo": MultiViewStereo},
+    "model": {"surface-model": SurfaceModel},
+}
+
+
+# `rng` is the source of randomness, which deterministic methods ignore; views are numbered like images.
+
+
+class Detector(Protocol):
+    """Detect the features of one image (4.2.1)."""
+
+    def detect(self, image: Image) -> Features:
+        """Detect the corners and, for some detectors, the seeds of an image.
+
+        Returns
+        -------
+        Features
+            Corners, strongest first, in pixels of the image; possibly none.
+        """
+
+
+class PairSelector(Protocol):
+    """Select the pairs of images to match."""
+
+    def select(
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
+    ) -> PairChoice:
+        """Select pairs of images by their names and features; ``map_all`` is a parallel map.
+
+        Raises
+        ------
+        UsageError
+            If the features have no seeds but need them.
+        """
+
+
+class Matcher(Protocol):
+    """Match the features of two images (4.2.2)."""
+
+    def prepare(self, image: Image, features: Features) -> Any:
+        """Do the work that depends on one image.
+
+        Returns
+        -------
+        Any
+            The data of the image that ``match`` needs.
+        """
+
+    def match(
+        self,
+        view1: Any,
+        view2: Any,
+        *,
+        pair: tuple[int, int],
+        estimate_fundamental: EstimateFundamental,
+        rng: np.random.Generator,
+    ) -> Matches:
+        """Match the corners of two prepared images one-to-one; ``pair`` are the numbers of the views, and
+        ``estimate_fundamental`` is the robust estimator of F for guided matching.
+
+        Returns
+        -------
+        Matches
+            Matches, possibly none; ``UsageError`` if the features have no seeds but need them.
+        """
+
+
+class FundamentalEstimator(Protocol):
+    """Estimate F from matches with outliers (chapter 5)."""
+
+    def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
+        """Estimate F of matched points ``xy1``, ``xy2`` (N, 2), px, with outliers.
+
+        Returns
+        -------
+        FundamentalFit
+            F, inliers, noise, covariance and competing models; always finite. ``StageFailure`` if there are
+            too few or collinear matches, or no F has 8 inliers.
+        """
+
+
+class Verifier(Protocol):
+    """Decide whether a pair and its F are accepted, and which matches are inliers."""
+
+    def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
+        """Verify all matches of a pair by the F estimated from them.
+
+        Returns
+        -------
+        TwoView
+            The pair with its verified matches, its configuration and the decision.
+        """
+
+
+class TrackBuilder(Protocol):
+    """Join pairwise matches to tracks."""
+
+    def build(
+        self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator
+    ) -> Tracks:
+        """Join the accepted pairs of prepared images to tracks; ``map_all`` is a parallel map.
+
+        Returns
+        -------
+        Tracks
+            Tracks of at least two views with at most one corner per view.
+        """
+
+
+class ProjectiveReconstructor(Protocol):
+    """Reconstruction up to a projective transform (chapter 6)."""
+
+    def reconstruct(
+        self,
+        tracks: Tracks,
+        pairs: Sequence[TwoView],
+        sizes: I64,
+        *,
+        rng: np.random.Generator,
+        attempt: int = 0,
+    ) -> Reconstruction:
+        """Reconstruct cameras and points from tracks and verified pairs.
+
+        Parameters
+        ----------
+        tracks, pairs : Tracks, sequence of TwoView
+            All tracks and the verified pairs; a selection of the tracks is used.
+        sizes : ndarray (V, 2) of int
+            Width and height of each image.
+        rng : numpy.random.Generator
+            Source of the resection samples.
+        attempt : int
+            Number of the attempt; each begins with another initial pair.
+
+        Returns
+        -------
+        Reconstruction
+            Projective reconstruction; ``StageFailure`` if no pair is accepted, shows parallax or is left.
+        """
+
+
+class SelfCalibrator(Protocol):
+    """Self-calibration of a projective reconstruction (chapter 7)."""
+
+    def calibrate(
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
+    ) -> SelfCalibration:
+        """Upgrade a projective reconstruction of at least three cameras by the prior of every view.
+
+        Returns
+        -------
+        SelfCalibration
+            Upgrades and calibrations, best first, with the identifiability report. ``StageFailure`` if none
+            places the points in front of the cameras.
+        """
+
+
+class MetricRefiner(Protocol):
+    """Refine the metric model: missing cameras, bundle adjustment, intervals and self-check."""
+
+    def refine(
+        self,
+        reconstruction: Reconstruction,
+        calibration: SelfCalibration,
+        *,
+        prior: IntrinsicsPrior,
+        rng: np.random.Generator,
+        threads: int,
+    ) -> MetricResult:
+        """Refine a projective reconstruction to the metric model; all candidate calibrations are tried.
+
+        The result does not depend on the number of ``threads``.
+
+        Returns
+        -------
+        MetricResult
+            Cameras, points, intrinsics with intervals, and the self-check; ``StageFailure`` if no candidate
+            gives a metric model.
+        """
+
+
+class StereoMatcher(Protocol):
+    """Match two views; :func:`thesisrecon.reconstruct` does not need it."""
+
+    def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap:
+        """Compute the disparities of a rectified pair.
+
+        Parameters
+        ----------
+        left, right : array_like (H, W) or (H, W, 3)
+            Grey levels 0 .. 255, integer or floating point, NaN = no pixel; rows correspond.
+        max_disparity_px : float
+            Disparity of the nearest point.
+
+        Returns
+        -------
+        DisparityMap
+            x_right = x_left - d, NaN = unknown or occluded.
+        """
+
+    def match_two_views(
+        self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+    ) -> RectifiedPair:
+        """Rectify two images by their F and at least 8 inliers, and match both directions.
+
+        ``planar`` allows homographies only.
+
+        Returns
+        -------
+        RectifiedPair
+            Rectified images and disparities of both.
+        """
+
+
+class DepthEstimator(StereoMatcher, Protocol):
+    """Estimate depth maps view by view (2.5); ``scene`` contains all views or at least ``required_views``."""
+
+    def prepare(
+        self,
+        images: Sequence[Image],
+        reconstruction: Reconstruction,
+        *,
+        depth_range: F64 | None = None,
+        threads: int = 1,
+    ) -> MultiViewScene:
+        """Undistort the images of a metric reconstruction and select the neighbours of each.
+
+        The depths to search are ``depth_range`` (V, 2), nearest and farthest, else follow from the points of
+        the reconstruction, else from the cameras.
+
+        Returns
+        -------
+        MultiViewScene
+            Input of the other methods.
+        """
+
+    def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
+        """Return the views that the depth map of a view and its confirmation need.
+
+        Returns
+        -------
+        frozenset of int
+            Numbers of the views, the view among them.
+        """
+
+    def depth_map(self, scene: MultiViewScene, view: int, *, pool: Executor | None = None) -> DepthMap:
+        """Compute the depth map of one view from its neighbours; idle threads of ``pool`` may take part.
+
+        Returns
+        -------
+        DepthMap
+            NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
+            neighbours that agree.
+        """
+
+    def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
+        """Complete a result of ``depth_map``, and keep the depths that the maps of other views confirm.
+
+        Returns
+        -------
+        DepthMap
+            ``views`` is the number of confirming views.
+        """
+
+
+class ModelBuilder(Protocol):
+    """Fuse depth maps to a textured surface (2.6); the result does not depend on ``threads``."""
+
+    def build(
+        self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1
+    ) -> TexturedMesh:
+        """Build the textured surface of a scene.
+
+        Raises
+        ------
+        StageFailure
+            If the maps contain no depths or no view sees the surface.
+        """
+
+    def color(
+        self,
+        surface: TexturedMesh,
+        views: Sequence[PinholeView],
+        *,
+        without: int | None = None,
+        threads: int = 1,
+    ) -> TexturedMesh:
+        """Texture a surface from all views except ``without``, whose image is to be compared with the model.
+
+        Returns
+        -------
+        TexturedMesh
+            The textured surface; the depths of that view remain part of it.
+        """
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """How images are read.
+
+    Parameters
+    ----------
+    max_size_px : int
+        Larger images are reduced to this long side.
+    groups : bool
+        Reconstruct each group of 3 or more images with too little overlap with the others.
+    part_views : int
+        Maximum number of images (approximately) that are reconstructed together. Larger sets are divided
+        into overlapping parts if a division separates few of the common points; 0: never.
+    """
+
+    max_size_px: int = 1600
+    groups: bool = True
+    part_views: int = 400
+
+    def __post_init__(self) -> None:
+        if self.max_size_px < 64:
+            raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
+        if self.part_views < 0:
+            raise ValueError(f"part_views must be at least 0; got {self.part_views}")
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """Settings of the whole pipeline; the defaults are the preset ``default``.
+
+    Parameters
+    ----------
+    images, intrinsics : ImageOptions, IntrinsicsOptions
+        How images are read, and prior knowledge of the cameras.
+    features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
+        The method of each stage: any object with the methods of its ``Protocol``; a ``UsageError`` if it does
+        not fit. ``features``, ``pairs``, ``matching`` and ``epipolar`` also take a plain function
+        (:mod:`thesisrecon.config.plug_ins`).
+
+    Examples
+    --------
+    >>> from thesisrecon import PipelineConfig
+    >>> from thesisrecon.config import ImageOptions
+    >>> config = PipelineConfig(images=ImageOptions(max_size_px=800))
+    >>> type(config.epipolar).__name__
+    'LocallyOptimisedRansac'
+    >>> type(PipelineConfig(matching=lambda image1, image2: ([], [])).matching).__name__
+    'FunctionMatcher'
+    """
+
+    images: ImageOptions = ImageOptions()
+    intrinsics: IntrinsicsOptions = field(default_factory=IntrinsicsOptions)
+    features: Detector = field(default_factory=MultiScaleCorners)
+    pairs: PairSelector = field(default_factory=OverlapEstimate)
+    matching: Matcher = field(default_factory=SeedsAndGrowth)
+    epipolar: FundamentalEstimator = field(
+        default_factory=lambda: LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
+    )
+    verification: Verifier = field(default_factory=PairVerification)
+    tracks: TrackBuilder = field(default_factory=AlignedTracks)
+    projective: ProjectiveReconstructor = field(default_factory=IncrementalProjective)
+    selfcalibration: SelfCalibrator = field(default_factory=HypothesesAndRefinement)
+    metric: MetricRefiner = field(default_factory=MetricRefinement)
+    dense: DepthEstimator = field(default_factory=MultiViewStereo)
+    model: ModelBuilder = field(default_factory=SurfaceModel)
+
+    def __post_init__(self) -> None:
+        for stage, kind in _stage_types().items():
+            value = getattr(self, stage)
+            if stage in KINDS:
+                object.__setattr__(self, stage, as_method(stage, value, kind))
+            elif not isinstance(value, kind):
+                raise UsageError(f"{stage} takes {kind.__name__}(...); got {in_words(value)}")
+        if isinstance(self.matching, FunctionMatcher) and self.tracks == AlignedTracks():
+            logging.getLogger(__name__).info("matches of a function are not aligned: tracks=PlainTracks()")
+            object.__setattr__(self, "tracks", PlainTracks())
+
+
+@cache
+def _stage_types() -> dict[str, type[Any]]:
+    return typing.get_type_hints(PipelineConfig)
+
+
+PRESETS: Mapping[str, PipelineConfig] = {
+    "default": PipelineConfig(),
+    "thesis": PipelineConfig(
+        features=HarrisCorners(),
+        pairs=AllPairs(),
+        matching=StrengthOfMatch(),
+        epipolar=ThesisRansac(),
+        tracks=PlainTracks(),
+        projective=SequentialProjective(),
+        selfcalibration=Stratified(),
+        dense=MultiViewStereo(
+            # This matcher also assigns disparities to textureless regions, with low confidence.
+            pairs=PairMatching(matcher=MaximumLikelihoodScanline(), min_confidence=0.25),
+            sequence_links=4,
+            refinement=False,
+        ),
+        # "By fitting parametric surfaces through the points ... sampled in a fine scale triangular pattern".
+        model=SurfaceModel(surface=BSplineSurface(), fusion=DepthSheets()),
+        # The thesis has no distortion model and fixes the principal point at the image centre.
+        intrinsics=IntrinsicsOptions(principal_point="known", k1="known"),
+    ),
+}
+
+
+def preset(name: Any) -> PipelineConfig:
+    """Return a preset configuration.
+
+    Parameters
+    ----------
+    name : str
+        "default" or "thesis"; another one is a ``UsageError``.
+
+    Returns
+    -------
+    PipelineConfig
+    """
+    if not isinstance(name, str) or name not in PRESETS:
+        raise UsageError(unknown_word("preset", name, PRESETS))
+    return PRESETS[name]

@@ -1,0 +1,380 @@
+"""User-defined methods of stages: functions, objects with the required methods, and code in a file.
+
+:class:`~thesisrecon.config.PipelineConfig` passes every method through :func:`as_method`, which wraps
+functions and checks objects. ``path/to/file.py:name`` is the text form of a function or class in a file.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, is_dataclass, replace
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.epipolar._frame import PairFrame, check_matches
+from thesisrecon.epipolar._noise import noise_scale
+from thesisrecon.epipolar.criteria import fundamental_covariance
+from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
+from thesisrecon.geometry.two_view import sampson_residuals
+from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice
+
+# ruff: noqa: ARG002 (all methods of a stage have the same arguments)
+
+MIN_INLIERS = 8
+NOT_IN_A_FILE = " (defined in a running program, not in a file)"
+"""Added to the name of a function in text; no such function can be loaded again."""
+
+
+def name_of(value: Any) -> str:
+    """The name of a function or class, or of the class of an object."""
+    if isinstance(value, FunctionAdapter):
+        value = value.function
+    return str(getattr(value, "__name__", None) or type(value).__name__)
+
+
+@dataclass(frozen=True)
+class _Check:
+    """Checks of the values that a function ``who`` returned; ``returns`` describes the required values."""
+
+    who: str
+    returns: str
+
+    def wrong(self, what: str) -> UsageError:
+        return UsageError(f"{self.who} returned {what}; it must return {self.returns}")
+
+    def array(self, value: Any, columns: int, what: str, kind: type = np.float64) -> Any:
+        """The value as an array (N,), or (N, columns), of finite numbers."""
+        try:
+            array: np.ndarray[Any, Any] = np.asarray(value, dtype=kind)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise self.wrong(f"{what} that is no array of numbers ({error})") from None
+        if columns and array.size == 0:
+            array = array.reshape(0, columns)
+        if array.ndim != (2 if columns else 1) or (columns and array.shape[1] != columns):
+            wanted = f"(N, {columns})" if columns else "(N,)"
+            raise self.wrong(f"{what} of shape {array.shape} instead of {wanted}")
+        if not np.isfinite(array).all():
+            raise self.wrong(f"{what} that is not finite (NaN or infinite)")
+        return np.ascontiguousarray(array)
+
+    def positions(self, value: Any, size: tuple[int, int] | None, what: str) -> F64:
+        """Positions (N, 2), px, inside an image of ``size`` (width, height) if that is known."""
+        xy: F64 = self.array(value, 2, what)
+        if size is not None:
+            outside = ((xy < -0.5) | (xy > np.array(size) - 0.5)).any(axis=1)
+            if outside.any():
+                x, y = xy[int(outside.argmax())]
+                where = f"outside the image of {size[0]} x {size[1]} px (its first pixel centre is (0, 0))"
+                raise self.wrong(f"{what} with ({x:g}, {y:g}) {where}")
+        return xy
+
+    def same_length(self, **arrays: Any) -> None:
+        if len({len(array) for array in arrays.values()}) > 1:
+            raise self.wrong(" and ".join(f"{len(array)} {name}" for name, array in arrays.items()))
+
+    def matches(
+        self, found: Any, pair: tuple[int, int], sizes: Sequence[tuple[int, int] | None] = (None, None)
+    ) -> Matches:
+        """Matches without corners from ``xy1, xy2[, score]``."""
+        if not isinstance(found, tuple | list) or len(found) not in (2, 3):
+            raise self.wrong(f"a {type(found).__name__}")
+        xy1, xy2 = (self.positions(found[n], sizes[n], f"xy{n + 1}") for n in (0, 1))
+        score: F32 = np.ones(len(xy1), np.float32)
+        if len(found) == 3:
+            score = self.array(found[2], 0, "score", np.float32)
+        self.same_length(xy1=xy1, xy2=xy2, score=score)
+        none, affine = np.full(len(xy1), -1, np.int64), np.tile(np.eye(2), (len(xy1), 1, 1))
+        return Matches(*pair, none, none, xy1, xy2, score, affine)
+
+
+def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence[Any]) -> Matches:
+    """Check the matches that a user-defined matcher returned: the kernels that use them check nothing."""
+    check = _Check(
+        f"the method match of {type(matching).__name__}", f"Matches, or {FUNCTIONS['matching'][2]}"
+    )
+    if not isinstance(found, Matches):
+        return check.matches(found, pair)
+    xy1, xy2 = check.array(found.xy1, 2, "xy1"), check.array(found.xy2, 2, "xy2")
+    n = len(xy1)
+    for name, shape in {"xy2": (n, 2), "score": (n,), "affine": (n, 2, 2)}.items():
+        if np.shape(getattr(found, name)) != shape:
+            raise check.wrong(f"{name} of shape {np.shape(getattr(found, name))} for {n} matches")
+    index = [np.asarray(found.index1), np.asarray(found.index2)]
+    for number, view in zip(index, views, strict=True):
+        features = getattr(view, "features", None)
+        most = np.inf if features is None else len(features.xy)
+        if (
+            number.shape != (n,)
+            or number.dtype.kind != "i"
+            or (n and not -1 <= number.min() <= number.max() < most)
+        ):
+            raise check.wrong("indices that are not corners of the view (-1: none)")
+    return replace(
+        found, xy1=xy1, xy2=xy2, index1=index[0].astype(np.int64), index2=index[1].astype(np.int64)
+    )
+
+
+@dataclass(frozen=True)
+class FunctionAdapter:
+    """A plain function as the method of a stage; several threads call it unless ``threads=1``."""
+
+    # No setting in text, where the function names the adapter.
+    function: Callable[..., Any] = field(metadata={"given": True})
+
+    @property
+    def _check(self) -> _Check:
+        returns = next(words for kind, _, words in FUNCTIONS.values() if kind is type(self))
+        return _Check(f"the function {name_of(self)}", returns)
+
+
+@dataclass(frozen=True)
+class FunctionDetector(FunctionAdapter):
+    """Features without seeds by a function ``f(image) -> xy[, scale, response]`` of an array (H, W, 3)."""
+
+    def detect(self, image: Image) -> Features:
+        """See `thesisrecon.config.Detector.detect`."""
+        found = self.function(image.rgb)
+        parts = found if isinstance(found, tuple) else (found,)
+        if not 1 <= len(parts) <= 3:
+            raise self._check.wrong(f"{len(parts)} values")
+        xy = self._check.positions(parts[0], image.size, "xy")
+        others: list[F32] = [np.ones(len(xy), np.float32)] * 2
+        for n, (part, what) in enumerate(zip(parts[1:], ("scale", "response"), strict=False)):
+            others[n] = self._check.array(part, 0, what, np.float32)
+            self._check.same_length(**{"positions": xy, f"values of {what}": others[n]})
+        if (others[0] <= 0.0).any():
+            raise self._check.wrong("a scale that is not positive")
+        order = np.argsort(-others[1], kind="stable")
+        return Features(xy[order], others[0][order], others[1][order])
+
+
+@dataclass(frozen=True)
+class FunctionPairs(FunctionAdapter):
+    """Image pairs by a function ``f(names) -> pairs`` of file names, or of numbers in the list of names."""
+
+    def select(
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: Any, rng: np.random.Generator
+    ) -> PairChoice:
+        """See `thesisrecon.config.PairSelector.select`."""
+        number: dict[Any, int] = {name: i for i, name in enumerate(names)} | {i: i for i in range(len(names))}
+        chosen = set()
+        for pair in self.function(list(names)):
+            try:
+                i, j = (number[end.item() if isinstance(end, np.generic) else end] for end in pair)
+            except (KeyError, TypeError, ValueError):
+                raise self._check.wrong(
+                    f"{in_words(pair)}, which is no pair of the {len(names)} images"
+                ) from None
+            if i == j:
+                raise self._check.wrong(f"{in_words(pair)}, a pair of an image with itself")
+            chosen.add((min(i, j), max(i, j)))
+        if not chosen:
+            raise self._check.wrong("no pairs")
+        return PairChoice(np.array(sorted(chosen), dtype=np.int64), f"pairs by {name_of(self)}")
+
+
+@dataclass(frozen=True)
+class FunctionView:
+    """Pixels at working size and features of an image, as prepared for a matching function."""
+
+    rgb: U8
+    features: Features
+
+
+@dataclass(frozen=True)
+class FunctionMatcher(FunctionAdapter):
+    """Matches by a function ``f(image1, image2) -> xy1, xy2[, score]`` of arrays (H, W, 3) uint8.
+
+    Positions may differ from pair to pair, as without a detector: tracks join those within
+    ``PlainTracks.merge_px``. Positions are not aligned, so that a configuration with ``AlignedTracks()`` gets
+    ``PlainTracks()``.
+    """
+
+    def prepare(self, image: Image, features: Features) -> FunctionView:
+        """See `thesisrecon.config.Matcher.prepare`."""
+        return FunctionView(image.rgb, features)
+
+    def match(
+        self,
+        view1: FunctionView,
+        view2: FunctionView,
+        *,
+        pair: tuple[int, int],
+        estimate_fundamental: Any,
+        rng: np.random.Generator,
+    ) -> Matches:
+        """See `thesisrecon.config.Matcher.match`."""
+        sizes = [(view.rgb.shape[1], view.rgb.shape[0]) for view in (view1, view2)]
+        return self._check.matches(self.function(view1.rgb, view2.rgb), pair, sizes)
+
+
+@dataclass(frozen=True)
+class FunctionFundamental(FunctionAdapter):
+    """F, made singular, by a function ``f(xy1, xy2) -> F, inliers`` of arrays (N, 2) px and of a mask."""
+
+    def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
+        """See `thesisrecon.config.FundamentalEstimator.estimate`."""
+        xy1, xy2 = check_matches(xy1, xy2, needed=MIN_INLIERS)
+        found = self.function(xy1, xy2)
+        if not isinstance(found, tuple | list) or len(found) != 2:
+            raise self._check.wrong(in_words(type(found).__name__))
+        if found[0] is None:
+            raise self._failure("it returned no F", len(xy1))
+        inliers: B8 = np.asarray(found[1])
+        inliers = inliers[:, 0] if inliers.shape == (len(xy1), 1) else inliers
+        if inliers.shape != (len(xy1),) or not np.isin(inliers, (0, 1)).all():
+            raise self._check.wrong(f"inliers of shape {inliers.shape} for {len(xy1)} matches")
+        inliers = inliers.astype(np.bool_)
+        F = self._check.array(found[0], 3, "F")
+        if F.shape != (3, 3):
+            raise self._check.wrong(f"F of shape {F.shape} instead of (3, 3)")
+        if inliers.sum() < MIN_INLIERS:
+            raise self._failure(f"it found {inliers.sum()} inliers", len(xy1))
+        frame = PairFrame.of(xy1, xy2)
+        U, s, Vt = np.linalg.svd(frame.matrix_in_frame(F).reshape(3, 3))
+        if not s[1] > 1e-12 * s[0]:
+            raise self._check.wrong("an F of rank below 2")
+        f = np.ascontiguousarray((U[:, :2] * s[:2]) @ Vt[:2]).ravel()
+        f /= np.linalg.norm(f)
+        F = frame.matrix_in_pixels(f)
+        sigma = noise_scale(sampson_residuals(F, xy1[inliers], xy2[inliers]))
+        points = frame.points(xy1[inliers], xy2[inliers])
+        return FundamentalFit(
+            F, inliers, sigma, fundamental_covariance(frame, f, points, sigma * frame.scale)
+        )
+
+    def _failure(self, what: str, count: int) -> StageFailure:
+        return StageFailure(Notice("no-geometry-of-function", name_of(self)), f"{what} in {count} matches")
+
+
+FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {
+    "features": (FunctionDetector, ("image",), "xy (N, 2) px, or xy, scale (N,), response (N,)"),
+    "pairs": (FunctionPairs, ("names",), "a list of pairs of names or of numbers from 0"),
+    "matching": (FunctionMatcher, ("image1", "image2"), "xy1, xy2 (N, 2) px, or xy1, xy2, score (N,)"),
+    "epipolar": (FunctionFundamental, ("xy1", "xy2"), "F (3, 3) and a mask (N,) of inliers"),
+}
+"""Stages that take a function: its adapter, its arguments, and its return values."""
+
+
+def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
+    """Return the method of a stage: a function in its adapter, or an object whose methods were checked."""
+    needed = {name: member for name, member in vars(protocol).items() if isinstance(member, FunctionType)}
+    needed = {name: member for name, member in needed.items() if not name.startswith("_")}
+    takes = f"{stage} takes an object with the method{'s' * (len(needed) > 1)} {' and '.join(needed)}"
+    if stage in FUNCTIONS:
+        takes += f", or a function of {', '.join(FUNCTIONS[stage][1])}"
+    if isinstance(value, type):
+        raise UsageError(f"{takes}; got the class {value.__name__}: write {value.__name__}()")
+    missing = [name for name in needed if not callable(getattr(value, name, None))]
+    if not missing:
+        for name, member in needed.items():
+            parameters = list(inspect.signature(member).parameters.values())[1:]
+            # The pipeline always passes the arguments without a default.
+            fixed = [p for p in parameters if p.default is p.empty]
+            _check_arguments(
+                getattr(value, name), fixed, f"the method {name} of {stage}={type(value).__name__}"
+            )
+        return value
+    if stage in FUNCTIONS and callable(value):
+        kind, names, _ = FUNCTIONS[stage]
+        fixed = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in names]
+        _check_arguments(value, fixed, f"the function {stage}={name_of(value)}")
+        return kind(value)
+    if isinstance(value, FunctionType):
+        raise UsageError(f"{takes}; only {', '.join(FUNCTIONS)} take a plain function, got {value.__name__}")
+    got = in_words(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    raise UsageError(f"{takes}; got {got}, which has no {' and no '.join(missing)}")
+
+
+def _check_arguments(function: Callable[..., Any], fixed: Sequence[inspect.Parameter], what: str) -> None:
+    """A UsageError unless the function can be called with these arguments."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return  # compiled code may have none
+    by_name = {p.name: None for p in fixed if p.kind is p.KEYWORD_ONLY}
+    try:
+        signature.bind(*[None] * (len(fixed) - len(by_name)), **by_name)
+    except TypeError:
+        wanted = ", ".join(p.name + "=..." * (p.kind is p.KEYWORD_ONLY) for p in fixed)
+        raise UsageError(
+            f"{what} must take the {len(fixed)} arguments ({wanted}); it takes {signature}"
+        ) from None
+
+
+def text_of(value: Any) -> str:
+    """``file.py:name`` with the absolute path of a method that can be loaded again, else its name."""
+    is_function = isinstance(value, FunctionAdapter)
+    made = value.function if is_function else value
+    home = sys.modules.get(str(getattr(made, "__module__", "")))
+    file = getattr(home, "__file__", None)
+    code = getattr(inspect.unwrap(made) if callable(made) else made, "__code__", None)
+    # A function typed at the prompt after a script has run is in the script's module, not in its file.
+    in_file = code is None or Path(code.co_filename).resolve() == Path(file or "").resolve()
+    # Files of a package may need their package.
+    if (
+        home is not None
+        and file
+        and Path(file).is_file()
+        and in_file
+        and (is_function or "." not in home.__name__)
+    ):
+        names = [name for name, member in vars(home).items() if member is made]
+        kind = type(made).__name__
+        if not is_function and is_dataclass(made) and getattr(home, kind, None) is type(made):
+            names = [kind]
+        if names:
+            return f"{Path(file).resolve()}:{names[0]}"
+    return name_of(made) + NOT_IN_A_FILE * is_function
+
+
+def is_reference(kind: Any) -> bool:
+    """Whether a text names something in a file: ``file.py:name``."""
+    return isinstance(kind, str) and kind.rpartition(":")[0].endswith(".py")
+
+
+def load_reference(reference: str, where: str) -> Any:
+    """Run ``file.py`` and return the object ``name`` that it defines, for a reference ``file.py:name``."""
+    file, _, name = reference.rpartition(":")
+    path = Path(file).expanduser().resolve()
+    if not path.is_file():
+        raise UsageError(f"{where}={reference}: there is no file {file}")
+    module = _module_of(path, where)
+    if not hasattr(module, name):
+        own = [k for k, v in vars(module).items() if getattr(v, "__module__", None) == module.__name__]
+        raise UsageError(f"{where}={reference}: {unknown_word(f'name in {file}', name, own or ['none'])}")
+    return getattr(module, name)
+
+
+def _module_of(path: Path, where: str) -> ModuleType:
+    """The module of a file, imported once; modules beside it can be imported, also by worker processes."""
+    for module in list(sys.modules.values()):
+        file = getattr(module, "__file__", None)
+        if file and Path(file).name == path.name and Path(file).resolve() == path:
+            return module
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    name = path.stem
+    found = None if "." in name or name in sys.modules else importlib.util.find_spec(name)
+    if found is None or not found.origin or Path(found.origin).resolve() != path:
+        name = f"{path.stem.replace('.', '_')}_{zlib.crc32(str(path).encode()):x}"
+        found = importlib.util.spec_from_file_location(name, path)
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    sys.modules[name] = module
+    try:
+        found.loader.exec_module(module)
+    except Exception as error:
+        # A user's file may raise anything.
+        del sys.modules[name]
+        raise UsageError(f"{where}: {path} cannot be imported: {type(error).__name__}: {error}") from None
+    return module

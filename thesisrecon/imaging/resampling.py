@@ -1,0 +1,252 @@
+"""Resampling of images into rectified or undistorted frames, strip by strip."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from thesisrecon._numba import empty, kernel
+from thesisrecon.arrays import B8, F32, F64, U8, resizing_transform
+from thesisrecon.camera import distort
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.filters import cubic_weights
+from thesisrecon.records import Image, PinholeView, Reconstruction
+
+MAX_TAPS = 24
+"""Limit of the filter width: reductions by more than 6 alias."""
+NOT_SHRUNK = 1.1
+"""Reduction up to which the filter is not widened."""
+STRIP_ROWS = 64
+"""Rows whose positions are held in memory at a time."""
+
+
+@kernel
+def _cubic(x: float) -> float:
+    """Cubic convolution kernel of Keys with a = -1/2, third-order accurate."""
+    x = abs(x)
+    if x < 1.0:
+        return (1.5 * x - 2.5) * x * x + 1.0
+    if x < 2.0:
+        return ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0
+    return 0.0
+
+
+@kernel
+def _taps(at: float, spread: float, weights: F64) -> tuple[int, int]:
+    """Weights of the pixels around ``at`` with the kernel ``spread`` times as wide; first pixel and count."""
+    reach = min(2.0 * spread, 0.5 * MAX_TAPS - 1.0)
+    first = int(np.ceil(at - reach))
+    count = int(np.floor(at + reach)) - first + 1
+    total = 0.0
+    for k in range(count):
+        weights[k] = _cubic((first + k - at) / spread)
+        total += weights[k]
+    for k in range(count):
+        weights[k] /= total
+    return first, count
+
+
+@kernel
+def _spread(xy: F64, i: int, j: int, axis: int) -> float:
+    """Distance of the neighbours of ``xy[i, j]`` along an axis of the image, at least 1."""
+    i1 = i + 1 if i + 1 < xy.shape[0] else i - 1
+    j1 = j + 1 if j + 1 < xy.shape[1] else j - 1
+    across = xy[i, j1, axis] - xy[i, j, axis] if j1 >= 0 else 0.0
+    down = xy[i1, j, axis] - xy[i, j, axis] if i1 >= 0 else 0.0
+    squared = across * across + down * down
+    # The comparison is also false for NaN.
+    return np.sqrt(squared) if squared > NOT_SHRUNK * NOT_SHRUNK else 1.0
+
+
+@kernel
+def _sample_image(image: F32, xy: F64, out: F32) -> None:
+    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C).
+
+    ``xy`` are the positions of adjacent output pixels and may have one row more than ``out``. The kernel is
+    widened along each axis of the image where they are more than a pixel apart, which prevents aliasing. NaN
+    where the position is NaN or outside the pixel centres, or one of the four pixels around is NaN; other NaN
+    pixels are left out.
+    """
+    height, width, channels = image.shape
+    wx, wy = empty(MAX_TAPS), empty(MAX_TAPS)
+    total = empty(channels)
+    for i in range(out.shape[0]):
+        for j in range(xy.shape[1]):
+            out[i, j] = np.nan
+            x, y = xy[i, j, 0], xy[i, j, 1]
+            # Rounding of the positions must not remove border pixels.
+            if not (x > -1e-6 and y > -1e-6 and x < width - 1 + 1e-6 and y < height - 1 + 1e-6):
+                continue
+            x0, y0 = min(max(int(x), 0), width - 1), min(max(int(y), 0), height - 1)
+            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
+            if np.isnan(image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]):
+                continue
+            spread_x, spread_y = _spread(xy, i, j, 0), _spread(xy, i, j, 1)
+            inner = x0 >= 1 and x0 + 2 < width and y0 >= 1 and y0 + 2 < height
+            if inner and spread_x == 1.0 and spread_y == 1.0:
+                cubic_weights(x - x0, wx)
+                cubic_weights(y - y0, wy)
+                for c in range(channels):
+                    value = 0.0
+                    for k in range(4):
+                        row = image[y0 - 1 + k]
+                        value += wy[k] * (
+                            wx[0] * row[x0 - 1, c]
+                            + wx[1] * row[x0, c]
+                            + wx[2] * row[x0 + 1, c]
+                            + wx[3] * row[x0 + 2, c]
+                        )
+                    total[c] = value
+                if not np.isnan(total[0]):
+                    for c in range(channels):
+                        out[i, j, c] = total[c]
+                    continue
+            left, n_x = _taps(x, spread_x, wx)
+            top, n_y = _taps(y, spread_y, wy)
+            weight = 0.0
+            total[:] = 0.0
+            for k in range(n_y):
+                v = min(max(top + k, 0), height - 1)
+                for l in range(n_x):
+                    u = min(max(left + l, 0), width - 1)
+                    if np.isnan(image[v, u, 0]):
+                        continue
+                    w = wy[k] * wx[l]
+                    weight += w
+                    for c in range(channels):
+                        total[c] += w * image[v, u, c]
+            for c in range(channels):
+                out[i, j, c] = total[c] / weight
+
+
+def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]) -> F32:
+    """Resample an image into a frame of (width, height) by cubic convolution, NaN outside the image."""
+    pixels = np.ascontiguousarray(image, dtype=np.float32)
+    pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    width, height = size
+    out = np.empty((height, width, pixels.shape[2]), np.float32)
+    for first in range(0, height, STRIP_ROWS):
+        last = min(first + STRIP_ROWS, height)
+        # One row more, if available: neighbour distances determine the filter width.
+        start = first - 1 if last == height and last - first == 1 and first > 0 else first
+        places = lookup(range(start, min(last + 1, height)))
+        strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
+        _sample_image(pixels, places, strip)
+        out[first:last] = strip[first - start :]
+    return out[:, :, 0] if image.ndim == 2 else out
+
+
+def undistort_image(
+    rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int], *, mask: B8 | None = None
+) -> tuple[U8, B8]:
+    """Resample an image with distortion into a pinhole camera; return it and which pixels are inside."""
+    inverse = np.linalg.inv(pinhole_K)
+
+    def lookup(rows: range) -> F64:
+        x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
+        rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ inverse.T
+        xy = distort(dehomogenize(rays), distortion) @ K[:2, :2].T + K[:2, 2]
+        return np.asarray(xy.reshape(*x.shape, 2))
+
+    given = rgb.astype(np.float32)
+    if mask is not None:
+        given[~mask] = np.nan
+    pixels = warp_image(given, lookup, size)
+    # In place: a full image in single precision takes 12 bytes per pixel.
+    del given
+    seen = np.asarray(np.isfinite(pixels).all(axis=2))
+    pixels[~seen] = 0.0
+    np.clip(np.rint(pixels, out=pixels), 0.0, 255.0, out=pixels)
+    return pixels.astype(np.uint8), seen
+
+
+def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:
+    """Bilinear samples (..., C) of ``values`` (H, W, C), and the range (..., C) of the four pixels around."""
+    height, width = values.shape[:2]
+    x0 = np.clip(np.floor(x).astype(np.int64), 0, max(width - 2, 0))
+    y0 = np.clip(np.floor(y).astype(np.int64), 0, max(height - 2, 0))
+    x1, y1 = np.minimum(x0 + 1, width - 1), np.minimum(y0 + 1, height - 1)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    a, b, c, d = (values[v, u] for v, u in ((y0, x0), (y0, x1), (y1, x0), (y1, x1)))
+    top, bottom = a + fx * (b - a), c + fx * (d - c)
+    spread = np.maximum.reduce([a, b, c, d]) - np.minimum.reduce([a, b, c, d])
+    return top + fy * (bottom - top), spread
+
+
+class Rectification(ABC):
+    """Maps between two images (side 0 is the left one) and a frame whose rows are epipolar lines."""
+
+    size: tuple[int, int]
+
+    @abstractmethod
+    def _original(self, side: int, xy: F64) -> F64: ...
+
+    @abstractmethod
+    def _rectified(self, side: int, xy: F64) -> F64: ...
+
+    @abstractmethod
+    def _lookup(self, side: int, rows: range) -> F64:
+        """Positions (len(rows), width, 2) of rows of the frame in an image."""
+
+    def original_from_rectified(self, side: int, xy: F64, *, within: bool = True) -> F64:
+        """Map positions (N, 2) of the frame to pixels, NaN if there is none, or ``within`` the frame only."""
+        return self._original(side, self._within(xy) if within else xy)
+
+    def rectified_from_original(self, side: int, xy: F64, *, within: bool = True) -> F64:
+        """Map pixels (N, 2) to the frame, NaN beyond the line sent to infinity, and outside if ``within``."""
+        moved = self._rectified(side, xy)
+        return self._within(moved) if within else moved
+
+    def _within(self, xy: F64) -> F64:
+        inside = np.all((xy >= -0.5) & (xy <= np.array(self.size) - 0.5), axis=1)
+        return np.where(inside[:, None], xy, np.nan)
+
+    def reduced(self, scale: float) -> Rectification:  # noqa: ARG002
+        """The frame with ``scale`` times as many pixels per side, or itself where its size is bounded."""
+        return self
+
+    def warp(self, image: F32, side: int) -> F32:
+        """Resample an image (H, W) or (H, W, C) into the frame, NaN outside."""
+        return warp_image(image, partial(self._lookup, side), self.size)
+
+
+def pinhole_frame(
+    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
+) -> PinholeView:
+    """The view of :func:`pinhole_view` without reading pixels: all are black and valid."""
+    P, _, size = _pinhole_camera(image, reconstruction, view, max_side)
+    black, seen = np.broadcast_to(np.uint8(0), (*size[::-1], 3)), np.broadcast_to(np.True_, size[::-1])
+    return PinholeView(view, P, black, seen)
+
+
+def pinhole_view(
+    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
+) -> PinholeView:
+    """Undistort an image of a metric reconstruction, at most ``max_side`` long; P[2] X is the depth."""
+    P, K, size = _pinhole_camera(image, reconstruction, view, max_side)
+    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
+    if not distortion.any() and size == image.size and image.mask is None:
+        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
+    assert reconstruction.K is not None
+    rgb, seen = undistort_image(image.rgb, reconstruction.K[view], distortion, K, size, mask=image.mask)
+    return PinholeView(view, P, rgb, seen)
+
+
+def _pinhole_camera(
+    image: Image, reconstruction: Reconstruction, view: int, max_side: int
+) -> tuple[F64, F64, tuple[int, int]]:
+    """P (3, 4), K (3, 3) and (width, height) of an undistorted image."""
+    K = reconstruction.K
+    if reconstruction.stratum != "metric" or K is None:
+        raise ValueError("undistorted views need a metric reconstruction with K")
+    if tuple(reconstruction.sizes[view]) != image.size:
+        raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
+    shrink = min(1.0, max_side / max(image.size))
+    size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
+    S = resizing_transform(np.divide(size, image.size))
+    P = reconstruction.P[view]
+    P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
+    return P, S @ K[view], size

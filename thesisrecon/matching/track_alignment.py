@@ -1,0 +1,316 @@
+"""Least-squares matching: sub-pixel alignment of windows by position and local affine map.
+
+Inverse compositional alignment (S. Baker and I. Matthews, "Lucas-Kanade 20 years on: a unifying framework",
+IJCV 56, 2004, section 3.2), at the scale of the corner and then at the finest scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy
+
+from thesisrecon._numba import FAST, copy_to, empty, kernel, zeros
+from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.matching._prepared import (
+    SAMPLES,
+    SIDE,
+    PreparedImage,
+    affine_determinant,
+    dot,
+    normalize_window,
+    pyramid_level,
+    sample_window,
+    select_matches,
+    window_raster,
+)
+from thesisrecon.records import Matches
+
+WIDE = SIDE + 2
+HALF = SIDE // 2
+# Below this correlation the windows show different surfaces and the iteration does not converge.
+MIN_WINDOW_CORRELATION = 0.3
+# Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
+MIN_CONDITION = 1e-4
+# Squared step in pixels of the scale at which the iteration stops.
+SETTLED = 1e-4
+ITERATIONS = 12
+# Maximum distance of aligned matches from their corners, in pixels of the corner's scale.
+MAX_SHIFT = 3.0
+# Prior standard deviation of an affine coefficient, and minimum correlation of an aligned match.
+AFFINE_STD, MIN_CORRELATION = 0.02, 0.8
+# Two matches closer than this in (x1, y1, x2, y2) px are the same.
+APART_PX = 1.0
+# A window of half the width must fit better and stay near the result of the wider one.
+FINE_CORRELATION = 0.85
+FINE_SHIFT = 1.0
+# Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
+# with anything and passes a correlation threshold.
+MAX_STD = 0.12
+
+
+@kernel
+def _align_windows(
+    view1: tuple[F32, I64, float],
+    view2: tuple[F32, I64, float],
+    matches: tuple[F64, F32, F64, F64],
+    limits: tuple[int, float, float, float],
+) -> tuple[F64, F64, F32]:
+    """Align the window around each ``xy1`` with image 2, invariant to gain and bias.
+
+    ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
+    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
+    shift and maximum expected error of the position, both in pixels of the corner's scale. The gradients of
+    the template, orthogonal to a constant (bias) and to the template (gain), serve every iteration. Returns
+    ``xy2`` (M, 2), affine (M, 2, 2) and the final correlation (M,), 0 for failures.
+    """
+    pixels1, levels1, base1 = view1
+    pixels2, levels2, base2 = view2
+    xy1, scale1, start, affine_start = matches
+    iterations, affine_std, max_shift, largest_std = limits
+    xy2, affine = start.copy(), affine_start.copy()
+    score = zeros(len(xy1), np.float32)
+    wide, raster = (empty(WIDE * WIDE, np.float32), window_raster(WIDE)), window_raster(SIDE)
+    template, window = empty(SAMPLES, np.float32), empty(SAMPLES, np.float32)
+    gradient = empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
+    for n in range(len(xy1)):
+        determinant = affine_determinant(affine[n])
+        if determinant == 0.0:
+            continue
+        m = np.sqrt(determinant)
+        # Finest size that both images resolve.
+        size = max(float(scale1[n]), base2 / m)
+        k1, k2 = pyramid_level(size, base1, len(levels1)), pyramid_level(size * m, base2, len(levels2))
+        to1, to2 = 1.0 / (base1 * 2.0**k1), 1.0 / (base2 * 2.0**k2)
+        if not _read_template(pixels1, levels1[k1], to1, (xy1[n], size), wide, raster, (template, gradient)):
+            continue
+        normal = _normal_matrix(gradient)
+        d = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
+        if d <= MIN_CONDITION * normal[0, 0] * normal[1, 1]:
+            continue
+        value = _iterate(
+            (pixels2, levels2[k2], to2),
+            (template, gradient, normal, window, raster),
+            (xy2[n], affine[n]),
+            (iterations, affine_std, max_shift * size * m, size),
+        )
+        # Variance of the position: that of a sample times the trace of the inverse normal matrix.
+        variance = (1.0 - value * value) / SAMPLES * ((normal[0, 0] + normal[1, 1]) / d)
+        if value == 0.0 or variance > largest_std * largest_std:
+            copy_to(xy2[n], start[n])
+            for row in range(2):
+                copy_to(affine[n, row], affine_start[n, row])
+        else:
+            score[n] = value
+    return xy2, affine, score
+
+
+# Inlined, as the next two kernels: they are called for every window or step.
+@kernel(forceinline=True)
+def _read_template(
+    pixels: F32,
+    level: I64,
+    to_level: float,
+    place: tuple[F64, float],
+    wide: tuple[F32, F32],
+    inner: F32,
+    out: tuple[F32, F32],
+) -> bool:
+    """Sample the normalised window of image 1 and its derivatives by the unknowns.
+
+    ``place`` = xy, sample spacing in px; ``wide`` = buffer and raster of a wider window, ``inner`` the raster
+    of this one. Unknowns: shift x, y in samples and, if ``gradient`` has six rows, the change of the map in
+    units of half the window, so that all six have equal size. False if the window leaves the image or is
+    blank.
+    """
+    xy, size = place
+    template, gradient = out
+    border, raster = wide
+    step = zeros((2, 2))
+    step[0, 0] = step[1, 1] = size
+    if not sample_window(pixels, level, to_level, xy, step, raster, border):
+        return False
+    at = 0
+    for row in range(1, WIDE - 1):
+        for column in range(1, WIDE - 1):
+            c = row * WIDE + column
+            template[at] = border[c]
+            gradient[0, at] = np.float32(0.5) * (border[c + 1] - border[c - 1])
+            gradient[1, at] = np.float32(0.5) * (border[c + WIDE] - border[c - WIDE])
+            at += 1
+    norm = normalize_window(template)
+    if norm == 0.0:
+        return False
+    if len(gradient) == 6:
+        half = np.float32(1.0 / HALF)
+        for n in range(SAMPLES):
+            column, row = half * inner[0, n], half * inner[1, n]
+            gradient[2, n], gradient[3, n] = gradient[0, n] * column, gradient[0, n] * row
+            gradient[4, n], gradient[5, n] = gradient[1, n] * column, gradient[1, n] * row
+    for g in range(len(gradient)):
+        _project_out_gain_and_bias(gradient[g], template, norm)
+    return True
+
+
+@kernel(fastmath=FAST, forceinline=True)
+def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> None:
+    """Scale a gradient like the template and remove its components along a constant and the template."""
+    total = np.float32(0.0)
+    for n in range(len(gradient)):
+        total += gradient[n]
+    mean = total / np.float32(len(gradient))
+    factor = np.float32(1.0 / norm)
+    along = np.float32(0.0)
+    for n in range(len(gradient)):
+        gradient[n] = (gradient[n] - mean) * factor
+        along += gradient[n] * template[n]
+    for n in range(len(gradient)):
+        gradient[n] -= along * template[n]
+
+
+@kernel(forceinline=True)
+def _normal_matrix(gradient: F32) -> F64:
+    """Inner products of the derivatives."""
+    unknowns = len(gradient)
+    normal = zeros((unknowns, unknowns))
+    for g in range(unknowns):
+        for h in range(g, unknowns):
+            normal[g, h] = normal[h, g] = dot(gradient[g], gradient[h])
+    return normal
+
+
+@kernel(forceinline=True)
+def _iterate(
+    level2: tuple[F32, I64, float],
+    template: tuple[F32, F32, F64, F32, F32],
+    found: tuple[F64, F64],
+    limits: tuple[int, float, float, float],
+) -> float:
+    """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
+
+    ``template`` = window of image 1, derivatives, normal matrix, buffer and raster of the window of image 2;
+    ``limits`` = iterations, prior standard deviation of an affine coefficient, maximum shift px, sample
+    spacing of image 1 px.
+    """
+    pixels, level, to_level = level2
+    fixed, gradient, normal, window, raster = template
+    xy, a = found
+    iterations, affine_std, reach, size = limits
+    x, y = xy[0], xy[1]
+    moved = zeros(len(gradient))
+    value = 0.0
+    for turn in range(iterations + 1):
+        if not sample_window(pixels, level, to_level, xy, a * size, raster, window):
+            return 0.0
+        if normalize_window(window) == 0.0:
+            return 0.0
+        value = dot(window, fixed)
+        if value < MIN_WINDOW_CORRELATION:
+            return 0.0
+        if turn == iterations:
+            break
+        delta = _solve_step(gradient, normal, window, value, (moved, affine_std))
+        _compose(xy, a, delta, size)
+        if (xy[0] - x) ** 2 + (xy[1] - y) ** 2 > reach**2:
+            return 0.0
+        if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < SETTLED:
+            # Another correlation would cost a window and not change the result.
+            break
+    return value
+
+
+@kernel(forceinline=True)
+def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tuple[F64, float]) -> F64:
+    """Step of all unknowns; ``prior`` = change of the map so far (updated) and its standard deviation."""
+    moved, affine_std = prior
+    unknowns = len(gradient)
+    damped = normal.copy()
+    right = empty(unknowns)
+    # Residual variance of a normalised sample against the prior of the affine coefficients.
+    ridge = max(1.0 - value * value, 1e-4) / SAMPLES / max(HALF * HALF * affine_std * affine_std, 1e-12)
+    for g in range(unknowns):
+        right[g] = dot(gradient[g], window) / value
+        if g >= 2:
+            damped[g, g] += ridge
+            right[g] -= ridge * moved[g]
+    delta = zeros(unknowns)
+    if solve_damped(damped, right, 0.0, delta):
+        for g in range(unknowns):
+            delta[g] = -delta[g]
+    for g in range(2, unknowns):
+        moved[g] += delta[g]
+    return delta
+
+
+@kernel(forceinline=True)
+def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
+    """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
+    if len(delta) == 6:
+        p, q, r, s = 1.0 + delta[2] / HALF, delta[3] / HALF, delta[4] / HALF, 1.0 + delta[5] / HALF
+        determinant = p * s - q * r
+        for i in range(2):
+            u, v = a[i, 0], a[i, 1]
+            a[i, 0], a[i, 1] = (u * s - v * r) / determinant, (v * p - u * q) / determinant
+    dx, dy = size * delta[0], size * delta[1]
+    xy[0] -= a[0, 0] * dx + a[0, 1] * dy
+    xy[1] -= a[1, 0] * dx + a[1, 1] * dy
+
+
+def align_corners(
+    view1: PreparedImage,
+    view2: PreparedImage,
+    matches: tuple[F64, F32, F64, F64],
+    *,
+    affine_std: float,
+    max_shift: float = MAX_SHIFT,
+) -> tuple[F64, F64, F32]:
+    """Align corners of image 1 with image 2 to sub-pixel positions.
+
+    Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
+    affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there (wide
+    convergence) and then at the finest scale (smaller noise), which is used if it fits. Arguments and results
+    are those of :func:`_align_windows`.
+    """
+    xy1, scale1, _, _ = matches
+    base = view1.pyramid[2]
+    limits = (ITERATIONS, affine_std, max_shift, MAX_STD)
+    xy2, affine, score = _align_windows(view1.pyramid, view2.pyramid, matches, limits)
+    coarse = np.flatnonzero((scale1 > 1.5 * base) & (score > 0.0))
+    if not len(coarse):
+        return xy2, affine, score
+    finest = np.full(len(coarse), base, np.float32)
+    fine_xy2, _, fine_score = _align_windows(
+        view1.pyramid,
+        view2.pyramid,
+        (xy1[coarse], finest, xy2[coarse], affine[coarse]),
+        (ITERATIONS, affine_std, FINE_SHIFT, MAX_STD),
+    )
+    fits = fine_score >= FINE_CORRELATION
+    xy2[coarse[fits]] = fine_xy2[fits]
+    return xy2, affine, score
+
+
+def align_matches(
+    view1: PreparedImage, view2: PreparedImage, matches: Matches, *, affine_std: float = AFFINE_STD
+) -> Matches:
+    """Align matches of corners to sub-pixel positions and drop those that fail or repeat a better one."""
+    start = (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine)
+    xy2, affine, score = align_corners(view1, view2, start, affine_std=affine_std)
+    moved = replace(matches, xy2=xy2, affine=affine, score=score)
+    good = select_matches(moved, np.flatnonzero(score >= MIN_CORRELATION))
+    return select_matches(good, strongest_distinct(good))
+
+
+def strongest_distinct(matches: Matches, apart_px: float = APART_PX) -> I64:
+    """Rows, sorted, of the matches that do not repeat a stronger one."""
+    rows = np.argsort(-matches.score, kind="stable")
+    keep = np.ones(len(rows), np.bool_)
+    if len(rows) >= 2:
+        places = np.hstack([matches.xy1, matches.xy2])[rows]
+        for a, b in sorted(scipy.spatial.cKDTree(places).query_pairs(apart_px)):
+            if keep[a]:
+                keep[b] = False
+    kept: I64 = np.sort(rows[keep])
+    return kept

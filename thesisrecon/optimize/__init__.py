@@ -1,0 +1,1 @@
+"""Optimisation and robust statistics: least squares, noise, robust resection, optimal triangulation."""

@@ -1,0 +1,193 @@
+"""Covariance of poses, intrinsics and points after bundle adjustment, and the noise from the residuals."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.optimize.bundle.elimination import BlockIndex
+from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF
+from thesisrecon.optimize.bundle.observations import Jacobians
+from thesisrecon.optimize.bundle.reduced_solvers import ReducedSystem, order_views
+from thesisrecon.optimize.least_squares import invert_information
+from thesisrecon.optimize.noise import MAD_FACTOR
+
+SIMILARITY_DOF = 7
+# Largest number of unknowns for dense inversion.
+MAX_DENSE = 1200
+# For more unknowns, a banded factor is less work if its band spans at most 1 / BAND of the views.
+BAND = 5
+# Pairs of observations at a time.
+PAIRS = 16384
+# Trimming point and variance of a standard normal variable trimmed there.
+TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
+# Least fraction of its variance that a residual must keep to be used for the noise.
+MIN_KEPT = 0.1
+
+
+def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
+    """Standard deviation of a coordinate from residuals (K, 2) within 2.5 sigma, corrected for the fit.
+
+    ``leverage`` (K, 2) is the fraction of the variance absorbed by the points, ``dof`` the number of other
+    unknowns.
+    """
+    if not len(residual):
+        return 0.0
+    kept = 1.0 - leverage - max(dof, 0) / residual.size
+    informative = kept > MIN_KEPT
+    if not informative.any():
+        return 0.0
+    size = np.abs(residual[informative]) / np.sqrt(kept[informative])
+    sigma = MAD_FACTOR * float(np.median(size))
+    for _ in range(5):
+        within = size[size <= TRIM * sigma]
+        if len(within):
+            sigma = float(np.sqrt(np.mean(within**2) / TRIMMED_VARIANCE))
+    return sigma
+
+
+def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """Return the covariance (n, C + e, C + e) of pairs of views with a common point, and of the border.
+
+    Its rows are the columns of view ``row``, then the border, its columns those of view ``column`` and the
+    border. It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved
+    the cameras least. ``R`` and ``t`` are those of the b views with observations.
+    """
+    b, C, e = reduced.sums.border.shape
+    if not b:
+        return np.zeros((0, C + e, C + e))
+    if b * C + e <= MAX_DENSE or BAND * order_views(reduced.row, reduced.column, b).reach > b:
+        return _dense_blocks(reduced, R, t, row, column)
+    return _band_blocks(reduced, R, t, row, column)
+
+
+def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
+    """Covariances of intrinsics (G, C, C) and poses (b, 6, 6); the unit of length is 1 / ``scale`` (6.7)."""
+    intrinsics, edge = np.zeros((*number.shape, number.shape[1])), len(blocks) * width
+    if not len(blocks):
+        return intrinsics, np.zeros((0, POSE_DOF, POSE_DOF))
+    units = np.array([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale])
+    poses = blocks[:, :POSE_DOF, :POSE_DOF] * units * units[:, None]
+    for g, row in enumerate(number):
+        moves = np.flatnonzero(row >= 0)
+        own = row[moves][row[moves] < edge] // width
+        block = int(own[0]) if len(own) else 0
+        index = np.where(row[moves] < edge, row[moves] - width * block, row[moves] - edge + width)
+        units = np.where(moves == FOCAL, focal[g], 1.0)
+        intrinsics[g][np.ix_(moves, moves)] = blocks[block][np.ix_(index, index)] * units * units[:, None]
+    return intrinsics, poses
+
+
+def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64) -> F64:
+    """Return the covariance (N, 3, 3) of the points in the gauge of the cameras' ``blocks``.
+
+    With V = B'B of a point and W' = sum B' [A E], it is V^-1 + V^-1 W' S W V^-1 for the covariance S of the
+    cameras that observe it. ``inverse`` (N, 3, 3) is V^-1; infinite for points in fewer than two views.
+    """
+    count = np.diff(index.start)
+    out, C = inverse.copy(), J.A.shape[2]
+    common = index.common[index.view_index]
+    moves = np.concatenate([J.A, np.where(common[:, None] >= 0, J.E, 0.0)], axis=2)
+    columns = np.concatenate(
+        [np.broadcast_to(np.arange(C), (len(moves), C)), C + np.maximum(common, 0)], axis=1
+    )
+    point = np.repeat(np.arange(len(count)), count)
+    T = inverse[point] @ np.swapaxes(J.B, 1, 2) @ moves
+    block = index.block[index.view_index]
+    # All pairs k <= m of observations of a point: m = k, k + 1, ... of a step at a time.
+    for step in range(int(count.max(initial=0))):
+        for first in range(0, len(T) - step, PAIRS):
+            k = np.arange(first, min(first + PAIRS, len(T) - step))
+            k = k[point[k] == point[k + step]]
+            m = k + step
+            pair = index.pair[block[k], block[m]]
+            S = blocks[pair[:, None, None], columns[k][:, :, None], columns[m][:, None, :]]
+            part = T[k] @ S @ np.swapaxes(T[m], 1, 2)
+            np.add.at(out, point[k], part + np.swapaxes(part, 1, 2) if step else part)
+    n_views = len(index.block)
+    seen = np.unique(point * n_views + index.view_index) // max(n_views, 1)
+    views = np.bincount(seen, minlength=len(count))
+    out[views < 2] = np.diag([np.inf] * 3)
+    return out
+
+
+def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """Return the blocks of :func:`camera_blocks` by dense inversion."""
+    b, C, e = reduced.sums.border.shape
+    S = reduced.dense()
+    covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, _gauge_basis(reduced, R, t))
+    index = np.concatenate(
+        [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
+    )
+    return np.asarray(covariance[index[row][:, :, None], index[column][:, None, :]])
+
+
+def invert_in_inner_gauge(information: F64, N: F64) -> F64:
+    """Invert an information matrix, singular along orthonormal N (D, 7): (S + w N N')^-1 - N N' / w."""
+    weight = float(np.median(np.diag(information)))
+    C = invert_information(information + weight * N @ N.T)
+    return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
+
+
+def _band_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+    """The blocks of :func:`camera_blocks` from a banded factor, by Baarda's S-transformation."""
+    b, C, e = reduced.sums.border.shape
+    _fix_gauge(reduced, R, t)
+    factored = order_views(reduced.row, reduced.column, b).factor(reduced)
+    N = _gauge_basis(reduced, R, t)
+    moved = None if factored is None else factored.solve(N)
+    if factored is None or moved is None:
+        return np.full((len(row), C + e, C + e), np.inf)
+
+    def rows(matrix: F64) -> F64:
+        own = matrix[: b * C].reshape(b, C, -1)
+        return np.concatenate([own, np.broadcast_to(matrix[b * C :], (b, e, own.shape[2]))], axis=1)
+
+    n, m, middle = rows(N), rows(moved), N.T @ moved
+    blocks = factored.inverse_blocks(row, column)
+    blocks -= m[row] @ np.swapaxes(n[column], 1, 2)
+    blocks -= np.swapaxes(m[column] @ np.swapaxes(n[row], 1, 2), 1, 2)
+    blocks += n[row] @ middle @ np.swapaxes(n[column], 1, 2)
+    return blocks
+
+
+def _fix_gauge(reduced: ReducedSystem, R: F64, t: F64) -> None:
+    """Add weight to seven coordinates: one pose, and the distance to the farthest camera."""
+    sums, C = reduced.sums, reduced.sums.border.shape[1]
+    diagonal = (reduced.row == reduced.column).nonzero()[0]
+    weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
+    _, moved, line = fixed_coordinates(R, t)
+    sums.blocks[diagonal[0], np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
+    sums.blocks[diagonal[moved.start // POSE_DOF], 3:6, 3:6] += weight * line
+
+
+def fixed_coordinates(R: F64, t: F64) -> tuple[slice, slice, F64]:
+    """Return the columns of the first pose, and of the translation of the farthest, with its direction.
+
+    Seven coordinates without a gauge freedom: a pose, and the distance to another camera, whose direction is
+    given as the outer product (3, 3) of a unit vector.
+    """
+    centres = -np.einsum("vba,vb->va", R, t)
+    far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
+    line = R[far] @ (centres[far] - centres[0])
+    direction = np.outer(line, line) / max(float(line @ line), 1e-300)
+    return slice(0, POSE_DOF), slice(POSE_DOF * far + 3, POSE_DOF * far + 6), direction
+
+
+def _gauge_basis(reduced: ReducedSystem, R: F64, t: F64) -> F64:
+    """Return the orthonormal motion (D, 7) of all columns under similarities of the world."""
+    N = np.zeros((len(reduced.sums.rhs), SIMILARITY_DOF))
+    columns = reduced.sums.border.shape[1] * np.arange(len(t))[:, None] + np.arange(POSE_DOF)
+    N[columns.ravel()] = gauge_directions(R, t)
+    return N
+
+
+def gauge_directions(R: F64, t: F64) -> F64:
+    """Return the orthonormal motion (6 V, 7) of poses under similarities of the world."""
+    directions = np.zeros((len(t), POSE_DOF, SIMILARITY_DOF))
+    directions[:, 3:, 0:3] = -R
+    directions[:, :3, 3:6] = -R
+    directions[:, 3:, 3:6] = -cross_matrix(t) @ R
+    directions[:, 3:, 6] = t
+    return np.asarray(np.linalg.qr(directions.reshape(-1, SIMILARITY_DOF))[0])

@@ -1,0 +1,291 @@
+"""Metric bundle adjustment: poses, points and intrinsics, shared or separate, with priors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.optimize.bundle.covariance import (
+    SIMILARITY_DOF,
+    bundle_covariances,
+    camera_blocks,
+    point_covariances,
+    robust_sigma,
+)
+from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
+from thesisrecon.optimize.bundle.intrinsic_unknowns import (
+    IntrinsicColumns,
+    IntrinsicUnknowns,
+    assign_columns,
+    number_unknowns,
+)
+from thesisrecon.optimize.bundle.metric_kernels import (
+    POSE_DOF,
+    MetricCameras,
+    MetricModel,
+    linearize_metric,
+    metric_cost,
+    move_poses,
+    project_metric,
+)
+from thesisrecon.optimize.bundle.observations import (
+    Jacobians,
+    Observations,
+    SortedObservations,
+    Weighting,
+    sort_observations,
+)
+from thesisrecon.optimize.bundle.schur import (
+    BundleLayout,
+    BundleStep,
+    BundleSystem,
+    CameraPrior,
+    build_layout,
+)
+from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
+
+# Below a relative gain of NEWTON_GAIN the second derivative of the loss is used; at least MIN_CURVATURE of
+# the curvature along a residual is kept. Reweighting is safe far from the minimum, Newton's method faster
+# near it.
+_MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
+MAX_ITERATIONS = 300
+"""Bound of the linear solves of one adjustment: a long valley of the cost takes fifty to a hundred."""
+MAX_SIGMAS_TO_MINIMUM = 0.1
+"""Distance of the cameras from the minimum, in standard deviations, up to which it counts as reached."""
+
+_Covariances = tuple[F64, F64 | None, F64 | None]
+"""Covariances of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """Options of :func:`refine_metric_bundle`.
+
+    ``sigma_px`` is the noise that weights the residuals, ``loss_px`` the width of Huber's loss. The
+    adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
+    distance of all cameras from the minimum, in standard deviations. ``damping`` is the initial damping; the
+    covariances are computed with a noise of at least ``noise_floor_px``.
+    """
+
+    sigma_px: float = 1.0
+    loss_px: float = 1.0
+    max_iterations: int = MAX_ITERATIONS
+    settled: float = 0.0
+    covariance: bool = False
+    point_covariance: bool = False
+    noise_floor_px: float = 0.0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        if not (self.sigma_px > 0.0 and self.loss_px > 0.0):
+            raise ValueError(f"sigma_px and loss_px must be positive; got {self.sigma_px}, {self.loss_px}")
+
+
+@dataclass(frozen=True)
+class MetricBundleResult:
+    """Refined cameras and points with their uncertainty, in the inner gauge (no camera is exact).
+
+    ``residual_px`` (K, 2) is projection minus observation in the caller's order, ``cost`` 1/2 sum rho in
+    units of the given sigma, priors included. ``intrinsics_covariance`` (G, C, C) is zero for entries that do
+    not move, ``pose_covariance`` (V, 6, 6) that of (rotation vector in rad, translation) of x -> exp(w) x + d
+    in each camera frame, ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views.
+    ``sigmas_to_minimum`` is (g' H^-1 g)^(1/2) of the cameras: the largest undamped step of any function of
+    them in its standard deviations, for noise of the given sigma.
+    """
+
+    cameras: MetricCameras
+    X: F64
+    residual_px: F64
+    cost: float
+    intrinsics_covariance: F64
+    pose_covariance: F64 | None
+    sigma_px: float
+    point_covariance: F64 | None
+    sigmas_to_minimum: float
+
+
+@dataclass(frozen=True)
+class _State:
+    model: MetricModel
+    values: F64
+
+
+@dataclass(frozen=True)
+class _MetricProblem:
+    """Reprojection in units of sigma plus the priors."""
+
+    layout: BundleLayout
+    columns: IntrinsicColumns
+    moves: B8
+    values: IntrinsicUnknowns
+    weighting: Weighting
+    jacobians: Jacobians
+
+    def linearize(self, state: _State) -> BundleSystem:
+        J, c = self.jacobians, self.columns
+
+        def work(rows: slice, obs: Observations) -> float:
+            part = Jacobians(*(a[rows] for a in J))
+            return float(linearize_metric(state.model, obs, self.weighting, c.own, c.common, part))
+
+        cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
+        if c.pinned.any():
+            J.A[:] = np.where(c.pinned[self.layout.observations.seen.view_index][:, None], 0.0, J.A)
+        return BundleSystem(cost, self.layout, J, self._prior(state))
+
+    def _prior(self, state: _State) -> CameraPrior | None:
+        terms, c = self.values.terms, self.columns
+        if not len(terms.first):
+            return None
+        gradient = np.zeros(self.layout.size)
+        gradient[c.place] = terms.gradient(state.values)
+        return c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient
+
+    def retract(self, state: _State, step: BundleStep) -> _State:
+        m, layout = state.model, self.layout
+        camera_step, point_step = step
+        own = camera_step[: layout.size - layout.border].reshape(-1, layout.width)
+        poses = np.zeros((len(m.t), POSE_DOF))
+        poses[self.moves] = own[:, :POSE_DOF]
+        R, t = np.empty_like(m.R), np.empty_like(m.t)
+        move_poses(m.R, m.t, poses, R, t)
+        values = self.values.step(state.values, camera_step[self.columns.place])
+        X = m.X + point_step
+        before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
+        o = layout.observations
+        revert_crossing_points(o.start, o.seen.view_index, before, after, m.X, X)
+        return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
+
+    def cost(self, state: _State) -> float:
+        data = self.layout.sum_over_observations(
+            lambda _, obs: float(metric_cost(state.model, obs, self.weighting))
+        )
+        return data + self.values.terms.cost(state.values)
+
+    def sigma(self, state: _State, residual: F64) -> float:
+        """Return the noise of one coordinate, px, from the residuals at the minimum."""
+        leverage = np.empty_like(residual)
+        self.linearize(state)
+        sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
+        dof = POSE_DOF * int(self.moves.sum()) + self.values.size - SIMILARITY_DOF
+        return robust_sigma(residual, leverage, dof)
+
+
+def refine_metric_bundle(
+    cameras: MetricCameras,
+    X: F64,
+    observations: Observations,
+    *,
+    free: B8,
+    prior: IntrinsicsPrior | None = None,
+    options: BundleOptions | None = None,
+    fixed: B8 | None = None,
+) -> MetricBundleResult:
+    """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics (6.7).
+
+    The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
+    Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
+    damping, and the scene is centred and scaled inside. The cost never rises; ``fixed`` (V,) views, and views
+    and points without observations, do not change.
+    """
+    options = options or BundleOptions()
+    o = sort_observations(observations, len(cameras.R), len(X))
+    seen_points = np.diff(o.start) > 0
+    origin, scale = scene_frame(X[seen_points])
+    moves = np.bincount(o.seen.view_index, minlength=len(cameras.R)) > 0
+    if fixed is not None:
+        moves &= ~fixed
+    problem, values, table = _metric_problem(cameras, o, (moves, np.asarray(free, bool)), prior, options)
+    start = MetricModel(
+        np.ascontiguousarray(cameras.R),
+        scale * (cameras.t + cameras.R @ origin),
+        problem.values.write(table, values),
+        np.ascontiguousarray(cameras.group, dtype=np.int64),
+        np.ascontiguousarray(scale * (X - origin)),
+    )
+    found = _minimize(problem, _State(start, values), options)
+    state, cost = found.state, found.cost
+    end, moved = state.model, problem.moves
+    refined = replace(
+        cameras,
+        R=np.where(moved[:, None, None], end.R, cameras.R),
+        t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
+        intrinsics=end.intrinsics,
+    )
+    residual = project_metric(end, o.seen)
+    sigma = problem.sigma(state, residual)
+    covariances: _Covariances = (np.zeros((*table.shape, table.shape[1])), None, None)
+    if options.covariance:
+        noise = max(sigma or options.sigma_px, options.noise_floor_px)
+        covariances = _covariances(problem, state, noise, scale, points=options.point_covariance)
+    return MetricBundleResult(
+        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), cost,
+        *covariances[:2], sigma, covariances[2], float(np.sqrt(2.0 * max(found.remaining, 0.0))),
+    )  # fmt: skip
+
+
+def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
+    """Return the minimum: by reweighting, then by steps close to Newton's."""
+    most, settled = options.max_iterations, options.settled
+    found = run_levenberg_marquardt(
+        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN, min_camera_gain=settled
+    )
+    if found.iterations < most:
+        near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
+        found = run_levenberg_marquardt(
+            near, found.state, max_iterations=most - found.iterations, min_camera_gain=settled,
+            initial_damping=found.damping,
+        )  # fmt: skip
+    return found
+
+
+def _metric_problem(
+    cameras: MetricCameras,
+    o: SortedObservations,
+    unknown: tuple[B8, B8],
+    prior: IntrinsicsPrior | None,
+    options: BundleOptions,
+) -> tuple[_MetricProblem, F64, F64]:
+    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics.
+
+    ``unknown``: the views (V,) that move, and the intrinsics (C,) that do.
+    """
+    group, (moves, free) = np.asarray(cameras.group, dtype=np.int64), unknown
+    used = np.bincount(group[moves], minlength=len(cameras.intrinsics)) > 0
+    values, start, table = number_unknowns(cameras, used, free, prior)
+    columns = assign_columns(values, group, np.flatnonzero(free), moves)
+    layout = build_layout(
+        o,
+        columns.block,
+        width=POSE_DOF + len(columns.own),
+        common=columns.border,
+        border=columns.n_border,
+        threads=options.threads,
+    )
+    weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
+    return _MetricProblem(layout, columns, moves, values, weighting, layout.jacobians()), start, table
+
+
+def _covariances(
+    problem: _MetricProblem, state: _State, sigma_px: float, scale: float, *, points: bool
+) -> _Covariances:
+    """Return the covariances, lengths in the caller's unit."""
+    problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
+    reduced, sums, _ = problem.linearize(state).reduce(1e-10)
+    m, seen, layout = state.model, problem.moves, problem.layout
+    number = problem.columns.columns_of(problem.values.number)
+    own = np.arange(int(seen.sum()))
+    row, column = (layout.row, layout.column) if points else (own, own)
+    blocks = camera_blocks(reduced, m.R[seen], m.t[seen], row, column)
+    poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
+    intrinsics, poses[seen] = bundle_covariances(
+        blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
+    )
+    if not points:
+        return intrinsics, poses, None
+    of_points = point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
+    return intrinsics, poses, of_points / scale**2

@@ -1,0 +1,220 @@
+"""Compiled projection, cost and Jacobians of calibrated cameras with radial distortion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from thesisrecon._numba import empty, kernel
+from thesisrecon.arrays import F64, I64
+from thesisrecon.geometry.small_matrices import away_from_zero, loss_curvature, loss_value, loss_weight
+from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
+
+
+@dataclass(frozen=True)
+class MetricCameras:
+    """Calibrated cameras with shared or separate intrinsics.
+
+    A normalised point (x, y) is distorted to (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6) and multiplied by
+    K = [[f, skew, cx], [0, aspect f, cy], [0, 0, 1]].
+
+    Parameters
+    ----------
+    R, t : ndarray (V, 3, 3), (V, 3)
+        Poses, world-to-camera.
+    intrinsics : ndarray (G, C)
+        Rows [focal_px, aspect fy/fx, skew_px, cx_px, cy_px, k1], and k2, k3 if C = 8.
+    group : ndarray (V,) of int
+        Row of each view.
+    shared : ndarray (G, C) of int, optional
+        Rows with equal numbers in a column have one value there; by default every row has its own.
+    """
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    group: I64
+    shared: I64 | None = None
+
+    @property
+    def K(self) -> F64:
+        """Calibration matrices (V, 3, 3)."""
+        f, aspect, skew, cx, cy = self.intrinsics[self.group].T[:5]
+        zero, one = np.zeros_like(f), np.ones_like(f)
+        rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
+        return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+    @property
+    def P(self) -> F64:
+        """Cameras before distortion, K [R t]; (V, 3, 4)."""
+        return np.asarray(self.K @ np.concatenate([self.R, self.t[:, :, None]], axis=2))
+
+    @property
+    def centres(self) -> F64:
+        """Camera centres (V, 3)."""
+        return np.asarray(-np.einsum("vba,vb->va", self.R, self.t))
+
+
+POSE_DOF = 6
+FOCAL = 0
+
+
+class MetricModel(NamedTuple):
+    """Poses ``R`` (V, 3, 3), ``t`` (V, 3), points ``X`` (N, 3) and ``intrinsics`` (G, 6) or (G, 8).
+
+    ``group`` (V,) is the row of each view.
+    """
+
+    R: F64
+    t: F64
+    intrinsics: F64
+    group: I64
+    X: F64
+
+
+@kernel(inline="always")
+def _in_camera(r: F64, t: F64, x: F64) -> tuple[float, float, float]:
+    """Return R x + t."""
+    return (
+        r[0, 0] * x[0] + r[0, 1] * x[1] + r[0, 2] * x[2] + t[0],
+        r[1, 0] * x[0] + r[1, 1] * x[1] + r[1, 2] * x[2] + t[1],
+        r[2, 0] * x[0] + r[2, 1] * x[1] + r[2, 2] * x[2] + t[2],
+    )
+
+
+@kernel(inline="always")
+def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
+    """Return the pixel of a point in the camera frame, w away from 0; q is a row of intrinsics."""
+    a, b = x0 / w, x1 / w
+    r2 = a * a + b * b
+    d = 1.0 + q[5] * r2
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+    return q[0] * a * d + q[2] * b * d + q[3], q[0] * q[1] * b * d + q[4]
+
+
+@kernel
+def image_points(model: MetricModel, view: I64, point: I64) -> tuple[F64, F64]:
+    """Return pixels (K, 2), with distortion, and depths (K,) of points in views."""
+    xy, depth = empty((len(view), 2)), empty(len(view))
+    for k in range(len(view)):
+        v = view[k]
+        x0, x1, depth[k] = _in_camera(model.R[v], model.t[v], model.X[point[k]])
+        q = model.intrinsics[model.group[v]]
+        xy[k, 0], xy[k, 1] = _image_of(q, x0, x1, away_from_zero(depth[k]))
+    return xy, depth
+
+
+@kernel
+def project_metric(model: MetricModel, obs: Observations) -> F64:
+    """Return residuals (K, 2), projection minus observation, px."""
+    return image_points(model, obs.view_index, obs.point_index)[0] - obs.xy
+
+
+@kernel
+def metric_cost(model: MetricModel, obs: Observations, weighting: Weighting) -> float:
+    """Return 1/2 sum rho of the residuals."""
+    cost = 0.0
+    for k in range(len(obs.xy)):
+        v, x = obs.view_index[k], model.X[obs.point_index[k]]
+        x0, x1, x2 = _in_camera(model.R[v], model.t[v], x)
+        px, py = _image_of(model.intrinsics[model.group[v]], x0, x1, away_from_zero(x2))
+        e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
+        cost += loss_value(e0 * e0 + e1 * e1, weighting.delta)
+    return 0.5 * cost
+
+
+@kernel
+def move_poses(R: F64, t: F64, step: F64, R_out: F64, t_out: F64) -> None:
+    """Apply x -> exp(w) x + d in the camera frames after the poses; ``step`` (V, 6) = (w, d)."""
+    for v in range(len(t)):
+        w = step[v, :3]
+        angle = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+        # Rodrigues: exp(w) = I + a [w]x + b [w]x^2, by series if the quotients lose digits.
+        a, b = 1.0 - angle * angle / 6.0, 0.5 - angle * angle / 24.0
+        if angle > 1e-4:
+            a, b = math.sin(angle) / angle, 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        for c in range(4):
+            x = R[v, :, c] if c < 3 else t[v]
+            y = R_out[v, :, c] if c < 3 else t_out[v]
+            u0, u1, u2 = w[1] * x[2] - w[2] * x[1], w[2] * x[0] - w[0] * x[2], w[0] * x[1] - w[1] * x[0]
+            y[0] = x[0] + a * u0 + b * (w[1] * u2 - w[2] * u1)
+            y[1] = x[1] + a * u1 + b * (w[2] * u0 - w[0] * u2)
+            y[2] = x[2] + a * u2 + b * (w[0] * u1 - w[1] * u0)
+        for c in range(3):
+            t_out[v, c] += step[v, 3 + c]
+
+
+@kernel
+def linearize_metric(
+    model: MetricModel, obs: Observations, weighting: Weighting, own: I64, common: I64, J: Jacobians
+) -> float:
+    """Fill weighted residuals, in units of sigma, and their Jacobians; return the cost.
+
+    A pose moves by x -> exp(w) x + d in the camera frame: columns (w, d) of A, then the intrinsics ``own``
+    among (log f, aspect, skew, cx, cy, k1, k2, k3); ``common`` are those in the columns of E.
+    """
+    cost = 0.0
+    D = empty((2, 10))
+    for k in range(len(obs.xy)):
+        v, x = obs.view_index[k], model.X[obs.point_index[k]]
+        r, q = model.R[v], model.intrinsics[model.group[v]]
+        x0, x1, x2 = _in_camera(r, model.t[v], x)
+        w = away_from_zero(x2)
+        px, py = _image_of(q, x0, x1, w)
+        e0, e1 = (px - obs.xy[k, 0]) / weighting.sigma, (py - obs.xy[k, 1]) / weighting.sigma
+        s = e0 * e0 + e1 * e1
+        cost += loss_value(s, weighting.delta)
+        root = np.sqrt(loss_weight(s, weighting.delta))
+        a, b = x0 / w, x1 / w
+        _fill_columns(q, a, b, root / weighting.sigma, D)
+        kept = max(loss_curvature(s, weighting.delta), weighting.min_curvature)
+        if kept < 1.0:
+            # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
+            kept = np.sqrt(kept)
+            root /= kept
+            for c in range(10):
+                along = (1.0 - kept) * (e0 * D[0, c] + e1 * D[1, c]) / s
+                D[0, c], D[1, c] = D[0, c] - along * e0, D[1, c] - along * e1
+        J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
+        for c in range(len(own)):
+            J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
+        for c in range(len(common)):
+            J.E[k, 0, c], J.E[k, 1, c] = D[0, common[c]], D[1, common[c]]
+        j00, j01, j02 = D[0, 8] / w, D[0, 9] / w, -(D[0, 8] * a + D[0, 9] * b) / w
+        j10, j11, j12 = D[1, 8] / w, D[1, 9] / w, -(D[1, 8] * a + D[1, 9] * b) / w
+        A = J.A[k]
+        A[0, 0], A[0, 1], A[0, 2] = j02 * x1 - j01 * w, j00 * w - j02 * x0, j01 * x0 - j00 * x1
+        A[1, 0], A[1, 1], A[1, 2] = j12 * x1 - j11 * w, j10 * w - j12 * x0, j11 * x0 - j10 * x1
+        A[0, 3], A[0, 4], A[0, 5] = j00, j01, j02
+        A[1, 3], A[1, 4], A[1, 5] = j10, j11, j12
+        for c in range(3):
+            J.B[k, 0, c] = j00 * r[0, c] + j01 * r[1, c] + j02 * r[2, c]
+            J.B[k, 1, c] = j10 * r[0, c] + j11 * r[1, c] + j12 * r[2, c]
+    return 0.5 * cost
+
+
+@kernel
+def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
+    """Fill D (2, 10): derivatives of the pixel by eight intrinsics and the normalised point, times root."""
+    f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
+    r2 = a * a + b * b
+    # d is the distortion, slope its derivative over r^2.
+    d, slope = 1.0 + q[5] * r2, q[5]
+    if len(q) > 6:
+        d += (q[6] + q[7] * r2) * r2 * r2
+        slope += (2.0 * q[6] + 3.0 * q[7] * r2) * r2
+    D[0, 0], D[1, 0] = f * a * d, g * b * d
+    D[0, 1], D[1, 1] = 0.0, f * b * d
+    D[0, 2], D[1, 2] = root * b * d, 0.0
+    D[0, 3], D[1, 3] = root, 0.0
+    D[0, 4], D[1, 4] = 0.0, root
+    D[0, 5], D[1, 5] = (f * a + skew * b) * r2, g * b * r2
+    D[0, 6], D[1, 6] = D[0, 5] * r2, D[1, 5] * r2
+    D[0, 7], D[1, 7] = D[0, 6] * r2, D[1, 6] * r2
+    m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
+    D[0, 8], D[0, 9] = f * m00 + skew * m01, f * m01 + skew * m11
+    D[1, 8], D[1, 9] = g * m01, g * m11

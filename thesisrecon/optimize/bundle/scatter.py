@@ -1,0 +1,428 @@
+"""Scatter of the intrinsics between blocks of the scene after bundle adjustment, relative to expected noise.
+
+The sandwich covariance (Huber 1967, White 1980) summed by clusters (Liang and Zeger 1986): correlated errors
+and errors of the lens model make the gradients of blocks larger than independent noise does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from thesisrecon._numba import kernel
+from thesisrecon.arrays import B8, F64, I32, I64
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.intrinsics import IntrinsicsPrior
+from thesisrecon.optimize.bundle.covariance import fixed_coordinates, gauge_directions, invert_in_inner_gauge
+from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
+from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
+from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
+
+# Number of pose unknowns tested besides all intrinsics.
+_MAX_POSES = 30
+_MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
+# Errors are correlated over large parts of the scene: their scatter is that of few large blocks.
+_LARGE_BLOCKS = 4
+# Number of unknowns above which matrices are sparse, if fewer than this fraction of the pairs of views share
+# points.
+_MANY, _SPARSE = 1200, 0.2
+
+_Solve = Callable[[F64], F64]
+"""B -> C B for the covariance C, which is dense even if the information is sparse."""
+
+
+@dataclass(frozen=True)
+class BlockScatter:
+    """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
+
+    ``shared_variance`` (C,) would hold if all views shared one camera. ``ratio`` (G, C) is the scatter over
+    its expectation, NaN for fixed intrinsics; ``large_ratio`` is that of the ``large_blocks`` into which the
+    blocks merge. ``overdispersion`` is the scatter between blocks over that between single points: 1 if the
+    noise of different points is independent, for any distribution. ``pull`` (G, C) is the step by which the
+    prior moves the values.
+    """
+
+    variance: F64
+    shared_variance: F64
+    ratio: F64
+    large_ratio: F64
+    pull: F64
+    overdispersion: float
+    blocks: int
+
+    @property
+    def large_blocks(self) -> int:
+        """Number of large blocks."""
+        return min(self.blocks, _LARGE_BLOCKS)
+
+    @property
+    def median_ratio(self) -> float:
+        """Median of the ratios, 1 without any."""
+        known = self.ratio[np.isfinite(self.ratio)]
+        return float(np.median(known)) if len(known) else 1.0
+
+    @property
+    def inflation(self) -> float:
+        """Factor on the noise that the blocks show, at least 1."""
+        return float(np.sqrt(max(self.median_ratio, 1.0)))
+
+
+def point_blocks(X: F64, used: B8) -> I64:
+    """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
+    block = np.where(used, 0, -1)
+    count = 1
+    while 2 * count <= _MAX_BLOCKS and np.count_nonzero(used) >= 2 * count * _MIN_BLOCK_POINTS:
+        for b in range(count):
+            rows = np.flatnonzero(block == b)
+            spread = np.subtract(*np.percentile(X[rows], [90, 10], axis=0))
+            axis = int(np.argmax(spread))
+            order = rows[np.argsort(X[rows, axis], kind="stable")]
+            block[order[len(order) // 2 :]] = count + b
+        count *= 2
+    return np.asarray(block, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points.
+
+    ``E`` (2K, 3N) are orthonormal columns that span the displacements by points, ``centre_columns`` (K, 2, 2)
+    the derivatives by the principal point.
+    """
+
+    residual: F64
+    J: scipy.sparse.csr_matrix
+    taken: scipy.sparse.csr_matrix
+    E: scipy.sparse.csr_matrix
+    point: I64
+    centre_columns: F64
+
+
+def block_scatter(fit: LinearisedFit) -> BlockScatter:
+    """Measure the scatter of the intrinsics' gradients between blocks of points after an adjustment (6.7).
+
+    Let S_b be the information of block b on the cameras (its points eliminated), g_b its gradient and C the
+    covariance with the column c_a of value a. Block b pulls value a by c_a' g_b; without correlation between
+    blocks sum (c_a' g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1.
+    The information uses the weights of Huber's loss instead of its second derivatives, which
+    :func:`_loss_correction` corrects.
+    """
+    system, solve, values, first, start = fit.system, fit.solve, fit.values, fit.first, fit.start
+    S = fit.information
+    poses = np.arange(0, first, max(first // _MAX_POSES, 1))
+    tested = np.concatenate([poses, np.arange(first, S.shape[0])])
+    rows = solve(_unit_columns(S.shape[0], tested)).T
+    block = point_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
+    curvature = _loss_correction(system.residual.reshape(-1, 2), fit.loss_sigmas)
+    ratio, large = (curvature * _block_ratio(system, rows, solve, b) for b in (block, block % _LARGE_BLOCKS))
+    alone = curvature * _point_ratio(system, rows)
+    valid = np.isfinite(ratio) & (alone > 0.0)
+    estimated, number = values.number >= 0, values.number
+    covariance = rows[len(poses) :, first:]
+    variance, pull = np.diag(covariance), covariance @ values.terms.gradient(start)
+    place_of = np.where(estimated, len(poses) + number, 0)
+    return BlockScatter(
+        np.append(variance, 0.0)[np.where(estimated, number, -1)],
+        _shared_variances(S, variance, values, fit.frame, fit.views),
+        np.where(estimated, ratio[place_of], np.nan),
+        np.where(estimated, large[place_of], np.nan),
+        np.append(pull, 0.0)[np.where(estimated, number, -1)],
+        float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
+        int(block.max()) + 1,
+    )
+
+
+@dataclass(frozen=True)
+class PoseUncertainty:
+    """How the poses of the V ``views`` depend on noise, on the intrinsics and on faults of the camera model.
+
+    Rows are the rotation about the axes of the camera (rad) and the centre along those of the world, in the
+    inner gauge: after the similarity that moves the cameras least. ``variance`` (V, 6) is that for known
+    intrinsics, ``response`` (V, 6, n) the derivative by each of the n unknown intrinsics, ``covariance``
+    (n, n) theirs, ``number`` (G, C) theirs in the table, -1 if fixed. ``fault`` (V, 6, 4) is the change by a
+    unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966).
+    """
+
+    views: I64
+    variance: F64
+    response: F64
+    covariance: F64
+    number: I64
+    fault: F64
+
+    def variances(self, noise: float, std: F64, fault: float) -> F64:
+        """Total variances (V, 6) for a factor ``noise`` on standard deviations, and those of other causes.
+
+        ``std`` (n,) are those of the intrinsics, ``fault`` that of each fault of the camera model.
+        """
+        # The correlations stay those of the adjustment.
+        scaled = self.response * (std / np.sqrt(np.diag(self.covariance)))
+        intrinsics = np.einsum("vkm,vkm->vk", scaled @ self.covariance, scaled)
+        return np.asarray(noise**2 * self.variance + intrinsics + fault**2 * np.sum(self.fault**2, axis=2))
+
+
+def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
+    """Propagate noise, intrinsics and faults of the camera model to the poses after an adjustment (6.7)."""
+    n, D, first = len(fit.views), fit.information.shape[0], fit.first
+    R = fit.frame.R[fit.views]
+    # Rows to (rotation, centre): C = -R' t moves by -R' d if t moves by d.
+    turn = np.zeros((n, POSE_DOF, POSE_DOF))
+    turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), -np.swapaxes(R, 1, 2) / fit.scale
+    S = scipy.sparse.csr_matrix(fit.information)
+    poses = S[:first, :first]
+    known = _covariance(
+        poses if scipy.sparse.issparse(fit.information) else poses.toarray(), fit.frame, fit.views
+    )
+    response = -known(S[:first, first:].toarray()).reshape(n, POSE_DOF, -1)
+    variance = np.zeros((n, POSE_DOF))
+    for v in range(n):
+        rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
+        own = known(_unit_columns(first, rows))[rows]
+        variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
+    moved = fit.solve(np.asarray(fit.system.J.T @ _faults(fit)))[:first]
+    return PoseUncertainty(
+        fit.views,
+        np.maximum(variance, 0.0),
+        turn @ response,
+        fit.solve(_unit_columns(D, np.arange(first, D)))[first:],
+        fit.values.number,
+        turn @ moved.reshape(n, POSE_DOF, -1),
+    )
+
+
+def _faults(fit: LinearisedFit) -> F64:
+    """Weighted displacements (2K, 4) of the observations by the faults that the points do not absorb."""
+    o, columns = fit.observations, fit.system.centre_columns
+    rows = fit.frame.intrinsics[fit.frame.group[o.view_index]]
+    x, y = ((o.xy - rows[:, 3:5]) / rows[:, :1]).T
+    square, none = x * x + y * y, np.zeros_like(x)
+    fields = np.array(
+        [[none, y], [y, none], [square + 2.0 * x * x, 2.0 * x * y], [2.0 * x * y, square + 2.0 * y * y]]
+    )
+    # The columns of the principal point weight displacements by px.
+    weighted = np.einsum("krc,fck->krf", columns * rows[:, :1, None], fields).reshape(-1, 4)
+    return np.asarray(weighted - fit.system.E @ (fit.system.E.T @ weighted))
+
+
+@dataclass(frozen=True)
+class LinearisedFit:
+    """A linearised adjustment in a centred frame of size 1; the first ``first`` unknowns are the poses.
+
+    ``X`` are the points before, and ``loss_sigmas`` is the width of Huber's loss.
+    """
+
+    X: F64
+    observations: Observations
+    loss_sigmas: float
+    system: _Linearised
+    information: F64 | scipy.sparse.csc_matrix
+    solve: _Solve
+    values: IntrinsicUnknowns
+    start: F64
+    frame: MetricCameras
+    scale: float
+    views: I64
+    first: int
+
+
+def linearise_fit(
+    cameras: MetricCameras,
+    X: F64,
+    o: Observations,
+    free: B8,
+    prior: IntrinsicsPrior,
+    noise: tuple[float, float],
+) -> LinearisedFit:
+    """Linearise an adjustment at its minimum; ``noise`` is the standard deviation and the loss width."""
+    group = cameras.group
+    observed = np.bincount(o.view_index, minlength=len(group)) > 0
+    used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
+    values, start, _ = number_unknowns(cameras, used, free, prior)
+    views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
+    # Centred and scaled to size 1.
+    origin, scale = scene_frame(X[np.unique(o.point_index)])
+    frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
+    place = np.where(observed, np.cumsum(observed) - 1, -1)
+    system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
+    S = _information(system, values.terms.information(values.size), o, len(views))
+    solve = _covariance(S, frame, views)
+    return LinearisedFit(
+        X, o, noise[1] / noise[0], system, S, solve, values, start, frame, scale, views, first
+    )
+
+
+def _information(
+    system: _Linearised, prior: F64, o: Observations, n_views: int
+) -> F64 | scipy.sparse.csc_matrix:
+    """Return the information (D, D) of the cameras, sparse if most views have no common point."""
+    D, size = system.J.shape[1], len(prior)
+    seen = scipy.sparse.csr_matrix((np.ones(len(o.xy)), (o.view_index, o.point_index)))
+    if D <= _MANY or (seen @ seen.T).nnz > _SPARSE * n_views**2:
+        S = _gram_matrix(system.J) - _gram_matrix(system.taken)
+        S[D - size :, D - size :] += prior
+        return S
+    both = scipy.sparse.block_diag([scipy.sparse.csc_matrix((D - size, D - size)), prior])
+    return scipy.sparse.csc_matrix(system.J.T @ system.J - system.taken.T @ system.taken + both)
+
+
+def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
+    """Return A'A as a dense matrix, since most pairs of views share points here."""
+    G = np.zeros((A.shape[1], A.shape[1]))
+    add_gram(A.indptr, A.indices, A.data, G)
+    return G + np.tril(G, -1).T
+
+
+@kernel
+def add_gram(start: I32, column: I32, value: F64, G: F64) -> None:
+    """Add the lower triangle of A'A; row i of A has the values of start[i] <= k < start[i + 1]."""
+    for i in range(len(start) - 1):
+        for k in range(start[i], start[i + 1]):
+            row, factor = G[column[k]], value[k]
+            for m in range(start[i], start[i + 1]):
+                if column[m] <= column[k]:
+                    row[column[m]] += factor * value[m]
+
+
+def _linearise(
+    cameras: MetricCameras,
+    X: F64,
+    o: Observations,
+    columns: tuple[IntrinsicUnknowns, I64],
+    noise: tuple[float, float],
+) -> _Linearised:
+    (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
+    model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
+    weighting = Weighting(sigma, loss / sigma)
+    weighted, none = Jacobians.empty(len(o.xy), POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
+    linearize_metric(model, o, weighting, np.arange(width), none, weighted)
+    first = POSE_DOF * (int(place.max()) + 1)
+    number = values.number[cameras.group[o.view_index]]
+    poses = POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF)
+    column = np.concatenate([poses, np.where(number >= 0, first + number, 0)], axis=1)
+    centre_columns = weighted.A[:, :, POSE_DOF + 3 : POSE_DOF + 5].copy()
+    weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
+    J = _sparse(weighted.A, column, first + values.size)
+    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
+    E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
+    taken = scipy.sparse.csr_matrix(E.T @ J)
+    residual -= E @ (E.T @ residual)
+    return _Linearised(residual, J, taken, E, np.repeat(o.point_index, 2), centre_columns)
+
+
+def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
+    """Return rows (2K, width) with values (K, 2, n) in the columns (K, n)."""
+    K, _, n = values.shape
+    rows = np.repeat(np.arange(2 * K), n)
+    return scipy.sparse.csr_matrix(
+        (values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width)
+    )
+
+
+def _orthonormal(B: F64, point: I64, n: int) -> F64:
+    """Return B (K, 2, 3) times the inverse root of its points' information: orthonormal columns."""
+    outer = np.einsum("kra,krb->kab", B, B).reshape(-1, 9)
+    V = np.stack([np.bincount(point, c, minlength=n) for c in outer.T], axis=1).reshape(n, 3, 3)
+    w, U = np.linalg.eigh(V)
+    root = np.where(w > 1e-12 * w[:, 2:], 1.0 / np.sqrt(np.maximum(w, 1e-300)), 0.0)
+    return np.asarray(B @ (U * root[:, None])[point])
+
+
+def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views: I64) -> _Solve:
+    """Return the inverse of S without the gauge freedoms."""
+    R, t = cameras.R[views], cameras.t[views]
+    poses = gauge_directions(R, t)
+    N = np.zeros((S.shape[0], poses.shape[1]))
+    N[: len(poses)] = poses
+    if isinstance(S, np.ndarray):
+        C = invert_in_inner_gauge(S, N)
+        return lambda B: C @ B
+    fixed, (first, far, line) = scipy.sparse.lil_matrix(S.shape), fixed_coordinates(R, t)
+    fixed[first, first] = np.eye(POSE_DOF)
+    fixed[far, far] = line
+    weight = float(np.median(S.diagonal()))
+    factor = scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(S + weight * fixed),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    # Baarda's S-transformation from the fixed coordinates to the inner gauge.
+    return lambda B: _without(N, factor.solve(_without(N, B)))
+
+
+def _unit_columns(size: int, index: I64) -> F64:
+    """Return the columns ``index`` of the identity, which would itself be dense."""
+    columns = np.zeros((size, len(index)))
+    columns[index, np.arange(len(index))] = 1.0
+    return columns
+
+
+def _without(N: F64, B: F64) -> F64:
+    """Return the part of B (D, m) orthogonal to the orthonormal N (D, n)."""
+    return np.asarray(B - N @ (N.T @ B))
+
+
+def _shared_variances(
+    S: F64 | scipy.sparse.csc_matrix,
+    variance: F64,
+    values: IntrinsicUnknowns,
+    cameras: MetricCameras,
+    views: I64,
+) -> F64:
+    """Return the variances (C,) of the intrinsics if all cameras were one, from S and those of each value."""
+    first, width = S.shape[0] - values.size, values.number.shape[1]
+    column = values.column[: values.n_table]
+    if values.size == len(np.unique(column)):
+        variances = np.zeros(width)
+        variances[column] = variance
+        return variances
+    used = np.unique(column)
+    place = np.searchsorted(used, column)
+    T = scipy.sparse.csc_matrix(
+        (
+            np.ones(first + values.n_table),
+            (np.arange(first + values.n_table), np.concatenate([np.arange(first), first + place])),
+        ),
+        (S.shape[0], first + len(used)),
+    )
+    together = T.T @ S @ T
+    solve = _covariance(together if scipy.sparse.issparse(S) else np.asarray(together), cameras, views)
+    shared = np.zeros(width)
+    shared[used] = np.diag(solve(_unit_columns(first + len(used), first + np.arange(len(used))))[first:])
+    return shared
+
+
+def _block_ratio(system: _Linearised, rows: F64, solve: _Solve, block: I64) -> F64:
+    """Squared pulls of the blocks on ``rows`` of C over sum C (S_b - S_b C S_b) C, their expectation."""
+    squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
+    of_residual, of_point = block[system.point], np.repeat(block, 3)
+    for b in range(int(block.max()) + 1):
+        here = np.flatnonzero(of_residual == b)
+        J, taken = system.J[here], system.taken[np.flatnonzero(of_point == b)]
+        half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
+        expected += np.sum(half * rows, axis=1) - np.sum(solve(half.T).T * half, axis=1)
+        squares += (rows @ (J.T @ system.residual[here])) ** 2
+    return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
+
+
+def _point_ratio(system: _Linearised, rows: F64) -> F64:
+    """Return the same ratio with every point a block of its own, whose effect on the fit is negligible."""
+    squares = np.zeros(len(rows))
+    for n, c in enumerate(rows):
+        squares[n] = np.sum(np.bincount(system.point, (system.J @ c) * system.residual) ** 2)
+    # Not the variance: priors contribute to it without points.
+    expected = np.sum((system.J @ rows.T) ** 2, axis=0) - np.sum((system.taken @ rows.T) ** 2, axis=0)
+    return np.asarray(squares / np.maximum(expected, 1e-300))
+
+
+def _loss_correction(weighted: F64, delta: float) -> float:
+    """Return (mean weight / mean slope)^2 of Huber's loss from weighted residuals."""
+    squared = np.sum(weighted**2, axis=1)
+    # Outside, |w r|^2 = delta |r|, hence the weight delta / |r| = delta^2 / |w r|^2.
+    outside = squared > delta**2
+    weight = np.where(outside, delta**2 / np.maximum(squared, 1e-300), 1.0)
+    slope = np.where(outside, 0.5 * weight, 1.0)
+    return float(weight.mean() / slope.mean()) ** 2
