@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Image
 from thesisrecon.stereo._planar import PlanarRectification
