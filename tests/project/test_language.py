@@ -7,7 +7,9 @@ ROOT = Path(__file__).parents[2]
 FILES = [p for folder in ("docs", "fixtures") for p in (ROOT / folder).rglob("*.md")]
 FILES += [p for p in (ROOT / "scripts").iterdir() if p.is_file()]
 FILES += [p for folder in ("tests", "benchmarks") for p in (ROOT / folder).rglob("*.py")]
-FILES += [p for folder in ("thesisrecon", "validation") for p in (ROOT / folder).rglob("*.[pt][yo]*")]
+FILES += [
+    p for f in ("thesisrecon", "validation") for p in (ROOT / f).rglob("*") if p.suffix in (".py", ".toml")
+]
 FILES = sorted({p for p in (*FILES, ROOT / "README.md") if p.is_file()} - {Path(__file__)})
 ODD_WORDS = re.compile(
     r"(?<![\w/`-])(told|tells? of|wish(es|ed)?|whoever|anew|mend(s|ed|ing)?|feign(s|ed)?|betrays?"
