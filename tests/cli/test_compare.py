@@ -10,6 +10,7 @@ import pytest
 from tests.io.test_colmap import export, scene
 from thesisrecon import compare_models
 from thesisrecon.cli.main import run_command
+from thesisrecon.errors import STRICT_VARIABLE
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "cameras.json"
 NAMES = ["a <b>.jpg", "böld.jpg", "c.jpg", "d.jpg", "e.jpg"]
@@ -45,6 +46,19 @@ def test_the_table_the_json_and_the_page_say_the_same(models, tmp_path, capsys):
     assert "a &lt;b&gt;.jpg" in page
     assert "<b>.jpg" not in page
     assert len(page) < 2_500_000
+
+
+def test_a_page_that_cannot_be_written_costs_a_warning(models, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv(STRICT_VARIABLE)
+    place = tmp_path / "file" / "out.html"
+    place.parent.touch()
+    options = ["--json", str(tmp_path / "out.json"), "--page", str(place)]
+    assert run_command(["compare", *map(str, models), *options]) == 0
+    said = capsys.readouterr().out
+    assert said.count("warning: ") == said.count(f"warning: output-not-made: {place} (") == 1
+    assert len(json.loads((tmp_path / "out.json").read_text(encoding="utf-8"))["cameras"]) > 0
+    options[1] = str(place)
+    assert run_command(["compare", *map(str, models), *options[:2]]) == 2
 
 
 def test_models_that_cannot_be_aligned_have_no_figure(tmp_path, capsys):

@@ -51,8 +51,8 @@ def compare(
     if page is not None:
         html = made(str(page), lambda: comparison_page(found, str(a), str(b)), warnings, "")
         files |= {page: html} if html else {}
+    write_new(files, overwrite=overwrite, extra=page, warnings=warnings)
     lines += [f"warning: {warning}" for warning in warnings]
-    write_new(files, overwrite=overwrite)
     typer.echo("\n".join(printable(line) for line in lines))
 
 

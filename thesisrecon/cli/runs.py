@@ -198,7 +198,7 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
         if (tiles := out / "tiles" / "tiles.json").is_file():
             lines.append(f"reduced there; all triangles are in the tiles of {tiles}")
     groups = summary.get("groups", ())
-    elsewhere = {name for group in groups for name in group["names"]}
+    elsewhere = {name for group in groups for name in group["names"] if name not in group["missing"]}
     refused = [one for one in summary["refused"] if one["name"] not in elsewhere]
     lines += [f"not registered: {one['name']}: {one['reason']}" for one in refused]
     for group in groups:

@@ -15,10 +15,11 @@ import stat
 import unicodedata
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from thesisrecon.errors import OutputError, UsageError, in_words
+from thesisrecon.errors import OutputError, UsageError, in_words, made
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26
@@ -183,14 +184,20 @@ def json_text(value: Any) -> str:
     return json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n"
 
 
-def write_new(texts: Mapping[Path, str], *, overwrite: bool) -> None:
-    """Write single texts; UsageError, and nothing is written, if an existing file would be replaced."""
+def write_new(texts: Mapping[Path, str], *, overwrite: bool, extra: Path | None, warnings: list[str]) -> None:
+    """Write single texts; UsageError, and nothing is written, if an existing file would be replaced.
+
+    If the file ``extra`` cannot be written, ``warnings`` receives a warning.
+    """
     files = {path: text.encode("utf-8", "replace") for path, text in texts.items()}
     new = {path: file for path, file in files.items() if not has_content(path, [digest_of(file)])}
     if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
         raise not_ours(refused)
     for path, file in new.items():
-        write_atomically(path, file)
+        if path == extra:
+            made(str(path), partial(write_atomically, path, file), warnings, None)
+        else:
+            write_atomically(path, file)
 
 
 def as_read(value: Any) -> Any:
