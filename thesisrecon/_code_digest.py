@@ -7,7 +7,7 @@ import dataclasses
 import dis
 import functools
 import hashlib
-import importlib
+import importlib.util
 import io
 import pickle
 import sys
@@ -50,7 +50,10 @@ def _package_of(value: Any) -> str:
 
 @cache
 def _is_library(package: str) -> bool:
-    file = getattr(sys.modules.get(package), "__file__", None)
+    module = sys.modules.get(package)
+    # A library that is imported on use may not be loaded.
+    found = importlib.util.find_spec(package) if module is None else None
+    file = getattr(module, "__file__", None) or getattr(found, "origin", None)
     if package in sys.builtin_module_names or package == "builtins":
         return True
     place = Path(file).resolve() if file else None

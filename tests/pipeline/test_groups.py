@@ -9,7 +9,7 @@ from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
-from thesisrecon.api import reconstruct
+from thesisrecon.api import reconstruct as api
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure
@@ -50,7 +50,7 @@ def _forget_calls():
 def run(out, impossible=0, **given):
     config = fake_config(verification=GroupVerifier(), projective=ProjectiveOfSize(impossible=impossible))
     config = replace(config, images=ImageOptions(groups=given.pop("groups", True)))
-    return reconstruct.reconstruct(photographs(9), out, config=config, until="metric", **given)
+    return api.reconstruct(photographs(9), out, config=config, until="metric", **given)
 
 
 def files_of(out):
@@ -154,7 +154,7 @@ class ProjectiveOfAFew(ProjectiveOfSize):
 
 def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     config = fake_config(projective=ProjectiveOfAFew())
-    result = reconstruct.reconstruct(photographs(8), tmp_path, config=config, until="metric")
+    result = api.reconstruct(photographs(8), tmp_path, config=config, until="metric")
     assert [group["registered"] for group in result.summary["groups"]] == [3]
     models = "The images form 2 models without a common scale"
     sentence = f"{models}: 3 images in this model, 3 in group-2, 2 in none"
@@ -164,7 +164,7 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     assert "is reconstructed in group-2" in result.refused["03.png"]
     assert result.refused["07.png"] == "sees 5 points"
     off = replace(config, images=ImageOptions(groups=False))
-    result = reconstruct.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
+    result = api.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
     assert "groups" not in result.summary
     assert not (tmp_path / "off" / "group-2").exists()
 
@@ -172,6 +172,6 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
 def test_a_projective_run_leaves_no_images_over(tmp_path):
     """It may end at the core of a large set, whose other images the metric stage registers."""
     config = fake_config(projective=ProjectiveOfAFew())
-    result = reconstruct.reconstruct(photographs(8), tmp_path, config=config, until="projective")
+    result = api.reconstruct(photographs(8), tmp_path, config=config, until="projective")
     assert "groups" not in result.summary
     assert not list(tmp_path.glob("group-*"))

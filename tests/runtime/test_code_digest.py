@@ -135,6 +135,18 @@ class State:
         self.ratio, self.function = ratio, function
 
 
+def test_a_library_counts_by_its_name_before_it_is_imported():
+    program = """import sys
+from thesisrecon._code_digest import code_digest
+def function():
+    import trimesh
+    return trimesh.load
+code_digest(function)
+print("trimesh" in sys.modules)"""
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert found.stdout == "False\n"
+
+
 def test_an_object_counts_with_its_state_and_one_that_cannot_be_pickled_never_twice():
     values = (
         State(0.8),
