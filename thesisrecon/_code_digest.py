@@ -96,7 +96,9 @@ class _Walk:
         if type(value) in _PLAIN:
             self.found.append(repr(value))
             return
-        if hasattr(value, "targetoptions") and hasattr(value, "py_func"):  # a kernel
+        if hasattr(value, "targetoptions") and isinstance(
+            getattr(value, "py_func", None), FunctionType
+        ):  # a kernel
             self.follow(sorted(value.targetoptions.items()))
             value = value.py_func
         if isinstance(value, (staticmethod, classmethod, MethodType)):

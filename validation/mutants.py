@@ -31,7 +31,7 @@ from thesisrecon.runtime._signals import install_signal_handlers
 from validation.runs.processes import own_cores, run_process
 from validation.scenes.real import ROOT
 
-PACKAGES = ("geometry", "epipolar", "selfcalibration", "numerics")
+PACKAGES = ("geometry", "epipolar", "selfcalibration", "optimize")
 MIN_SCORE = 0.85
 COPIED = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
 LIMIT_S = 420.0

@@ -38,7 +38,7 @@ _EQUATIONS = {"3": 42, "4": 1, "5": 6}
 
 
 # Folders and files that hold no theory, in the package and in the tests.
-_OTHER = ("cli", "config.py", "hostile", "io", "pipeline", "report", "runtime", "validation")
+_OTHER = ("cli", "config", "bad_input", "io", "pipeline", "report", "runtime", "validation")
 
 
 @dataclass(frozen=True)

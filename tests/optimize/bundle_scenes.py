@@ -1,4 +1,4 @@
-"""A small synthetic block of images for the tests of numerics."""
+"""A small synthetic block of images for the tests of bundle adjustment."""
 
 from dataclasses import dataclass
 

@@ -222,4 +222,6 @@ def test_a_first_fundamental_matrix_compiles_few_kernels(tmp_path):
     assert run_in(tmp_path, textwrap.dedent(code)) == ["True"]
     compiled = [entry.name.partition("-")[0] for entry in (tmp_path / "cache" / "thesisrecon").iterdir()]
     # Each takes a quarter of a second of a user's first call.
-    assert len(set(compiled)) == len(compiled) <= 26, sorted(compiled)
+    own = [name for name in compiled if not name.startswith("_numba.")]
+    assert len(set(own)) == len(own) <= 26, sorted(compiled)
+    assert len(compiled) <= len(own) + 6  # arrays of other types and shapes

@@ -138,7 +138,7 @@ def export(
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
     >>> from thesisrecon import export
-    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> from thesisrecon.results import SparseModel, SparseView
     >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> view = SparseView("a.jpg", np.eye(3), np.zeros(3), K, (640, 480), np.array([-0.1, 0, 0]))
     >>> with TemporaryDirectory() as folder:

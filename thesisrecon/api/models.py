@@ -142,7 +142,7 @@ def align_to_positions(
     --------
     >>> import numpy as np
     >>> from thesisrecon import align_to_positions
-    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> from thesisrecon.results import SparseModel, SparseView
     >>> centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> model = SparseModel([SparseView(name, np.eye(3), -c) for name, c in zip("abcd", centres)])
     >>> aligned, report = align_to_positions(model, dict(zip("abcd", 2.5 * centres + 10)))
@@ -269,7 +269,7 @@ def scaled(
     --------
     >>> import numpy as np
     >>> from thesisrecon import scaled
-    >>> from thesisrecon.sparse_model import SparseModel, SparseView
+    >>> from thesisrecon.results import SparseModel, SparseView
     >>> views = [SparseView(name, np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 0.5))]
     >>> scaled(SparseModel(views), "a", "b", 3.0).views[1].centre.tolist()
     [-3.0, 0.0, 0.0]

@@ -270,11 +270,13 @@ def widen_by_camera_model(
     factor = 1.0 if any(difference) else np.sqrt(misfit)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own in intervals:
+        focal = own["focal_px"].value
+        # The larger part names the interval.
         wider = {
             name: IntrinsicInterval(
                 own[name].value,
-                float(np.hypot(factor * own[name].std, off * own["focal_px"].value)),
-                CAMERA_MODEL,
+                float(np.hypot(factor * own[name].std, off * focal)),
+                CAMERA_MODEL if factor > 1.0 or off * focal > own[name].std else own[name].source,
             )
             for name, off in moved.items()
             if name in own and own[name].std > 0.0 and (off > 0.0 or factor > 1.0)
