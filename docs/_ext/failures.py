@@ -18,8 +18,8 @@ TABLES = tomllib.loads((PACKAGE / "messages.toml").read_text(encoding="utf-8"))
 """Heading -> code -> text and remedy."""
 EXPLAINED = "Failures of several stages"
 FOLDERS = (
-    "api", "pipeline", "io", "matching", "epipolar", "geometry", "optimize", "projective", "selfcalibration", "metric",
-    "stereo", "surface", "views", "",
+    "api", "pipeline", "io", "matching", "epipolar", "geometry", "optimize", "projective", "selfcalibration",
+    "metric", "stereo", "surface", "views", "",
 )  # fmt: skip
 
 
