@@ -270,7 +270,7 @@ def widen_by_camera_model(
     factor = 1.0 if any(difference) else np.sqrt(misfit)
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own in intervals:
-        focal = own["focal_px"].value
+        focal = own["focal_px"].value if own else 0.0
         # The larger part names the interval.
         wider = {
             name: IntrinsicInterval(
