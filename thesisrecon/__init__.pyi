@@ -1,72 +1,73 @@
 """Public names and the modules that define them; the reference pages follow this order."""
+# ruff: noqa: I001
 
 # Whole runs
-from thesisrecon.api.calibrate import absolute_dual_quadric as absolute_dual_quadric
-from thesisrecon.api.calibrate import kruppa as kruppa
-from thesisrecon.api.calibrate import plane_at_infinity as plane_at_infinity
-
-# Strata and self-calibration
-from thesisrecon.api.calibrate import self_calibrate as self_calibrate
-from thesisrecon.api.calibrate import upgrade_affine as upgrade_affine
-from thesisrecon.api.cameras import BundleAdjustment as BundleAdjustment
-from thesisrecon.api.cameras import bundle_adjust as bundle_adjust
-from thesisrecon.api.cameras import cheirality as cheirality
-from thesisrecon.api.cameras import reconstruction_from_cameras as reconstruction_from_cameras
-from thesisrecon.api.cameras import resect as resect
-from thesisrecon.api.cameras import triangulate as triangulate
-from thesisrecon.api.compare import compare_models as compare_models
-from thesisrecon.api.export import export as export
-from thesisrecon.api.export import write_mesh as write_mesh
-from thesisrecon.api.from_matches import reconstruct_from_colmap as reconstruct_from_colmap
+from thesisrecon.api.reconstruct import reconstruct as reconstruct
 from thesisrecon.api.from_matches import reconstruct_from_matches as reconstruct_from_matches
 from thesisrecon.api.from_matches import reconstruct_from_tracks as reconstruct_from_tracks
-from thesisrecon.api.models import align_to_positions as align_to_positions
+from thesisrecon.api.from_matches import reconstruct_from_colmap as reconstruct_from_colmap
 from thesisrecon.api.models import load as load
-
-# Models and files
-from thesisrecon.api.models import read_cameras as read_cameras
 from thesisrecon.api.models import save as save
-from thesisrecon.api.models import scaled as scaled
-from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
-from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
-from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
-from thesisrecon.api.pairs import estimate_homography as estimate_homography
-from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
+from thesisrecon.config import PipelineConfig as PipelineConfig
+from thesisrecon.results import RunResult as RunResult
 
 # Two and three images
 from thesisrecon.api.pairs import match_pair as match_pair
-from thesisrecon.api.reconstruct import reconstruct as reconstruct
-from thesisrecon.api.stereo import match_rectified as match_rectified
-
-# Stereo and surfaces
-from thesisrecon.api.stereo import rectify as rectify
-from thesisrecon.api.surface import depth_maps as depth_maps
-from thesisrecon.api.surface import fuse_depth_maps as fuse_depth_maps
-from thesisrecon.api.surface import texture as texture
-from thesisrecon.api.views import interpolate_view as interpolate_view
-
-# New views
-from thesisrecon.api.views import render as render
-from thesisrecon.api.views import synthesize_view as synthesize_view
+from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
+from thesisrecon.api.pairs import estimate_homography as estimate_homography
+from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
+from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
+from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
+from thesisrecon.epipolar.estimation import FundamentalEstimate as FundamentalEstimate
+from thesisrecon.records import FundamentalFit as FundamentalFit
+from thesisrecon.records import TwoView as TwoView
 
 # Points and cameras
 from thesisrecon.camera import Camera as Camera
-from thesisrecon.config import PipelineConfig as PipelineConfig
-from thesisrecon.epipolar.estimation import FundamentalEstimate as FundamentalEstimate
+from thesisrecon.api.cameras import triangulate as triangulate
+from thesisrecon.api.cameras import resect as resect
+from thesisrecon.api.cameras import cheirality as cheirality
+from thesisrecon.api.cameras import bundle_adjust as bundle_adjust
+from thesisrecon.api.cameras import BundleAdjustment as BundleAdjustment
+from thesisrecon.records import Reconstruction as Reconstruction
+from thesisrecon.api.cameras import reconstruction_from_cameras as reconstruction_from_cameras
+from thesisrecon.records import Tracks as Tracks
+from thesisrecon.records import Image as Image
+
+# Strata and self-calibration
+from thesisrecon.api.calibrate import self_calibrate as self_calibrate
+from thesisrecon.records import SelfCalibration as SelfCalibration
+from thesisrecon.api.calibrate import plane_at_infinity as plane_at_infinity
+from thesisrecon.api.calibrate import upgrade_affine as upgrade_affine
+from thesisrecon.api.calibrate import absolute_dual_quadric as absolute_dual_quadric
+from thesisrecon.api.calibrate import kruppa as kruppa
+
+# Stereo and surfaces
+from thesisrecon.api.stereo import rectify as rectify
+from thesisrecon.api.stereo import match_rectified as match_rectified
+from thesisrecon.records import DisparityMap as DisparityMap
+from thesisrecon.api.surface import depth_maps as depth_maps
+from thesisrecon.records import DepthMap as DepthMap
+from thesisrecon.api.surface import fuse_depth_maps as fuse_depth_maps
+from thesisrecon.api.surface import texture as texture
+from thesisrecon.records import TexturedMesh as TexturedMesh
+
+# New views
+from thesisrecon.api.views import render as render
+from thesisrecon.api.views import interpolate_view as interpolate_view
+from thesisrecon.api.views import synthesize_view as synthesize_view
+
+# Models and files
+from thesisrecon.api.models import read_cameras as read_cameras
+from thesisrecon.api.export import export as export
+from thesisrecon.api.export import write_mesh as write_mesh
+from thesisrecon.api.models import align_to_positions as align_to_positions
+from thesisrecon.api.models import scaled as scaled
+from thesisrecon.api.compare import compare_models as compare_models
+from thesisrecon.results import ModelComparison as ModelComparison
 
 # Errors
 from thesisrecon.errors import StageFailure as StageFailure
 from thesisrecon.errors import UsageError as UsageError
-from thesisrecon.records import DepthMap as DepthMap
-from thesisrecon.records import DisparityMap as DisparityMap
-from thesisrecon.records import FundamentalFit as FundamentalFit
-from thesisrecon.records import Image as Image
-from thesisrecon.records import Reconstruction as Reconstruction
-from thesisrecon.records import SelfCalibration as SelfCalibration
-from thesisrecon.records import TexturedMesh as TexturedMesh
-from thesisrecon.records import Tracks as Tracks
-from thesisrecon.records import TwoView as TwoView
-from thesisrecon.results import ModelComparison as ModelComparison
-from thesisrecon.results import RunResult as RunResult
 
 __version__: str

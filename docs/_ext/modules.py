@@ -119,7 +119,9 @@ def resolve(app, env, node, contnode):
 def setup(app):
     """Write the pages before the sources are read, and connect what reads docstrings."""
     app.connect("builder-inited", lambda app: write_pages(Path(app.srcdir) / "reference" / "modules"))
-    app.connect("builder-inited", lambda app: write_public_names(Path(app.srcdir) / "reference" / "api.md"))
+    # Before the sources are listed, which autosummary makes pages for.
+    names = Path(app.srcdir) / "reference" / "api.md"
+    app.connect("config-inited", lambda *_: write_public_names(names))
     app.connect("autodoc-skip-member", skip_aliases)
     app.connect("autodoc-process-docstring", add_example, priority=300)
     app.connect("autodoc-process-docstring", escape_bars, priority=400)
