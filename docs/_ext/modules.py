@@ -28,7 +28,8 @@ def public_modules() -> list[Path]:
     found = []
     for path in sorted(PACKAGE.rglob("*.py"), key=lambda p: (len(p.relative_to(PACKAGE).parts), p)):
         parts = path.relative_to(PACKAGE).parts
-        if not path.name.startswith("_") and parts[0] not in LEFT_OUT:
+        public = not path.name.startswith("_") or parts == ("config", "__init__.py")
+        if public and parts[0] not in LEFT_OUT:
             found.append(path)
     return found
 
@@ -39,7 +40,7 @@ def write_pages(folder: Path) -> None:
     groups: dict[str, list[str]] = {}
     for path in public_modules():
         relative = path.relative_to(PACKAGE).with_suffix("")
-        name = "thesisrecon." + ".".join(relative.parts)
+        name = ("thesisrecon." + ".".join(relative.parts)).removesuffix(".__init__")
         title = name.removeprefix("thesisrecon.")
         text = f"{title}\n{'=' * len(title)}\n\n.. automodule:: {name}\n   :members:\n"
         write(folder / f"{name}.rst", text)

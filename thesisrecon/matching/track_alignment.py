@@ -271,7 +271,7 @@ def align_corners(
     Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
     affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there (wide
     convergence) and then at the finest scale (smaller noise), which is used if it fits. Arguments and results
-    are those of :func:`_align_windows`.
+    are those of `_align_windows`.
     """
     xy1, scale1, _, _ = matches
     base = view1.pyramid[2]

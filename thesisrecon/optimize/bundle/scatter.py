@@ -108,7 +108,7 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     covariance with the column c_a of value a. Block b pulls value a by c_a' g_b; without correlation between
     blocks sum (c_a' g_b)^2 has the expectation sum c_a' (S_b - S_b C S_b) c_a, and the ratio of the two is 1.
     The information uses the weights of Huber's loss instead of its second derivatives, which
-    :func:`_loss_correction` corrects.
+    `_loss_correction` corrects.
     """
     system, solve, values, first, start = fit.system, fit.solve, fit.values, fit.first, fit.start
     S = fit.information
