@@ -184,7 +184,13 @@ def json_text(value: Any) -> str:
     return json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n"
 
 
-def write_new(texts: Mapping[Path, str], *, overwrite: bool, extra: Path | None, warnings: list[str]) -> None:
+def write_new(
+    texts: Mapping[Path, str],
+    *,
+    overwrite: bool,
+    extra: Path | None = None,
+    warnings: list[str] | None = None,
+) -> None:
     """Write single texts; UsageError, and nothing is written, if an existing file would be replaced.
 
     If the file ``extra`` cannot be written, ``warnings`` receives a warning.
@@ -194,7 +200,7 @@ def write_new(texts: Mapping[Path, str], *, overwrite: bool, extra: Path | None,
     if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
         raise not_ours(refused)
     for path, file in new.items():
-        if path == extra:
+        if path == extra and warnings is not None:
             made(str(path), partial(write_atomically, path, file), warnings, None)
         else:
             write_atomically(path, file)
