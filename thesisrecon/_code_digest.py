@@ -96,9 +96,8 @@ class _Walk:
         if type(value) in _PLAIN:
             self.found.append(repr(value))
             return
-        if hasattr(value, "targetoptions") and isinstance(
-            getattr(value, "py_func", None), FunctionType
-        ):  # a kernel
+        # A kernel; other objects may answer to any name.
+        if hasattr(value, "targetoptions") and isinstance(getattr(value, "py_func", None), FunctionType):
             self.follow(sorted(value.targetoptions.items()))
             value = value.py_func
         if isinstance(value, (staticmethod, classmethod, MethodType)):

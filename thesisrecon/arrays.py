@@ -1,4 +1,4 @@
-"""Names of NumPy array types, defined here only, and rows of arrays by the number of their image."""
+"""Names of NumPy array types, checks of shapes and values, and rows of arrays by image number."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera record: calibration, pose, image size and radial distortion."""
+"""The camera: calibration, pose, image size and radial distortion; projection with and without the record."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The result of a run: cameras, points and observations in pixels of the original images, and all stages."""
+"""Results in pixels of the original images: of a run, models of any program, comparisons of models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bundle adjustment in one call: cameras and points with their covariances."""
+"""Cameras and points: resection, triangulation, cheirality and bundle adjustment with covariances."""
 
 from __future__ import annotations
 

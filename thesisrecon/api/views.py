@@ -1,4 +1,4 @@
-"""Views between two images: rectified, matched and interpolated (thesis, section 1.2)."""
+"""New views: interpolated between two images (1.2), by the trilinear tensor (1.3), rendered from a model."""
 
 from __future__ import annotations
 

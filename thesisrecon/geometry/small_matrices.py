@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices: kernels that compile in a fraction of the time of LAPACK's wrappers."""
+"""Small matrices and loss functions: kernels that compile in a fraction of the time of LAPACK's wrappers."""
 
 from __future__ import annotations
 

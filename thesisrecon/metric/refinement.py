@@ -126,10 +126,10 @@ class MetricRefinement:
         )
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
-        return assess(settled, reconstruction.tracks, calibration, reasons)
+        return _assess(settled, reconstruction.tracks, calibration, reasons)
 
 
-def assess(
+def _assess(
     settled: _Settled, tracks: Tracks, calibration: SelfCalibration, reasons: tuple[str, ...]
 ) -> MetricResult:
     """State the intervals of a final model with all ``tracks``, and check it."""

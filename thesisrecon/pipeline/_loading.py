@@ -12,7 +12,6 @@ import numpy as np
 from thesisrecon.arrays import I64
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import image_without_pixels
-from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.pipeline._matching_stages import final_pairs
 from thesisrecon.pipeline._outputs import with_image_names
 from thesisrecon.pipeline._stages import best_result
@@ -32,13 +31,13 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
     sizes = projective[0].sizes if projective else [_working_size(view) for view in views]
     names = [view["name"] for view in views]
     unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
-    features, share = tuple(stages["features"].values()), SeedsAndGrowth.many_share
+    features = tuple(stages["features"].values())
     result = RunResult(
         out=folder,
         images=tuple(_image(view, size) for view, size in zip(views, sizes, strict=True)),
         unread=unread,
         features=features,
-        pairs=final_pairs(stages["matches"], features, share),
+        pairs=final_pairs(stages["matches"], features),
         groups=np.array([view["camera"] for view in views], dtype=np.int64),
         settings=run["settings"],
         pair_choice=stages["pairs"].get("choice"),

@@ -177,18 +177,13 @@ def finish_matches(
     run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
 
 
-def final_pairs(
-    records: Mapping[str, Any], features: Sequence[Features], share: float
-) -> tuple[TwoView, ...]:
-    """The pairs that :func:`finish_matches` reported, from the records of the stage.
-
-    ``share`` is the share of the corners that pairs of many images are matched by first.
-    """
+def final_pairs(records: Mapping[str, Any], features: Sequence[Features]) -> tuple[TwoView, ...]:
+    """The pairs that :func:`finish_matches` reported, from the records of the stage."""
     if FINAL not in records:
         return tuple(records.values())
     final = records[FINAL]
     fewer = [item for item in final["items"] if item.endswith(FEWER)]
-    whole = _of_all_corners([records[item] for item in fewer], features, share)
+    whole = _of_all_corners([records[item] for item in fewer], features, SeedsAndGrowth.many_share)
     pairs = {item: records[item] for item in final["items"]} | dict(zip(fewer, whole, strict=True))
     for item, reason in final["rejected"].items():
         pairs[item] = replace(pairs[item], accepted=False, reason=reason)
