@@ -117,42 +117,13 @@ class Configuration(Enum):
 
 
 def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> Configuration:
-    """Determine which model explains the inliers of F.
+    """Determine which model explains at least 12 inliers of F.
+
+    GENERAL if relief and baseline exceed the noise.
 
     The matches with their outliers show how many agree by chance. Both images are assumed to share their
     intrinsics (otherwise a rotation is classified as a plane and a translation as general) and to have square
     pixels.
-
-    Parameters
-    ----------
-    F : array_like (3, 3)
-        Fundamental matrix, px.
-    xy1, xy2 : array_like (N, 2)
-        Matched points, px.
-    inliers : ndarray (N,) of bool, optional
-        At least 12 inliers of F; all matches by default.
-
-    Returns
-    -------
-    Configuration
-        GENERAL if relief and baseline exceed the noise.
-
-    Raises
-    ------
-    ValueError
-        If F has rank below 2, flags have the wrong shape, or matches are not finite (N, 2) arrays.
-    StageFailure
-        If there are too few or collinear inliers.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon import estimate_fundamental
-    >>> rng = np.random.default_rng(0)
-    >>> xy1 = rng.uniform(0, 500, (60, 2))
-    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1)) + rng.normal(0, 0.3, (60, 2))
-    >>> classify_configuration(estimate_fundamental(xy1, xy2).F, xy1, xy2).value
-    'pure translation'
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers

@@ -18,44 +18,11 @@ DIAGONAL = np.sqrt(0.5)
 
 
 def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_two: bool = True) -> F64:
-    """Estimate F from at least eight matches by the eight-point algorithm (5.2).
+    """F of unit norm from at least eight matches (N, 2) by the eight-point algorithm (5.2).
 
-    Minimises the algebraic residuals x2' F x1 over unit vectors.
-
-    Parameters
-    ----------
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 8, px.
-    normalized : bool
-        Normalise the coordinates first [1]_. The thesis uses raw pixels, which weight the entries of F
-        unequally.
-    rank_two : bool
-        Replace F by the nearest singular matrix in the frame of the solution. The thesis does not.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        F with x2' F x1 = 0, unit norm.
-
-    Raises
-    ------
-    ValueError
-        If the matches are not finite (N, 2) arrays.
-    StageFailure
-        If the matches do not determine F (fewer than 8, all collinear, or coplanar without noise).
-
-    References
-    ----------
-    .. [1] R. Hartley, "In defense of the eight-point algorithm", PAMI 19, 1997.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9]], dtype=float)
-    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / np.array([1, 2, 4, 2, 1, 4, 1, 2])[:, None]
-    >>> F = estimate_eight_point(xy1, xy2)
-    >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
-    0.5
+    Minimises the algebraic residuals x2' F x1 over unit vectors. ``normalized``: with Hartley's normalisation
+    (PAMI 19, 1997); the thesis uses raw pixels, which weight the entries of F unequally. ``rank_two``: the
+    nearest singular matrix in the frame of the solution; the thesis does not enforce it.
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=8)
     T1 = normalizing_transform(xy1) if normalized else np.eye(3)

@@ -36,48 +36,13 @@ MAPS_TRIED = 4
 def refine_fundamental(
     F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson", *, parameters: Parameters = "orthonormal"
 ) -> F64:
-    """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt.
+    """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt, from a start F.
 
-    F = U diag(cos phi, sin phi, 0) V' [1]_ has rank 2 without the thesis' exception of an epipole at
-    infinity. The reprojection error gives the maximum likelihood for Gaussian noise (HZ, algorithm 11.3); the
-    Sampson distance is optimal to first order in the noise.
-
-    Parameters
-    ----------
-    F : array_like (3, 3)
-        Start, rank 2 or 3, px.
-    xy1, xy2 : array_like (N, 2)
-        Matched points, N >= 7, px.
-    criterion : {"sampson", "epipolar-distance", "reprojection"}
-        (5.4), (5.6) or the reprojection error.
-    parameters : {"orthonormal", "row", "row-and-column"}
-        "orthonormal": as above. "row", "row-and-column": one row (and one column) of F is a combination of
-        the others, as in the thesis; its 18 (36) maps reach the same minimum more slowly.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        Refined F, rank 2, unit norm.
-
-    Raises
-    ------
-    ValueError
-        If F is not finite and of rank 2 or 3, the matches are not finite (N, 2) arrays, or a word is unknown.
-    StageFailure
-        If there are too few matches or the points of an image are collinear.
-
-    References
-    ----------
-    .. [1] A. Bartoli and P. Sturm, "Nonlinear estimation of the fundamental matrix", PAMI 26, 2004.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> xy1 = np.array([[0, 0], [9, 1], [2, 8], [7, 7], [4, 3], [1, 5], [8, 4], [5, 9]], dtype=float)
-    >>> xy2 = xy1 + np.array([[4.0, 2.0]]) / np.array([1, 2, 4, 2, 1, 4, 1, 2])[:, None]
-    >>> F = refine_fundamental(np.array([[0.0, 0.0, 0.4], [0.0, 0.0, -0.9], [-0.4, 0.9, 0.0]]), xy1, xy2)
-    >>> float(np.round(np.abs(F[0, 2] / F[1, 2]), 6))
-    0.5
+    F = U diag(cos phi, sin phi, 0) V' (Bartoli and Sturm, PAMI 26, 2004) has rank 2 without the thesis'
+    exception of an epipole at infinity. The reprojection error gives the maximum likelihood for Gaussian
+    noise (HZ, algorithm 11.3); the Sampson distance is optimal to first order in the noise. With the
+    ``parameters`` "row" and "row-and-column" one row (and one column) of F is a combination of the others, as
+    in the thesis; its 18 (36) maps reach the same minimum more slowly.
     """
     if criterion not in _CRITERIA:
         raise ValueError(unknown_word("criterion", criterion, _CRITERIA))

@@ -112,26 +112,10 @@ def _assess_pair(
 def homography_inlier_ratio(
     F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, rng: np.random.Generator
 ) -> float:
-    """Compute the largest fraction of matches that one homography explains.
+    """The largest fraction of the matches (N, 2) of F that one homography maps to within ``tolerance_px``.
 
     The best of 200 planes through three matches is fitted again to its inliers until they stay the same. A
-    ratio near 1 indicates a planar scene or a pure rotation.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, px.
-    xy1, xy2 : ndarray (N, 2)
-        Inliers of F, px.
-    tolerance_px : float
-        Maximum transfer error in image 2.
-    rng : numpy.random.Generator
-        Source of the samples.
-
-    Returns
-    -------
-    float
-        Inlier ratio; 1 for fewer than 5 matches, which always have a homography.
+    ratio near 1 indicates a planar scene or a pure rotation; fewer than 5 matches always have a homography.
     """
     n = len(xy1)
     if n < 5:

@@ -13,33 +13,14 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 
 
 def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
-    """Return P = K [R, -R C] (3.21), the thesis' K [R' | -R' C].
-
-    Parameters
-    ----------
-    K, R, centre : ndarray (..., 3, 3), (..., 3, 3) and (..., 3)
-        Calibration matrix, rotation world-to-camera and camera centre C.
-
-    Returns
-    -------
-    ndarray (..., 3, 4)
-    """
+    """P = K [R, -R C] (3.21), the thesis' K [R' | -R' C], of a camera with the centre C (..., 3)."""
     return compose_camera(K, R, -np.einsum("...ij,...j->...i", R, centre))
 
 
 def calibration_matrix(f_u: float, f_v: float, u_0: float, v_0: float, *, skew: float = 0.0) -> F64:
-    """Return K (3.16, 3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]].
+    """K (3.16, 3.17): [[f_u, skew, u_0], [0, f_v, v_0], [0, 0, 1]].
 
-    Parameters
-    ----------
-    f_u, f_v, u_0, v_0 : float
-        Focal lengths, positive (otherwise a ``ValueError``), and principal point, px.
-    skew : float
-        f_v tan(alpha), px, for pixel sides that deviate from a right angle by alpha (table 3.1).
-
-    Returns
-    -------
-    ndarray (3, 3)
+    The skew is f_v tan(alpha) for pixel sides that deviate from a right angle by alpha (table 3.1).
     """
     if not (f_u > 0.0 and f_v > 0.0):
         raise ValueError(f"calibration_matrix needs positive focals; got {f_u} and {f_v}")
@@ -50,112 +31,44 @@ def normalize_camera(P: F64) -> F64:
     """Scale P such that det M = 1 (definition 3.5.1): P / det(M)^(1/3), which also corrects the sign.
 
     Points in front then have t > 0 in P X (proposition 3.5.1).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4)
-        Finite cameras [M m]; a singular M is a ``ValueError``.
-
-    Returns
-    -------
-    ndarray (..., 3, 4)
     """
     det = _left_determinant(P, "normalize_camera")
     return np.asarray(P / np.cbrt(det)[..., None, None])
 
 
 def principal_ray(P: F64) -> F64:
-    """Return the direction of the optical axis towards the front: det(M) m_3, normalised (3.23).
+    """Direction of the optical axis towards the front: det(M) m_3, normalised (3.23), in a metric frame.
 
     The last row (m_3, p_34) of P is the principal plane (3.22); the principal point is M m_3 (HZ 6.2).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4)
-        Cameras of a metric frame, of any sign.
-
-    Returns
-    -------
-    ndarray (..., 3)
     """
     axis = np.linalg.det(P[..., :3])[..., None] * P[..., 2, :3]
     return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
 
 
 def camera_centre(P: F64) -> F64:
-    """Return the centre C with P C = 0, by minors (3.24 - 3.26).
-
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4)
-        Cameras.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Homogeneous, with the sign of the minors.
-    """
+    """The centre C with P C = 0, homogeneous with the signs of the minors (3.24 - 3.26)."""
     minors = [np.linalg.det(np.delete(P, k, axis=-1)) for k in range(4)]
     return np.stack([-minors[0], minors[1], -minors[2], minors[3]], axis=-1)
 
 
 def project(P: F64, X: F64) -> F64:
-    """Project space points to pixels.
-
-    Parameters
-    ----------
-    P, X : ndarray (3, 4), and (N, 3) or (N, 4)
-        Camera, and Euclidean or homogeneous points.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        Inf or NaN for points of the principal plane.
-
-    Examples
-    --------
-    >>> project(np.eye(3, 4), np.array([[1.0, 2.0, 4.0]])).tolist()
-    [[0.25, 0.5]]
-    """
+    """Pixels (N, 2) of points (N, 3) or (N, 4); inf or NaN in the principal plane."""
     Xh = homogenize(X) if X.shape[-1] == 3 else X
     return dehomogenize(Xh @ P.T)
 
 
 def depth(P: F64, X: F64) -> F64:
-    """Return the signed distance of points from the principal plane (HZ 6.2.3).
-
-    Parameters
-    ----------
-    P, X : ndarray (3, 4) and (N, 4)
-        Camera of any scale and sign, homogeneous points.
-
-    Returns
-    -------
-    ndarray (N,)
-    """
+    """Signed distances of points (N, 4) from the principal plane of a camera of any scale (HZ 6.2.3)."""
     M = P[:, :3]
     return np.asarray(np.sign(np.linalg.det(M)) * (X @ P[2]) / (X[:, 3] * np.linalg.norm(M[2])))
 
 
 def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float]:
-    """Choose signs of cameras and points that make the projective depths w of P X = w (u, v, 1) positive.
+    """Signs of cameras and points that make the projective depths w of P X = w (u, v, 1) positive.
 
     Starts from the view with most observations; then the sign of each point and of each camera is that of the
-    majority of its observations, so that a few wrong matches do not spread.
-
-    Parameters
-    ----------
-    P, X, view, point : ndarray (V, 3, 4), (N, 4), (K,) and (K,), int
-        Cameras, homogeneous points, and view and point of each observation.
-
-    Returns
-    -------
-    views, points, ratio : ndarray (V,) and (N,), float
-        Signs +-1 of cameras and points, and the fraction of the observations with positive depth.
-
-    References
-    ----------
-    Hartley, "Chirality", IJCV 26(1), 1998, theorem 17.
+    majority of its observations, so that a few wrong matches do not spread. Also returns the fraction of the
+    observations with positive depth (Hartley, "Chirality", IJCV 26(1), 1998, theorem 17).
     """
     w = np.sign(np.einsum("kj,kj->k", P[view, 2], X[point]))
     views, points = np.zeros(len(P)), np.zeros(len(X))

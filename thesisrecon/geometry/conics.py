@@ -24,35 +24,14 @@ ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 
 
 def bilinear_form(C: F64, x: F64, y: F64) -> F64:
-    """Return S(x, y) = x'C y (3.5); S(x, x) is 0 on the conic (3.1, 3.2) or quadric (3.8).
-
-    Parameters
-    ----------
-    C : ndarray (..., d, d)
-        Conics or quadrics, or their duals.
-    x, y : ndarray (..., d)
-        Homogeneous points, or lines or planes for duals (3.3, 3.9).
-
-    Returns
-    -------
-    ndarray (...)
-    """
+    """S(x, y) = x'C y (3.5); S(x, x) is 0 on the conic (3.1, 3.2) or quadric (3.8), and for tangents."""
     return np.asarray(np.einsum("...i,...ij,...j->...", x, C, y))
 
 
 def dual(C: F64) -> F64:
-    """Return the dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines C x or tangent planes (3.7).
+    """The dual C* ~ C^-1 (3.4) or Q* ~ Q^-1 (3.10): tangent lines C x or tangent planes (3.7).
 
     It is the adjugate, by singular values: the dual of two lines (rank 2) is their common point, twice.
-
-    Parameters
-    ----------
-    C : ndarray (3, 3) or (4, 4)
-        Conic or quadric.
-
-    Returns
-    -------
-    ndarray (3, 3) or (4, 4)
     """
     require_finite("dual", C)
     U, s, Vt = np.linalg.svd(C)
@@ -71,22 +50,10 @@ def _length_scale(C: F64) -> float:
 
 
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
-    """Intersect a conic or quadric with the line of two points (3.5).
+    """Real intersections (0 to 2, d) of a conic or quadric with the line of two points (3.5).
 
-    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y. The discriminant S(x, y)^2 -
-    S(x) S(y) is 0 for tangents (3.6, where the thesis' text lost the square).
-
-    Parameters
-    ----------
-    C : ndarray (d, d)
-        Conic or quadric.
-    x, y : ndarray (d,)
-        Homogeneous points.
-
-    Returns
-    -------
-    ndarray (0, d), (1, d) or (2, d)
-        Real points; one for a tangent, none for a line that lies on the quadric.
+    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y. The discriminant S(x, y)^2 - S(x)
+    S(y) is 0 for tangents (3.6, where the thesis' text lost the square). None for a line of the quadric.
     """
     require_finite("intersect_line", C)
     units = np.append(np.full(len(C) - 1, _length_scale(C)), 1.0)
@@ -106,20 +73,11 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
 
 
 def curvature_sign(Q: F64) -> int:
-    """Return the sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
+    """The sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
 
-    K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1) has the sign of det Q.
-
-    Parameters
-    ----------
-    Q : ndarray (4, 4)
-        Quadric.
-
-    Returns
-    -------
-    int
-        1 for ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones,
-        cylinders and planes.
+    K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1) has the sign of det Q: 1 for
+    ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones, cylinders
+    and planes.
     """
     require_finite("curvature_sign", Q)
     units = np.append(np.full(3, _length_scale(Q)), 1.0)
@@ -128,44 +86,15 @@ def curvature_sign(Q: F64) -> int:
 
 
 def image_of_absolute_conic(K: F64, *, is_dual: bool = False) -> F64:
-    """Return omega = K^-T K^-1 (3.11 - 3.13), or its inverse omega* = K K' (3.14, 3.15).
-
-    Parameters
-    ----------
-    K : ndarray (..., 3, 3)
-        Calibration matrices.
-    is_dual : bool
-        Whether omega* is returned.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-    """
+    """omega = K^-T K^-1 (3.11 - 3.13), or its inverse omega* = K K' (3.14, 3.15)."""
     factor = K if is_dual else np.swapaxes(checked_inverse(K, "image_of_absolute_conic"), -1, -2)
     return np.asarray(factor @ np.swapaxes(factor, -1, -2))
 
 
 def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
-    """Recover K from omega ~ K^-T K^-1 (3.13) or omega* ~ K K' (3.14), by Cholesky from the last row up.
+    """K with K33 = 1 from omega ~ K^-T K^-1 (3.13) or omega* ~ K K' (3.14), by Cholesky from the last row up.
 
-    Parameters
-    ----------
-    image : ndarray (3, 3)
-        Omega, or omega* if ``is_dual``, of any scale and sign; an indefinite one is a ``ValueError``.
-    is_dual : bool
-        Whether the image is omega*.
-
-    Returns
-    -------
-    ndarray (3, 3)
-        K with positive focal lengths and K33 = 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
-    >>> bool(np.allclose(calibration_from_image(image_of_absolute_conic(K)), K))
-    True
+    A conic that is indefinite is a ``ValueError``.
     """
     if not np.isfinite(image).all() or not (is_dual or np.linalg.cond(image) < 1e15):
         raise ValueError("calibration_from_image needs a finite invertible conic")

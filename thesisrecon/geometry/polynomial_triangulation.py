@@ -313,15 +313,6 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     """Move matches to the nearest pairs with x2' F x1 = 0: least sum of squared distances.
 
     The minimum is global. A match with a point on its epipole is exact with every partner and is not moved.
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix of rank 2 (``ValueError`` for rank 1), any scale, and matches, px.
-
-    Returns
-    -------
-    xy1, xy2 : ndarray (N, 2)
     """
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     require_shapes("correct_matches", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
@@ -343,21 +334,11 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
-    """Triangulate optimally from two views (6.3.3).
+    """Triangulate xy (2, N, 2) optimally from two views (6.3.3): unit points (N, 4); zeros where xy is NaN.
 
-    The sum of squared reprojection errors is the global minimum in any frame (:func:`correct_matches`).
-
-    Parameters
-    ----------
-    P, xy : ndarray (2, 3, 4) and (2, N, 2)
-        Cameras of rank 3 with different centres (others are a ``ValueError``), and pixels; NaN for not
-        observed.
-
-    Returns
-    -------
-    ndarray (N, 4)
-        Points of unit norm; zeros if not observed twice. A match whose nearest exact pair has one point on an
-        epipole gives the centre of the other camera; with both there, some point of the baseline.
+    The sum of squared reprojection errors is the global minimum in any frame (:func:`correct_matches`). A
+    match whose nearest exact pair has one point on an epipole gives the centre of the other camera; with both
+    there, some point of the baseline.
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f'the polynomial method needs exactly two cameras, not {len(P)}; use "optimal"')

@@ -9,20 +9,10 @@ from thesisrecon.geometry.conditioning import normalizing_transform
 
 
 def resect_linear(X: F64, xy: F64) -> F64:
-    """Estimate cameras by the direct linear transform, least algebraic residual.
+    """Unit cameras of least algebraic residual (DLT) of points X (..., M, 4) and xy (..., M, 2), M >= 6.
 
-    Coplanar points do not determine the camera; one of the solutions is returned.
-
-    Parameters
-    ----------
-    X, xy : ndarray (..., M, 4) and (..., M, 2)
-        M >= 6 homogeneous points, best as whitened unit vectors, and their pixels; fewer are a
-        ``ValueError``.
-
-    Returns
-    -------
-    ndarray (..., 3, 4)
-        P of unit norm.
+    Best with whitened unit vectors X. Coplanar points do not determine the camera; one of the solutions
+    results.
     """
     if X.shape[-2] < 6:
         raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
@@ -41,24 +31,11 @@ def resect_linear(X: F64, xy: F64) -> F64:
 
 
 def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
-    """Return all poses of calibrated cameras that see three points along three rays (P3P).
+    """All poses R, t that see three points X (B, 3, 3) along unit rays (B, 3, 3), and their samples (P3P).
 
     With side lengths a = |X2 - X3|, b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v
-    = s3 / s1 of the distances is a root of Grunert's quartic.
-
-    Parameters
-    ----------
-    X, rays : ndarray (B, 3, 3)
-        Samples of three points and their unit directions in the camera frame.
-
-    Returns
-    -------
-    R, t, sample : ndarray (C, 3, 3), (C, 3) and (C,) of int
-        Rotations world-to-camera and translations, up to four a sample, and the sample of each.
-
-    References
-    ----------
-    Haralick et al., "Review and analysis of solutions of the three point ... problem", IJCV 13(3), 1994.
+    = s3 / s1 of the distances is a root of Grunert's quartic: up to four poses a sample (Haralick et al.,
+    IJCV 13(3), 1994).
     """
     a2, b2, c2 = (np.sum((X[:, i] - X[:, j]) ** 2, axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))
     ca, cb, cc = (np.sum(rays[:, i] * rays[:, j], axis=1) for i, j in ((1, 2), (0, 2), (0, 1)))

@@ -9,27 +9,9 @@ from thesisrecon.records import Similarity
 
 
 def estimate_similarity(source: F64, target: F64) -> Similarity:
-    """Estimate the similarity from ``source`` to ``target`` with the least sum of squared distances.
+    """The similarity from ``source`` to ``target`` (N, 3) with the least sum of squared distances.
 
-    Parameters
-    ----------
-    source, target : ndarray (N, 3)
-        At least 3 points, not on one line (the rotation about it is free); otherwise a ``ValueError``.
-
-    Returns
-    -------
-    Similarity
-
-    References
-    ----------
-    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI, 1991.
-
-    Examples
-    --------
-    >>> X = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    >>> found = estimate_similarity(X, 2.0 * X + 5.0)
-    >>> round(found.scale, 9), found.t.round(9).tolist()
-    (2.0, [5.0, 5.0, 5.0])
+    Umeyama, PAMI 13(4), 1991. Fewer than 3 points, or points of one line, are a ``ValueError``.
     """
     require_shapes("estimate_similarity", source=(source, ("N", 3)), target=(target, ("N", 3)))
     if len(source) < 3:
@@ -47,25 +29,9 @@ def estimate_similarity(source: F64, target: F64) -> Similarity:
 
 
 def rotation_errors_deg(R: F64, R_true: F64) -> F64:
-    """Compute the angles between rotations after the rotation of the world that fits them best.
+    """Angles between rotations after the rotation of the world that fits them best.
 
     It is the chordal mean of the relative rotations: two views suffice, and the centres have no effect.
-
-    Parameters
-    ----------
-    R, R_true : ndarray (V, 3, 3)
-        Rotations from world to camera in two worlds.
-
-    Returns
-    -------
-    ndarray (V,)
-        Degrees.
-
-    Examples
-    --------
-    >>> R = np.array([np.eye(3), np.diag([1.0, -1.0, -1.0])])
-    >>> rotation_errors_deg(R, R @ np.diag([-1.0, -1.0, 1.0])).round(9).tolist()
-    [0.0, 0.0]
     """
     common = nearest_rotation(np.einsum("vji,vjk->ik", R_true, R))
     difference = np.einsum("vij,jk,vlk->vil", R_true, common, R)

@@ -101,17 +101,7 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
 def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
     """Solve (H + damping diag H) step = -g by Cholesky factorisation, inside kernels.
 
-    Parameters
-    ----------
-    H, g, damping : ndarray (n, n), ndarray (n,), float
-        J'J, J'r and Levenberg-Marquardt damping.
-    step : ndarray (n,)
-        Output.
-
-    Returns
-    -------
-    bool
-        False if the damped matrix is not positive definite.
+    False if the damped matrix is not positive definite.
     """
     n = len(g)
     L = zeros((n, n))
@@ -147,16 +137,10 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 
 @kernel
 def orthogonalize_columns(A: F64, V: F64) -> None:
-    """Make the columns of A orthogonal in place by one-sided Jacobi rotations (Hestenes 1958).
+    """Make the columns of A (m, n) orthogonal in place by one-sided Jacobi rotations (Hestenes 1958).
 
-    The lengths of the columns become the singular values, not sorted.
-
-    Parameters
-    ----------
-    A : ndarray (m, n)
-        Matrix; becomes A V.
-    V : ndarray (n, n)
-        Output: the right singular vectors, in columns.
+    A becomes A V with the right singular vectors V (n, n); column lengths are the singular values, not
+    sorted.
     """
     m, n = A.shape
     V[:] = 0.0
@@ -186,18 +170,7 @@ def orthogonalize_columns(A: F64, V: F64) -> None:
 
 @kernel
 def shortest_column(A: F64) -> int:
-    """Index of the column of least length.
-
-    Parameters
-    ----------
-    A : ndarray (m, n)
-        Matrix.
-
-    Returns
-    -------
-    int
-        The first of the shortest columns.
-    """
+    """Index of the column of least length, the first of several."""
     best, least = 0, math.inf
     for p in range(A.shape[1]):
         length = 0.0

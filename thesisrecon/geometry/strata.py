@@ -31,30 +31,8 @@ PLANE_AT_INFINITY = np.array([0.0, 0.0, 0.0, 1.0])
 def transform(G: F64, entity: F64, kind: Entity) -> F64:
     """Transform points, planes, cameras, conics or quadrics, or their duals (table 3.3).
 
-    X -> G X, Pi' -> Pi' G^-1, P -> P G^-1 (which keeps the images P X), C -> G^-T C G^-1, C* -> G C* G'.
-
-    Parameters
-    ----------
-    G : ndarray (4, 4) or (3, 3)
-        Transform of space, or homography.
-    entity : ndarray
-        (..., d) points, planes or image lines, (..., 3, 4) cameras, (..., d, d) conics or quadrics.
-    kind : {"points", "planes", "cameras", "conics", "dual conics"}
-        Kind of the entity.
-
-    Returns
-    -------
-    ndarray
-
-    Raises
-    ------
-    ValueError
-        For an unknown kind, or a singular G where its inverse is needed.
-
-    Examples
-    --------
-    >>> transform(np.diag([2.0, 2.0, 2.0, 1.0]), np.eye(3, 4), "cameras").tolist()
-    [[0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 0.0]]
+    X -> G X, Pi' -> Pi' G^-1, P -> P G^-1 (which keeps the images P X), C -> G^-T C G^-1, C* -> G C* G'. G is
+    a transform of space (4, 4), or a homography (3, 3) of points, lines and conics.
     """
     if kind not in get_args(Entity):
         raise ValueError(unknown_word("kind of entity", kind, get_args(Entity)))
@@ -67,19 +45,10 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
 
 
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
-    """Return the smallest group that a transform belongs to (figure 3.1).
+    """The smallest group that a transform belongs to (figure 3.1).
 
     With G = [A t; b' 1] the transform is affine if b = 0, metric if also A'A = s^2 I and det A > 0, and
     Euclidean if also s = 1. The unit of length of the test is that of G, or |t| / |A| if this is larger.
-
-    Parameters
-    ----------
-    G, tolerance : ndarray (4, 4), float
-        Transform of any scale, finite and invertible (otherwise a ``ValueError``), and relative tolerance.
-
-    Returns
-    -------
-    {"projective", "affine", "metric", "euclidean"}
     """
     if G.shape == (4, 4) and np.isfinite(G).all() and G[:3, :3].any():
         length = max(1.0, float(np.linalg.norm(G[:3, 3]) / np.linalg.norm(G[:3, :3])))
@@ -98,19 +67,10 @@ def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
 
 
 def affine_from_projective(plane: F64) -> F64:
-    """Return G_PA, which moves the plane at infinity of a projective frame to (0, 0, 0, 1) (3.4.3).
+    """G_PA, which moves the plane at infinity of a projective frame to (0, 0, 0, 1) (3.4.3).
 
     The identity with the last row (Pi1/Pi4, Pi2/Pi4, Pi3/Pi4, 1). For a plane (nearly) through the origin it
     is the smallest rotation that moves the plane there.
-
-    Parameters
-    ----------
-    plane : ndarray (4,)
-        Plane at infinity in the projective frame, finite and not 0 (otherwise a ``ValueError``).
-
-    Returns
-    -------
-    ndarray (4, 4)
     """
     norm = float(np.linalg.norm(plane))
     if plane.shape != (4,) or not np.isfinite(norm) or norm == 0.0:
@@ -126,18 +86,9 @@ def affine_from_projective(plane: F64) -> F64:
 
 
 def metric_from_affine(absolute_conic: F64) -> F64:
-    """Return G_AM, which moves the absolute conic of an affine frame to the identity (3.4.4).
+    """G_AM, which moves the absolute conic of an affine frame to the identity (3.4.4).
 
     With Omega = A'A (Cholesky) the points of the plane at infinity move by A. Determined up to a similarity.
-
-    Parameters
-    ----------
-    absolute_conic : ndarray (3, 3)
-        Definite conic on the plane at infinity, of any sign; an indefinite one is a ``ValueError``.
-
-    Returns
-    -------
-    ndarray (4, 4)
     """
     sign = 1.0 if np.trace(absolute_conic) > 0.0 else -1.0
     try:
@@ -150,19 +101,9 @@ def metric_from_affine(absolute_conic: F64) -> F64:
 
 
 def metric_from_projective(dual_quadric: F64) -> F64:
-    """Return G_PM, which moves the absolute dual quadric to diag(1, 1, 1, 0), det G_PM > 0.
+    """G_PM, which moves the absolute dual quadric to diag(1, 1, 1, 0), det G_PM > 0.
 
     Q* = V diag(s1, s2, s3, s4) V' with |s4| least, set to 0; G_PM^-1 = V diag(roots of s1, s2, s3, 1).
-
-    Parameters
-    ----------
-    dual_quadric : ndarray (4, 4)
-        Absolute dual quadric of a projective frame, of any sign; a ``ValueError`` unless s1, s2 and s3 have
-        the same sign.
-
-    Returns
-    -------
-    ndarray (4, 4)
     """
     s, V = np.linalg.eigh((dual_quadric + dual_quadric.T) / 2.0)
     order = np.argsort(-np.abs(s))
@@ -175,18 +116,9 @@ def metric_from_projective(dual_quadric: F64) -> F64:
 
 
 def cross_ratio(X: F64) -> float:
-    """Return (l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
+    """(l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
 
-    Parameters
-    ----------
-    X : ndarray (4, d)
-        Homogeneous points of any scale, d = 2, 3 or 4, collinear and at most two of them equal (otherwise a
-        ``ValueError``).
-
-    Returns
-    -------
-    float
-        Inf if X1 = X4 or X2 = X3.
+    At most two of the homogeneous points may be equal; inf if X1 = X4 or X2 = X3.
     """
     if X.ndim != 2 or X.shape[0] != 4 or not np.isfinite(X).all():
         raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")

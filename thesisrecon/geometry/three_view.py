@@ -21,19 +21,9 @@ _TURN = np.linalg.solve(np.eye(3) - _SKEW, np.eye(3) + _SKEW)
 
 
 def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
-    """Return T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17), i from 0.
+    """T_i^jk = (-1)^i det [P1 without row i; row j of P2; row k of P3] (HZ 17), i from 0, of unit norm.
 
-    For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki.
-
-    Parameters
-    ----------
-    P1, P2, P3 : ndarray (3, 4)
-        Cameras of any frame and scale.
-
-    Returns
-    -------
-    ndarray (3, 3, 3)
-        T of unit norm; zero if all three centres coincide.
+    For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki; zero if all three centres coincide.
     """
     P1, P2, P3 = (checked_unit(P, "tensor_from_cameras") for P in (P1, P2, P3))
     T, centre = np.zeros((3, 3, 3)), camera_centre(P1)
@@ -50,18 +40,9 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
 
 
 def trifocal_residuals(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
-    """Return x1^i l2_j l3_k T_i^jk: 0 if l2 and l3 pass through the images of a point on the ray of x1.
+    """x1^i l2_j l3_k T_i^jk: 0 if l2 and l3 pass through the images of a point on the ray of x1.
 
     Points (lines through x2 and x3) give four independent equations, lines (points of l1) two (HZ 15.1).
-
-    Parameters
-    ----------
-    T, x1, l2, l3 : ndarray (3, 3, 3), then (..., 3)
-        Tensor, points of view 1 and lines of views 2 and 3.
-
-    Returns
-    -------
-    ndarray (...)
     """
     return np.asarray(np.einsum("...i,...j,...k,ijk->...", x1, l2, l3, T))
 
@@ -70,16 +51,6 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
     """Transfer lines of views 1 and 2 to view 3: l3 is the null vector of [l1]x (l2_j T_i^jk) (figure 3.15).
 
     It is undetermined if both lines belong to one epipolar plane of views 1 and 2.
-
-    Parameters
-    ----------
-    T, l1, l2 : ndarray (3, 3, 3), then (..., 3)
-        Tensor and lines of views 1 and 2.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Unit lines of view 3.
     """
     require_finite("transfer_lines", T, l1, l2)
     M = np.einsum("...j,ijk->...ik", l2, T)
@@ -91,28 +62,8 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     """Transfer matches of views 1 and 2 to view 3 (figure 3.14).
 
     The matches are corrected (6.3.3); then the line l2 through x2 perpendicular to its epipolar line
-    transfers x1 by the homography l2_j T_i^jk (HZ 15.3), also for points of the plane of the centres.
-
-    Parameters
-    ----------
-    T, xy1, xy2 : ndarray (3, 3, 3), (N, 2) and (N, 2)
-        Tensor and matches of views 1 and 2, px.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        Pixels of view 3; inf or NaN for points of the line through the centres of views 1 and 2.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> P = np.eye(3, 4) + np.array([0.0, 1, 2])[:, None, None] * np.outer([1.0, 0.5, 0.1], [0, 0, 0, 1])
-    >>> X = np.array([[0.5, -0.2, 4.0, 1]])
-    >>> x1, x2, x3 = X @ P.transpose(0, 2, 1)
-    >>> T = tensor_from_cameras(*P)
-    >>> xy1, xy2, xy3 = (x[:, :2] / x[:, 2:] for x in (x1, x2, x3))
-    >>> bool(np.allclose(transfer_points(T, xy1, xy2), xy3))
-    True
+    transfers x1 by the homography l2_j T_i^jk (HZ 15.3), also for points of the plane of the centres. Inf or
+    NaN for points of the line through the centres of views 1 and 2.
     """
     F21, _ = fundamentals_from_tensor(T)
     xy1, xy2 = correct_matches(F21, xy1, xy2)
@@ -125,34 +76,17 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
 def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
     """Transfer matches of views 1 and 2 to the intersection of their epipolar lines in view 3 (3.6.3).
 
-    Parameters
-    ----------
-    F31, F32, xy1, xy2 : ndarray (3, 3), (3, 3), (N, 2) and (N, 2)
-        Fundamental matrices from views 1 and 2 to view 3, and matches of views 1 and 2, px.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        Pixels of view 3; inf or NaN if the lines coincide, as for points of the plane of the three centres.
+    Inf or NaN if the lines coincide, as for points of the plane of the three centres.
     """
     return dehomogenize(np.cross(homogenize(xy1) @ F31.T, homogenize(xy2) @ F32.T))
 
 
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:
-    """Return the unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
+    """The unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
     e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
     squares for a noisy T. The coordinates of view 1 are rotated first, because T_i has rank 1 (a plane of
     null vectors) if the i-th unit vector of view 1 is an epipole, as in rectified images.
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor.
-
-    Returns
-    -------
-    e2, e3 : ndarray (3,)
     """
     require_finite("tensor_epipoles", T)
     sizes = np.linalg.norm(T, axis=(1, 2), keepdims=True)
@@ -161,18 +95,7 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
 
 
 def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
-    """Return F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 of unit norm (HZ 15.1).
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor.
-
-    Returns
-    -------
-    F21, F31 : ndarray (3, 3)
-        x2'F21 x1 = 0 and x3'F31 x1 = 0.
-    """
+    """F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 of unit norm (HZ 15.1)."""
     e2, e3 = tensor_epipoles(T)
     F21 = cross_matrix(e2) @ np.einsum("ijk,k->ji", T, e3)
     F31 = cross_matrix(e3) @ np.einsum("ijk,j->ki", T, e2)
@@ -180,18 +103,7 @@ def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
 
 
 def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:
-    """Return [I 0], [[T_1, T_2, T_3] e3, e2] and [(e3 e3' - I) [T_1', T_2', T_3'] e2, e3] (HZ 15.1).
-
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor of cameras.
-
-    Returns
-    -------
-    P1, P2, P3 : ndarray (3, 4)
-        Cameras of one projective frame with tensor T.
-    """
+    """Cameras [I 0], [[T_1, T_2, T_3] e3, e2] and [(e3 e3' - I) [T_1', T_2', T_3'] e2, e3] of T (HZ 15.1)."""
     e2, e3 = tensor_epipoles(T)
     A = np.einsum("ijk,k->ji", T, e3)
     B = (np.outer(e3, e3) - np.eye(3)) @ np.einsum("ijk,j->ki", T, e2)

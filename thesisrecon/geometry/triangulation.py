@@ -185,17 +185,9 @@ SortedPixels = tuple[I64, I64, F64]
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
-    """Triangulate a list of observations by the linear method of :func:`triangulate`.
+    """Triangulate observations in any order by the linear method: unit points (n_points, 4).
 
-    Parameters
-    ----------
-    P, view, point, xy, n_points : ndarray (V, 3, 4), (K,), (K,) and (K, 2), int
-        Cameras; view, point and pixel of each observation, in any order; number of points.
-
-    Returns
-    -------
-    ndarray (n_points, 4)
-        Points of unit norm; zeros for fewer than two observations, or observations from one centre only.
+    Zeros for fewer than two observations, or observations from one centre only.
     """
     if not (point[1:] >= point[:-1]).all():
         order = np.argsort(point, kind="stable")
@@ -206,18 +198,7 @@ def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: i
 
 
 def triangulation_angles(centres: F64, view: I64, point: I64, X: F64, n_points: int) -> F64:
-    """Return for each point the largest angle between one of its rays and the ray of its first observation.
-
-    Parameters
-    ----------
-    centres, view, point, X, n_points : ndarray (V, 3), (K,), (K,) and (n_points, 3), int
-        Camera centres, view and point of each observation, and points.
-
-    Returns
-    -------
-    ndarray (n_points,)
-        Angles, rad; 0 without observations.
-    """
+    """For each point the largest angle, rad, between one of its rays and the ray of its first observation."""
     rays = X[point] - centres[view]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300)
     first = np.zeros((n_points, 3))

@@ -19,39 +19,16 @@ def _check(F: F64, caller: str) -> None:
 
 
 def enforce_rank_two(F: F64) -> F64:
-    """Return the nearest matrix of rank 2 (Frobenius norm), scaled to unit norm.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Matrix.
-
-    Returns
-    -------
-    ndarray (3, 3)
-    """
+    """The nearest matrix of rank 2 (Frobenius norm), scaled to unit norm."""
     _check(F, "enforce_rank_two")
     U, s, Vt = np.linalg.svd(F)
     return unit_norm((U[:, :2] * s[:2]) @ Vt[:2])
 
 
 def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
-    """Return F = [e2]x P2 P1^+ of two cameras, of unit norm and rank 2, e2 = P2 C1 (3.33, 3.35).
+    """F = [e2]x P2 P1^+ of two cameras, of unit norm and rank 2, e2 = P2 C1 (3.33, 3.35).
 
-    Parameters
-    ----------
-    P1, P2 : ndarray (3, 4)
-        Cameras of rank 3 with different centres; others are a ``ValueError``.
-
-    Returns
-    -------
-    ndarray (3, 3)
-
-    Examples
-    --------
-    >>> F = fundamental_from_cameras(np.eye(3, 4), np.hstack([np.eye(3), [[1.0], [0.0], [0.0]]]))
-    >>> np.abs(F * np.sqrt(2.0)).round(9).tolist()
-    [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
+    Equal centres are a ``ValueError``.
     """
     P1, P2 = checked_unit(P1, "fundamental_from_cameras"), checked_unit(P2, "fundamental_from_cameras")
     C1 = checked_unit(camera_centre(P1), "fundamental_from_cameras, for the centre of its first camera,")
@@ -63,23 +40,9 @@ def fundamental_from_cameras(P1: F64, P2: F64) -> F64:
 
 
 def epipoles(F: F64) -> tuple[F64, F64]:
-    """Return the epipoles, F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
+    """The unit epipoles, F e1 = 0 and F' e2 = 0, of the nearest matrix of rank 2 (3.34, 3.35).
 
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix.
-
-    Returns
-    -------
-    e1, e2 : ndarray (3,)
-        Unit epipoles in images 1 and 2, the thesis' e_ji and e_ij (section 5.3 exchanges the two).
-
-    Examples
-    --------
-    >>> e1, e2 = epipoles(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
-    >>> np.abs(e1).tolist(), np.abs(e2).tolist()
-    ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    They are the thesis' e_ji and e_ij (section 5.3 exchanges the two).
     """
     _check(F, "epipoles")
     U, _, Vt = np.linalg.svd(F)
@@ -87,7 +50,7 @@ def epipoles(F: F64) -> tuple[F64, F64]:
 
 
 def lines_of_points(F: F64, xy1: F64) -> F64:
-    """Return the epipolar lines F x1 (N, 3) with unit normals; see :func:`thesisrecon.epipolar_lines`."""
+    """The epipolar lines F x1 (N, 3) with unit normals; see :func:`thesisrecon.epipolar_lines`."""
     x = homogenize(xy1)
     lines = x @ F.T
     # At an epipole only rounding errors are left.
@@ -96,18 +59,7 @@ def lines_of_points(F: F64, xy1: F64) -> F64:
 
 
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the distances of x1 to the line F' x2 and of x2 to F x1 (5.5); both are multiples of x2' F x1.
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and matches, px.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        In images 1 and 2, px.
-    """
+    """Distances (N, 2) of x1 to the line F' x2 and of x2 to F x1 (5.5); both are multiples of x2' F x1."""
     of_first = np.sum(homogenize(xy1) * lines_of_points(F.T, xy2), axis=1)
     of_second = np.sum(homogenize(xy2) * lines_of_points(F, xy1), axis=1)
     return np.asarray(np.abs(np.column_stack([of_first, of_second])))
@@ -126,54 +78,26 @@ def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the signed Sampson distances (5.4).
+    """Signed Sampson distances (N,) (5.4).
 
     To first order the distance of (x1, y1, x2, y2) to the nearest exact match, with the standard deviation of
     one image coordinate (5.3).
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and matches, px.
-
-    Returns
-    -------
-    ndarray (N,)
     """
     g2, g1 = _gradients(F, xy1, xy2)
     return _algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
 
 
 def symmetric_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the root of the sum of the two squared distances to the epipolar lines (5.6).
-
-    Parameters
-    ----------
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and matches, px.
-
-    Returns
-    -------
-    ndarray (N,)
-    """
+    """The root (N,) of the sum of the two squared distances to the epipolar lines (5.6)."""
     g2, g1 = _gradients(F, xy1, xy2)
     return np.abs(_algebraic_residuals(F, xy1, xy2)) * np.sqrt(1.0 / g1 + 1.0 / g2)
 
 
 def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
-    """Return the standard deviations of the distances of exact matches to their epipolar lines in image 2.
+    """Standard deviations (N,) of the distances of exact matches to their epipolar lines in image 2.
 
-    First order in the error of F alone. A match with own noise sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2))
-    with g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
-
-    Parameters
-    ----------
-    F, covariance, xy1, xy2 : ndarray (3, 3), (9, 9), (N, 2) and (N, 2)
-        Fundamental matrix, covariance of its entries (row-major), and matches, px.
-
-    Returns
-    -------
-    ndarray (N,)
+    First order in the error of F alone, whose entries have the ``covariance`` (9, 9). A match with own noise
+    sigma has sqrt(std^2 + sigma^2 (1 + g1 / g2)), g1 and g2 the squared gradients of x2' F x1 by x1 and x2.
     """
     x1, x2 = homogenize(xy1), homogenize(xy2)
     lines = x1 @ F.T
@@ -187,22 +111,13 @@ def epipolar_distance_std(F: F64, covariance: F64, xy1: F64, xy2: F64) -> F64:
 
 
 def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
-    """Return the homography x2 ~ H x1 of unit norm between two images induced by a plane (3.29 - 3.32).
+    """The homography x2 ~ H x1 of unit norm between two images induced by a plane (3.29 - 3.32).
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
     is projected. For P1 = [I 0], P2 = [M m] and the plane (pi, 1) it is H_Pi = M - m pi' (3.29), which maps
     the point (x, -pi'x) to its image; [M m] = [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40). In
-    general it equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin.
-
-    Parameters
-    ----------
-    P1, P2, plane : ndarray (3, 4), (3, 4) and (4,)
-        Cameras, and a plane that does not contain the first centre (otherwise a ``ValueError``).
-
-    Returns
-    -------
-    ndarray (3, 3)
-        Singular if the plane contains the second centre.
+    general it equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin; singular for a plane through
+    the second centre.
     """
     P1, P2, plane = (checked_unit(array, "plane_homography") for array in (P1, P2, plane))
     centre = checked_unit(camera_centre(P1), "plane_homography, for the centre of its first camera,")
@@ -213,18 +128,9 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
 
 
 def infinite_homography(P1: F64, P2: F64) -> F64:
-    """Return H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1), of unit norm.
+    """H = M2 M1^-1 (3.31), the homography of the plane (0, 0, 0, 1), of unit norm.
 
     K2 R2 R1' K1^-1 in a metric frame (3.28, where the thesis' R are transposed), for any centres.
-
-    Parameters
-    ----------
-    P1, P2 : ndarray (3, 4)
-        Cameras; a first camera at infinity is a ``ValueError``.
-
-    Returns
-    -------
-    ndarray (3, 3)
     """
     require_finite("infinite_homography", P1, P2)
     if not np.linalg.cond(P1[:, :3]) < 1e14:
@@ -234,25 +140,12 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 
 
 def quasi_euclidean_planes(F: F64) -> F64:
-    """Return the two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
+    """The two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
     v = +-(s1 + s2) / 2 e1 with the singular values s1 >= s2 of F gives the left part the singular values s1,
     (s1 + s2) / 2, s2. With a calibration near the identity v is near the plane at infinity. The two solutions
-    differ by a rotation of 180 degrees about the baseline; only matches decide between them.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix.
-
-    Returns
-    -------
-    ndarray (2, 3)
-        v, that of the smaller rotation first.
-
-    References
-    ----------
-    Beardsley, Zisserman and Murray, "Sequential Updating of Projective and Affine Structure", IJCV 23, 1997.
+    differ by a rotation of 180 degrees about the baseline; only matches decide between them. That of the
+    smaller rotation is first (Beardsley, Zisserman and Murray, IJCV 23, 1997).
     """
     F = unit_norm(F)
     e1, e2 = epipoles(F)
@@ -263,28 +156,11 @@ def quasi_euclidean_planes(F: F64) -> F64:
 
 
 def canonical_cameras(F: F64, *, plane: F64 | None = None, scale: float = 1.0) -> tuple[F64, F64]:
-    """Return P1 = [I 0], P2 = [H  scale e2] (3.42), H = -[e2]x F + e2 v': two cameras of F.
+    """P1 = [I 0], P2 = [H  scale e2] (3.42), H = -[e2]x F + e2 v': two cameras of F.
 
     H is the homography of a plane for any v (3.39), [e2]x H = F for F of unit norm. (3.41) is the singular H
-    of v = 0, the plane through the second centre; with the default v its condition number is that of F.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix.
-    plane, scale : ndarray (3,), optional; float
-        v, by default the first of :func:`quasi_euclidean_planes`, and the scale, not 0 (a ``ValueError``).
-
-    Returns
-    -------
-    P1, P2 : ndarray (3, 4)
-
-    Examples
-    --------
-    >>> F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    >>> P1, P2 = canonical_cameras(F)
-    >>> np.allclose(fundamental_from_cameras(P1, P2), unit_norm(F))
-    True
+    of v = 0, the plane through the second centre; with the default v, the first of
+    :func:`quasi_euclidean_planes`, its condition number is that of F.
     """
     if scale == 0.0 or not np.isfinite(scale):
         raise ValueError(f"canonical_cameras needs a finite scale other than 0; got {scale}")

@@ -44,22 +44,10 @@ Edge = tuple[int, int]
 
 
 def depths_from_fundamentals(xy: F64, F: Mapping[Edge, F64], tree: Sequence[Edge]) -> F64:
-    """Compute projective depths from fundamental matrices along a tree of views.
+    """Projective depths (V, N) of xy (V, N, 2) from F[i, j], x_j' F x_i = 0, along a tree of edges (i, j).
 
-    For an edge (i, j): w_i F x_i = w_j (e_j x x_j), in least squares (Sturm and Triggs, eq. 3). Points near
-    an epipole get inaccurate depths.
-
-    Parameters
-    ----------
-    xy : ndarray (V, N, 2)
-        Matches in pixels.
-    F, tree : mapping of (int, int) to ndarray (3, 3), sequence of (int, int)
-        ``F[i, j]`` with x_j' F x_i = 0, and edges (i, j) that reach every view once, i before j.
-
-    Returns
-    -------
-    ndarray (V, N)
-        Depths, 1 in the first view of the tree.
+    The edges reach every view once, i before j: w_i F x_i = w_j (e_j x x_j), in least squares (Sturm and
+    Triggs, eq. 3), and the depths are 1 in the first view. Points near an epipole get inaccurate depths.
     """
     x = homogenize(xy)
     depths = np.ones(xy.shape[:2])
@@ -82,21 +70,11 @@ def _balance_depths(depths: F64, sizes: F64) -> F64:
 
 
 def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> tuple[F64, F64, F64]:
-    """Factorize matches seen in every view into cameras and points (rank 4).
+    """Factorize N >= 8 matches xy (V, N, 2) into cameras, unit points and reprojection distances (V, N).
 
-    Parameters
-    ----------
-    xy, depths : ndarray (V, N, 2), (V, N)
-        Eight or more matches in pixels, and initial depths. By default these are equal, as for affine
-        cameras; ``iterations`` are needed then.
-    iterations : int
-        Maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
-        balanced matrix, which approximates the reprojection error, no longer falls.
-
-    Returns
-    -------
-    P, X, residual_px : ndarray (V, 3, 4), (N, 4), (V, N)
-        Cameras for pixels, points of unit norm, and reprojection distances.
+    Initial depths are equal by default, as for affine cameras; ``iterations`` are needed then. They are the
+    maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
+    balanced matrix, which approximates the reprojection error, no longer falls.
     """
     depths = np.ones(xy.shape[:2]) if depths is None else depths
     T = np.stack([normalizing_transform(view) for view in xy])

@@ -170,31 +170,14 @@ class IncrementalProjective:
         return best
 
     def complete(self, model: ProjectiveModel, pairs: Sequence[TwoView], rng: Generator) -> None:
-        """Add views to a model of two cameras or more in place and remove those that prove wrong.
-
-        Parameters
-        ----------
-        model, pairs, rng : ProjectiveModel, sequence of TwoView, numpy.random.Generator
-            Model, verified pairs, and source of the resection samples.
-        """
+        """Add views to a model of two cameras or more in place and remove those that prove wrong."""
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
             adjust_all(model, self.bundle_iterations, self.outlier_sigmas[0])
             self._grow(model, rng)
 
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> ProjectiveModel:
-        """Reconstruct the initial pair: cameras (3.42) and points.
-
-        Parameters
-        ----------
-        tracks, pair, sizes : Tracks, TwoView, ndarray (V, 2) of int
-            Observations, initial pair, and width and height of the images.
-
-        Returns
-        -------
-        ProjectiveModel
-            Model of two views.
-        """
+        """Reconstruct the initial pair: cameras (3.42) and points."""
         model = ProjectiveModel.empty(
             tracks, sizes, sigma_px=pair.sigma_px, noise_floor_px=self.noise_floor_px
         )
@@ -220,18 +203,7 @@ class IncrementalProjective:
             adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
 
     def add_next_camera(self, model: ProjectiveModel, rng: Generator) -> int | None:
-        """Resect the view with the best coverage by model points that passes the covariance test.
-
-        Parameters
-        ----------
-        model, rng : ProjectiveModel, numpy.random.Generator
-            Model, changed in place, and source of the resection samples.
-
-        Returns
-        -------
-        int or None
-            The view; None if no view can be added.
-        """
+        """Resect the view best covered by model points that passes the covariance test; None if none does."""
         t = model.tracks
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)

@@ -35,18 +35,7 @@ class LinearAbsoluteConic:
     """
 
     def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
-        """Compute the calibrations for a plane at infinity.
-
-        Parameters
-        ----------
-        scene, plane : ProjectiveScene, ndarray (3,)
-            Cameras and prior, and the plane p.
-
-        Returns
-        -------
-        ndarray (R, 3, 3)
-            Unit-free calibrations. ``StageFailure`` if the conic is indefinite or not unique.
-        """
+        """Unit-free calibrations (R, 3, 3) of a plane p (3,); ``StageFailure`` without a unique conic."""
         frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
         one_camera = bool((constraints.first == constraints.first[0]).all())

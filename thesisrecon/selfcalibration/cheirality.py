@@ -39,18 +39,7 @@ class CheiralitySearch:
     max_points = 2000
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        """Find candidate planes at infinity, best first.
-
-        Parameters
-        ----------
-        scene, rng : ProjectiveScene, numpy.random.Generator
-            Cameras, points and prior; source of the random choices.
-
-        Returns
-        -------
-        PlaneCandidates
-            The planes; ``StageFailure`` if there is none.
-        """
+        """Candidate planes at infinity, best first; ``StageFailure`` if there is none."""
         planes, _ = self.search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):
             raise StageFailure(
@@ -64,20 +53,7 @@ class CheiralitySearch:
         self, frame: ReferenceFrame, reconstruction: Reconstruction, constraints: ConicConstraints,
         rng: np.random.Generator,
     ) -> tuple[F64, F64]:  # fmt: skip
-        """Find planes and focal lengths.
-
-        Parameters
-        ----------
-        frame, reconstruction : ReferenceFrame, Reconstruction
-            Cameras, and the projective reconstruction.
-        constraints, rng : ConicConstraints, numpy.random.Generator
-            Prior knowledge of the cameras; selects the points.
-
-        Returns
-        -------
-        planes, focals : ndarray (B, 3), (B,)
-            Planes p, best first, possibly none, and unit-free focal lengths of the reference camera.
-        """
+        """Planes p (B, 3), best first, and unit-free focal lengths (B,) of the reference camera."""
         region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
         parts = [self._minima(frame, constraints, polytope) for polytope in region.polytopes]
         if not parts:

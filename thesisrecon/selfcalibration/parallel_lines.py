@@ -357,18 +357,9 @@ def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
 
 
 def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
-    """Return the plane at infinity (4,), unit norm, from vanishing points of three directions or more.
+    """The plane at infinity (4,), unit norm, from vanishing points xyh (V, D, 3), D >= 3, NaN where not seen.
 
-    Parameters
-    ----------
-    P, xyh : ndarray (V, 3, 4), ndarray (V, D, 3)
-        Projective cameras, and homogeneous pixels of the vanishing points, NaN where not seen.
-    unit : ndarray (V, 3, 3)
-        Pixels from unit-free coordinates.
-
-    Returns
-    -------
-    ndarray (4,)
+    ``unit`` (V, 3, 3) are the pixels from unit-free coordinates.
     """
     require_cameras_of_full_rank(P)
     cameras = np.linalg.inv(unit) @ P

@@ -56,18 +56,7 @@ class Stratified:
     criterion = RotationCriterion()
 
     def with_images(self, images: Iterable[Image]) -> Stratified:
-        """Return the same method with the images, if the plane is estimated from them.
-
-        Parameters
-        ----------
-        images : iterable of Image
-            One image per view.
-
-        Returns
-        -------
-        Stratified
-            Method with images.
-        """
+        """The same method with one image per view, if the plane is estimated from them."""
         if not isinstance(self.plane, ParallelLines):
             return self
         return replace(self, plane=replace(self.plane, images=tuple(images)))
@@ -87,18 +76,7 @@ class Stratified:
     def locate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
     ) -> F64:
-        """Estimate the plane at infinity alone.
-
-        Parameters
-        ----------
-        reconstruction, prior, rng
-            As in :meth:`thesisrecon.config.SelfCalibrator.calibrate`.
-
-        Returns
-        -------
-        ndarray (4,)
-            Unit-norm plane in the projective frame.
-        """
+        """Estimate the plane at infinity alone: (4,), unit norm, in the projective frame."""
         scene = projective_scene(reconstruction, prior)
         p = self.plane.locate(scene, rng).planes[0]
         plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
@@ -136,24 +114,7 @@ def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruct
 
     Parallelism and ratios of lengths on parallel lines are correct, angles are not. In the affine frame the
     camera with most observations is K [I | 0] with a nominal K (focal length of one long side), and its
-    points have a median depth of 1.
-
-    Parameters
-    ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    plane : ndarray (4,)
-        Plane at infinity; it becomes (0, 0, 0, 1).
-
-    Returns
-    -------
-    Reconstruction
-        Affine reconstruction with X[:, 3] = 1; points on the plane at infinity become invalid.
-
-    Raises
-    ------
-    ValueError
-        If the reconstruction is not projective, or the plane is zero or not finite.
+    points have a median depth of 1 and X4 = 1; points on the plane at infinity become invalid.
     """
     if reconstruction.stratum != "projective":
         raise ValueError(f"upgrade_to_affine takes a projective reconstruction; got {reconstruction.stratum}")
@@ -196,17 +157,6 @@ def _facing(affine: Reconstruction) -> F64:
 
 
 def with_images(method: M, images: Sequence[Image]) -> M:
-    """Give the images to a self-calibration method that detects parallel lines in them.
-
-    Parameters
-    ----------
-    method, images : SelfCalibrator, sequence of Image
-        Any method, and one image per view or none.
-
-    Returns
-    -------
-    SelfCalibrator
-        The method with the images, or unchanged if it does not use them.
-    """
+    """Give the images, one per view, to a self-calibration method that detects parallel lines in them."""
     given = getattr(method, "with_images", None)
     return method if given is None or not images else cast(M, given(images))
