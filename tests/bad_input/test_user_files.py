@@ -21,7 +21,7 @@ from thesisrecon.cli.main import run_command
 from thesisrecon.cli.view_files import ViewSequence
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _frames
-from thesisrecon.pipeline._outputs import RESULT_FILES
+from thesisrecon.pipeline.outputs import RESULT_FILES
 
 pytestmark = pytest.mark.usefixtures("bounded")
 

@@ -13,7 +13,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import images_folder, read_images
 from thesisrecon.io._models import read_model
-from thesisrecon.pipeline._given import views_of
+from thesisrecon.pipeline.inputs import views_of
 from thesisrecon.records import Image
 from thesisrecon.results import SparseModel, SparseView
 

@@ -14,7 +14,7 @@ from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.io._images import demo_images
 from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.pipeline import _matching_stages
+from thesisrecon.pipeline import matching
 from thesisrecon.records import Features
 
 
@@ -53,7 +53,7 @@ def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path,
         assert np.abs(part.xy2 - every.features[part.j].xy[part.index2]).max() < 10.0
     for name, value in (("MIN_VERIFIED", 10**6), ("has_narrow_cut", lambda _: True)):
         with monkeypatch.context() as patch:
-            patch.setattr(_matching_stages, name, value)
+            patch.setattr(matching, name, value)
             again = pairs(name, 2).pairs
         for whole, pair in zip(every.pairs, again, strict=True):
             assert np.array_equal(whole.index1, pair.index1)

@@ -17,7 +17,7 @@ from thesisrecon import reconstruct, reconstruct_from_tracks
 from thesisrecon.geometry.critical_motions import UpgradedCameras, measure_motion, nearest_critical_motion
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.pipeline._core_views import restrict_views
+from thesisrecon.pipeline.large_sets import restrict_views
 from thesisrecon.records import IdentifiabilityReport
 from thesisrecon.selfcalibration._identifiability import check_identifiability
 

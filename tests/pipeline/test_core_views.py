@@ -10,7 +10,7 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import prior_for
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.pipeline._core_views import (
+from thesisrecon.pipeline.large_sets import (
     CORE_VIEWS,
     MAX_CORES,
     calibrate_with_core,

@@ -15,7 +15,7 @@ from tests.pipeline.given_scene import SIZE, given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._models import read_model
-from thesisrecon.pipeline import _stages
+from thesisrecon.pipeline import stages
 
 SCENE = given_scene()
 ORIENTATIONS = "CREATE TABLE {} (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
@@ -82,7 +82,7 @@ def test_images_give_colours_and_other_sizes_of_work(from_rows):
 
 
 def test_a_run_without_a_folder_holds_all_depth_maps(monkeypatch):
-    monkeypatch.setattr(_stages, "MAP_BYTES", 1)
+    monkeypatch.setattr(stages, "MAP_BYTES", 1)
     images = np.random.default_rng(0).integers(0, 256, (5, 480, 640, 3), np.uint8)
     config = thesisrecon.PipelineConfig(dense=FakeDense())
     result = reconstruct_from_matches(

@@ -13,7 +13,7 @@ from thesisrecon.api import reconstruct as api
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import _matching_stages
+from thesisrecon.pipeline import matching
 
 GROUPS = [range(3), range(3, 7), range(7, 9)]
 
@@ -131,12 +131,12 @@ def test_a_group_that_fails_leaves_the_others_whole(tmp_path):
 def test_a_group_takes_the_pairs_of_the_whole_set_and_not_older_ones(tmp_path, monkeypatch):
     """A pair may be rejected, or matched again, because of images that were added."""
     run(tmp_path)
-    reject = _matching_stages.reject_repeated_structure
+    reject = matching.reject_repeated_structure
 
     def reject_first(pairs, views):
         return [replace(p, accepted=p.accepted and (p.i, p.j) != (0, 1)) for p in reject(pairs, views)]
 
-    monkeypatch.setattr(_matching_stages, "reject_repeated_structure", reject_first)
+    monkeypatch.setattr(matching, "reject_repeated_structure", reject_first)
     run(tmp_path, overwrite=True)
     assert [pair.accepted for pair in load(tmp_path / "group-2").pairs] == [False, True, True]
 

@@ -17,19 +17,20 @@ from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.matching._repeated_structure import reject_repeated_structure
-from thesisrecon.pipeline import _parts
-from thesisrecon.pipeline._parts import (
+from thesisrecon.pipeline import large_sets
+from thesisrecon.pipeline.large_sets import (
     align_parts,
     cameras_from_parts,
+    cameras_on_tracks,
     divide_views,
     has_narrow_cut,
     input_of_part,
     neighbour_graph,
     overlapping_parts,
+    pairs_of_missing,
     reconstruct_part,
 )
-from thesisrecon.pipeline._second_pass import cameras_on_tracks, pairs_of_missing
-from thesisrecon.records import Image, MetricResult, Similarity
+from thesisrecon.records import MetricResult, Similarity
 from thesisrecon.runtime._run import _StageLog, start_run
 
 VIEWS, PART = 72, 45
@@ -77,7 +78,7 @@ def test_a_street_is_cut_into_stretches_that_overlap(scene):
     for k, (views, grown) in enumerate(zip(own, parts, strict=True)):
         ends = (k > 0) + (k < len(own) - 1)
         assert set(views) < set(grown)
-        assert len(grown) - len(views) <= ends * _parts.OVERLAP
+        assert len(grown) - len(views) <= ends * large_sets.OVERLAP
         assert (np.diff(grown) == 1).all()
 
 
@@ -123,16 +124,14 @@ def test_the_result_of_a_part_is_small(scene, models):
 
 
 def test_the_tasks_of_a_run_give_the_parts_that_are_aligned(scene, models, monkeypatch, tmp_path):
-    monkeypatch.setattr(_parts, "reconstruct_part", lambda _, __, number, ___, ____: [models[number]])
+    monkeypatch.setattr(large_sets, "reconstruct_part", lambda _, __, number, ___, ____: [models[number]])
     config = PipelineConfig(images=ImageOptions(part_views=PART))
     _, run, _ = start_run(tmp_path, config, 0, None, {"threads": 1})
     run.logs["tracks"] = run.logs["matches"] = _StageLog()
-    grey = np.zeros(1, np.uint8)
-    images = tuple(Image("", np.broadcast_to(grey, (h, w, 3)), (w, h)) for w, h in scene.sizes)
-    result = SimpleNamespace(tracks=scene.tracks, images=images)
     prior = prior_from_options(IntrinsicsOptions(), [(1, 1)] * VIEWS, np.full(VIEWS, np.nan), np.ones(VIEWS))
-    state = SimpleNamespace(run=run, config=config, result=result, used_pairs=(), prior=prior)
-    found, (own, parts) = cameras_from_parts(state, 1), parts_of(scene, PART)
+    job = SimpleNamespace(run=run, config=config, sizes=scene.sizes, prior=prior)
+    (found, keys), (own, parts) = cameras_from_parts(job, scene.tracks, (), 1), parts_of(scene, PART)
+    assert keys == list(run.logs["metric"].keys.values())
     expected = align_parts(scene.tracks, scene.sizes, own, parts, models)
     assert expected.registered.all()
     for name in ("P", "X", "inlier", "valid", "registered"):
@@ -171,7 +170,7 @@ def test_similarities_of_common_cameras_need_no_centres_off_a_line():
     Cb = np.arange(9.0)[:, None] * np.array([1.0, 0.2, 0.0])
     Ra, Ca = Rb @ true.R.T, true.apply(Cb)
     Ca[4] += 3.0
-    found = _parts._similarity_of_cameras(Ra, Ca, Rb, Cb)
+    found = large_sets._similarity_of_cameras(Ra, Ca, Rb, Cb)
     np.testing.assert_allclose(found.R, true.R, atol=1e-9)
     np.testing.assert_allclose([found.scale, *found.t], [true.scale, *true.t], atol=1e-6)
 

@@ -22,8 +22,8 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
-from thesisrecon.pipeline import _matching_stages, _outputs, _stages, _tiles
-from thesisrecon.pipeline._state import PreparedViews, name_images
+from thesisrecon.pipeline import algorithm1, matching, outputs, stages
+from thesisrecon.pipeline.job import name_images
 from thesisrecon.records import Image
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
@@ -148,7 +148,7 @@ def test_a_run_to_its_end_leaves_a_textured_model(tmp_path):
 
 def test_depth_maps_that_do_not_fit_in_memory_give_the_same_model(tmp_path, monkeypatch):
     run(tmp_path / "a", until="model", threads=1)
-    monkeypatch.setattr(_stages, "MAP_BYTES", 0)
+    monkeypatch.setattr(stages, "MAP_BYTES", 0)
     monkeypatch.setattr(fusion, "GROUP_BYTES", 1)
     result = run(tmp_path / "b", until="model", threads=2)
     assert (tmp_path / "a" / "model.glb").read_bytes() == (tmp_path / "b" / "model.glb").read_bytes()
@@ -162,7 +162,7 @@ def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
     whole = (tmp_path / "a" / "model.glb").read_bytes()
     directory, limit_mb = RunDirectory(tmp_path / "b"), 0.6e-6 * len(whole)
     directory.path.mkdir()
-    (sentence,) = _outputs._write_surface(directory, result, limit_mb, 1)
+    (sentence,) = outputs._write_surface(directory, result, limit_mb, 1)
     assert "1 tile (tiles/tiles.json) hold" in sentence
     assert sentence.endswith("model-full.glb holds all")
     assert (tmp_path / "b" / "model-full.glb").read_bytes() == whole
@@ -170,7 +170,7 @@ def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
     reduced = read_mesh(tmp_path / "b" / "model.glb")
     assert len(reduced.faces) < len(result.mesh.faces)
     np.testing.assert_allclose(reduced.vertices[:, 2], 8.0, atol=0.05)
-    assert _outputs._write_surface(directory, result, 50.0, 1) == []
+    assert outputs._write_surface(directory, result, 50.0, 1) == []
     assert not (tmp_path / "b" / "model-full.glb").exists()
     assert not (tmp_path / "b" / "tiles").exists()
     refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
@@ -184,9 +184,9 @@ def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkey
     result = run(tmp_path / "a", until="model", threads=1, config=of_all_faces())
     directory, mesh = RunDirectory(tmp_path / "b"), result.mesh
     whole = (tmp_path / "a" / "model.glb").stat().st_size
-    monkeypatch.setattr(_tiles, "TILE_FACES", len(mesh.faces) // 2)
-    monkeypatch.setattr(_tiles, "TILE_MB", 0.2e-6 * whole)
-    count = _tiles.write_tiles(directory, mesh, mesh)
+    monkeypatch.setattr(outputs, "TILE_FACES", len(mesh.faces) // 2)
+    monkeypatch.setattr(outputs, "TILE_MB", 0.2e-6 * whole)
+    count = outputs.write_tiles(directory, mesh, mesh)
     coarse, *tiles = read(tmp_path / "b" / "tiles" / "tiles.json")["tiles"]
     assert (coarse["file"], coarse["level"], coarse["faces"]) == ("../model.glb", 0, len(mesh.faces))
     assert len(tiles) == count > 4
@@ -212,7 +212,7 @@ def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path
     config = of_all_faces()
     object.__setattr__(config.model, "max_glb_mb", 0.03)
     monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
-    monkeypatch.setattr(_tiles, "TILE_FACES", 500)
+    monkeypatch.setattr(outputs, "TILE_FACES", 500)
     result = run(out, until="model", config=config)
     tiles = {path.name for path in (out / "tiles").iterdir()}
     assert len(tiles) > 3
@@ -448,7 +448,7 @@ def test_a_large_set_is_divided_once_whichever_attempt_is_the_first_to_be_calibr
     tmp_path, monkeypatch, failed
 ):
     divided = []
-    monkeypatch.setattr(_stages, "cameras_from_parts", lambda *_: divided.append(len(CALLS)))
+    monkeypatch.setattr(algorithm1, "cameras_from_parts", lambda *_: (divided.append(len(CALLS)), []))
     untrusted = fakes.FakeMetric(trusted_from=9)
     run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=failed), metric=untrusted))
     assert len(divided) == 1
@@ -531,16 +531,16 @@ def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
 def test_the_final_pairs_are_read_back(tmp_path, monkeypatch):
     """One is matched again from oblique views, and one is rejected because of the others."""
 
-    def oblique(state):
-        return PreparedViews(lambda _, features: replace(features, xy=features.xy + 1.0), state.given())
+    def oblique(_config, _image, features):
+        return replace(features, xy=features.xy + 1.0)
 
     def reject(pairs, _):
         return [*pairs[:-1], replace(pairs[-1], accepted=False, reason="repeated structure")]
 
     with monkeypatch.context() as patch:
-        patch.setattr(_matching_stages, "pairs_to_connect", lambda *_: [1])
-        patch.setattr(_matching_stages, "_prepared_oblique", oblique)
-        patch.setattr(_matching_stages, "reject_repeated_structure", reject)
+        patch.setattr(matching, "pairs_to_connect", lambda *_: [1])
+        patch.setattr(matching, "prepare_oblique", oblique)
+        patch.setattr(matching, "reject_repeated_structure", reject)
         result = run(tmp_path, until="matches", threads=1)
     np.testing.assert_allclose(result.pairs[1].xy2, result.features[2].xy + 1.0)
     assert [pair.accepted for pair in result.pairs] == [True] * 5 + [False]

@@ -24,9 +24,9 @@ from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
-from thesisrecon.pipeline import _matching_stages, _stages
-from thesisrecon.pipeline import _state as preparing
-from thesisrecon.pipeline._state import PreparedViews, batch_pairs
+from thesisrecon.pipeline import matching, stages
+from thesisrecon.pipeline import matching as preparing
+from thesisrecon.pipeline.matching import PreparedViews, batch_pairs
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 
@@ -266,15 +266,15 @@ def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
     images = sorted(COURTYARD.iterdir())[4:8]
     result = reconstruct(images, tmp_path, config=config, until="dense", threads=1, executor=recorder)
     corners = [len(features.xy) for features in result.features]
-    batches = recorder.found[_matching_stages._match_all]
+    batches = recorder.found[matching._match_all]
     assert 1 < len(batches) < 6
     for (_, _, pairs, _), answer in batches:
         matches = sum(min(corners[i], corners[j]) for i, j in pairs)
         bound = preparing.PAIR_BYTES * len(pairs) + preparing.MATCH_BYTES * matches
         assert len(answer) <= bound <= largest
-    for (_, answer), image in zip(recorder.found[_stages._depths], result.images, strict=True):
+    for (_, answer), image in zip(recorder.found[stages._depths], result.images, strict=True):
         assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
-    assert set(recorder.found) == {_matching_stages._detect, _matching_stages._match_all, _stages._depths}
+    assert set(recorder.found) == {matching._detect, matching._match_all, stages._depths}
 
 
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])

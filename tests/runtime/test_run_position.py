@@ -12,7 +12,7 @@ from thesisrecon import reconstruct
 from thesisrecon.cli.main import run_command
 from thesisrecon.io._files import write_json
 from thesisrecon.io._outputs import LOCK_FILE
-from thesisrecon.pipeline import _steps
+from thesisrecon.pipeline import algorithm1
 from thesisrecon.records import PairChoice, StageReport
 from thesisrecon.runtime._run_folder import RunDirectory, StageFolder
 from thesisrecon.runtime._run_position import run_position
@@ -72,7 +72,7 @@ def test_records_of_a_replaced_run_are_not_counted(tmp_path, monkeypatch):
     assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
     # Killed while it compiles: what the run had done before still counts.
     with monkeypatch.context() as patch:
-        patch.setattr(_steps, "precompile", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(algorithm1, "precompile", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             run(5, seed=1)
     assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"

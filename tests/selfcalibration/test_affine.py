@@ -12,7 +12,7 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.pipeline._outputs import write_affine
+from thesisrecon.pipeline.outputs import write_affine
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
@@ -20,7 +19,8 @@ from thesisrecon.io._images import images_folder
 from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
-from thesisrecon.pipeline._given import (
+from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
+from thesisrecon.pipeline.inputs import (
     Given,
     PairMatches,
     Views,
@@ -28,17 +28,9 @@ from thesisrecon.pipeline._given import (
     given_matches,
     given_tracks,
     outside_masks,
-    take_corners,
-    take_pairs,
-    take_tracks,
-    verify_pairs,
     views_of,
 )
-from thesisrecon.pipeline._matching_stages import split_groups
-from thesisrecon.pipeline._outputs import REPLACED_FILES
-from thesisrecon.pipeline._stages import build_tracks
-from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
+from thesisrecon.pipeline.job import Job
 from thesisrecon.records import Tracks
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Progress, RunOptions, start_run
@@ -292,19 +284,7 @@ def _reconstruct(
                         warnings.append(USELESS_MASKS)
                 given = outside_masks(at_working_size(given, inputs.images), inputs.images)
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
-            result = empty_result(run, inputs)
-            state = PipelineState(run, inputs, result, until)
-            identity = identity_of(run, inputs, source)
-            run.directory.adopt(identity, overwrite=overwrite, results=REPLACED_FILES)
-            found = run_steps(state, _steps(given, until), surface_required=requested)
+            job = Job(run, inputs, given, until, requested)
+            found = run_adopted(job, overwrite=overwrite, source=source)
         # All depth maps are read: the folder is removed.
         return found if out is not None else replace(found, out=None, depth_maps=found.depth_maps[:])
-
-
-def _steps(given: Given, until: str) -> list[Any]:
-    """The steps of Algorithm 1, the first ones replaced."""
-    tracks = build_tracks if given.tracks is None else partial(take_tracks, given)
-    front = [partial(take_corners, given), partial(take_pairs, given), partial(verify_pairs, given)]
-    # Given tracks are not divided into groups.
-    rest = [step for step in STEPS[until][3:] if step is not split_groups or given.tracks is None]
-    return [*front[: len(STEPS[until])], *(tracks if step is build_tracks else step for step in rest)]

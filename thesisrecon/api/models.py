@@ -20,8 +20,7 @@ from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model
 from thesisrecon.io._positions import read_positions
-from thesisrecon.pipeline._loading import load_run
-from thesisrecon.pipeline._outputs import folder_with, save_result
+from thesisrecon.pipeline.outputs import folder_with, load_run, save_result
 from thesisrecon.records import Similarity
 from thesisrecon.results import SUMMARY, RunResult, SparseModel
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord

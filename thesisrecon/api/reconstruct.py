@@ -16,9 +16,9 @@ from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
 from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
 from thesisrecon.matching.pair_selection import ListedPairs
-from thesisrecon.pipeline._outputs import REPLACED_FILES
-from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.pipeline._steps import STEPS, claimed, empty_result, identity_of, run_steps
+from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
+from thesisrecon.pipeline.job import Job
+from thesisrecon.pipeline.matching import FromImages
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 
@@ -131,9 +131,8 @@ def reconstruct(
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             listed.check([image.name for image in inputs.images], inputs.refused)
-        state = PipelineState(run, inputs, empty_result(run, inputs), until)
-        run.directory.adopt(identity_of(run, inputs, source), overwrite=overwrite, results=REPLACED_FILES)
-        return run_steps(state, STEPS[until], surface_required=surface_required)
+        job = Job(run, inputs, FromImages(), until, surface_required)
+        return run_adopted(job, overwrite=overwrite, source=source)
 
 
 def _frame_source(images: ImageSource, every: int, run: Run) -> FrameSource:

@@ -7,7 +7,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.io._images import is_rgba, read_levels
-from thesisrecon.pipeline._image_pair import ImageInput
+from thesisrecon.pipeline.image_pair import ImageInput
 from thesisrecon.records import (
     DisparityMap,
 )

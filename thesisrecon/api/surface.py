@@ -17,7 +17,7 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.io._images import list_images, read_image, rotation_words
-from thesisrecon.pipeline._image_pair import ImageInput
+from thesisrecon.pipeline.image_pair import ImageInput
 from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks, require_mesh
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
 from thesisrecon.surface.model import SurfaceModel

@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.api.reconstruct import reconstruct
-from thesisrecon.pipeline import _matching_stages, _parts, _stages
-from thesisrecon.pipeline._state import PreparedViews, batch_pairs
+from thesisrecon.pipeline import large_sets, matching, stages
+from thesisrecon.pipeline.matching import PreparedViews, batch_pairs
 from thesisrecon.runtime._executors import AHEAD
 from thesisrecon.runtime._run import Until
 from validation.runs.processes import call_apart
@@ -33,9 +33,9 @@ from validation.runs.tables import text_table
 from validation.studies.growth_of_cost import write_scene
 
 STAGES: Mapping[Callable[..., Any], str] = {
-    _matching_stages._detect: "features",
-    _parts.reconstruct_part: "parts",
-    _stages._depths: "depth maps",
+    matching._detect: "features",
+    large_sets.reconstruct_part: "parts",
+    stages._depths: "depth maps",
 }
 """Function of a task -> stage."""
 PREPARATIONS = {"prepare": "matches", "prepare_oblique": "oblique matches"}
@@ -79,7 +79,7 @@ class Matching:
                     self.views[view] = Task(used, len(pickle.dumps(views.subset([view]), 5)), 0)
                     self.corners[view] = len(views._given[view][1].xy)
             start = time.process_time()
-            one = _matching_stages._match_all(config, views, [pair], seed)
+            one = matching._match_all(config, views, [pair], seed)
             self.pairs[pair] = Task(time.process_time() - start, 0, len(pickle.dumps(one, 5)))
             found += one
         return found
@@ -110,7 +110,7 @@ class TaskMeter(Executor):
         """Run ``fn(key, pickled task)``, as :class:`thesisrecon.runtime._executors.Workers` submits it."""
         start, answer = time.process_time(), Future[Any]()
         function, given = pickle.loads(args[1])
-        if function is _matching_stages._match_all:
+        if function is matching._match_all:
             prepare = given[1]._prepare
             stage = PREPARATIONS[getattr(prepare, "func", prepare).__name__]
             answer.set_result(pickle.dumps(self.matching.setdefault(stage, Matching()).run(*given), 5))
@@ -175,8 +175,8 @@ def efficiency_table(serial_s: float, by_workers: Mapping[int, Mapping[str, Sequ
         return [cell for s in paths for cell in (f"{s:.1f}", f"{work_s / max(workers * s, 1e-9):.2f}")]
 
     for stage in work:
-        for workers, stages in by_workers.items():
-            tasks = stages[stage]
+        for workers, found in by_workers.items():
+            tasks = found[stage]
             paths = [critical_path(tasks, workers, speed) for speed in (math.inf, LINE)]
             whole[workers] = [total + s for total, s in zip(whole[workers], paths, strict=True)]
             largest = [

@@ -14,7 +14,7 @@ import numpy as np
 
 from thesisrecon.config import PipelineConfig
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
+from thesisrecon.pipeline.large_sets import calibrate_with_core, calibrated_part
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.runtime._run import stream
 from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error

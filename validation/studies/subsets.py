@@ -21,7 +21,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.pipeline._stages import ATTEMPTS
+from thesisrecon.pipeline.algorithm1 import ATTEMPTS
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream
 from validation.runs.study import Part, report_progress

@@ -17,7 +17,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.geometry.two_view import symmetric_residuals
-from thesisrecon.pipeline._image_pair import match_images
+from thesisrecon.pipeline.image_pair import match_images
 from thesisrecon.records import TwoView
 from validation.references.sift import affine_sift_front_end, sift_front_end
 from validation.runs.study import Part, pick, report_progress

@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io._images import read_images
-from thesisrecon.pipeline._image_pair import match_views
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.epipolar import RIGHT_PX, rms_epipolar_distance

@@ -1,13 +1,20 @@
-"""Many images in overlapping parts: each is reconstructed alone, all are aligned and then adjusted together.
+"""Large and difficult sets: calibration of a core of views, overlapping parts, and a second pass.
+
+Drift and wrong tracks bend projective reconstructions of long sequences, so that no calibration places the
+points in front of all cameras. Neighbouring views still determine one; the metric stage registers the others.
 
 Parts are independent tasks. Wrong matches between two similar places cannot deform a part that contains only
 one of them, and a part that fails does not affect the others: its images are registered after the alignment.
+
+A few matches are not enough to verify the epipolar geometry of a pair. If they lead to points of the model, a
+camera must explain them with twice as many equations: the second pass uses them for missing images only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -15,16 +22,26 @@ import scipy
 from thesisrecon._code_digest import code_digest
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import project_camera
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.similarity import nearest_rotation
+from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.matching._repeated_structure import strong_pairs
-from thesisrecon.pipeline._core_views import calibrate_with_core, calibrated_part
-from thesisrecon.pipeline._state import PipelineState
-from thesisrecon.records import Reconstruction, Similarity, Tracks, TwoView
+from thesisrecon.matching._repeated_structure import reject_repeated_structure, strong_pairs
+from thesisrecon.pipeline.job import Job
+from thesisrecon.records import (
+    MetricResult,
+    Reconstruction,
+    SelfCalibration,
+    Similarity,
+    Tracks,
+    TwoView,
+    Upgrade,
+)
 from thesisrecon.runtime._run import Batch, stream
 
+CORE_VIEWS, MAX_CORES = 5, 8
+"""Views of a core, and number of cores that are tried."""
 MAX_CUT = 0.1
 """Largest fraction of the common points of a part that a cut may sever; images of a single place have no such
 cut."""
@@ -38,26 +55,94 @@ MAX_OFFSET_REL = 0.005
 """Largest distance, relative to the long side, between the projections of a point that two parts agree on."""
 MIN_AGREEMENT = 0.5
 """Fraction of the common points that must agree, otherwise two parts are not aligned."""
-ROUNDS = 5
+_Part = tuple[I64, I64, Reconstruction]
+"""Views, points and model of a part."""
 
 
-def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | None:
+def calibrate_with_core(
+    method: SelfCalibrator, projective: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
+) -> SelfCalibration:
+    """Calibrate all views, or a core of them if that fails: the first core that determines the calibration.
+
+    ``K`` is zero for the views that are not in the core. Raises the failure of all views if no core succeeds.
+    """
+    try:
+        return method.calibrate(projective, prior=prior, rng=rng)
+    except StageFailure as failure:
+        found = list[SelfCalibration]()
+        for views in _cores(projective):
+            try:
+                found.append(method.calibrate(restrict_views(projective, views), prior=prior, rng=rng))
+            except StageFailure:
+                continue
+            if found[-1].identifiable:
+                return found[-1]
+        if not found:
+            raise failure from None
+        return found[0]
+
+
+def calibrated_part(projective: Reconstruction, calibration: SelfCalibration) -> Reconstruction:
+    """The reconstruction of the views that have a calibration; itself if all have."""
+    views = projective.registered & (calibration.K[:, 0, 0] > 0.0)
+    return projective if (views == projective.registered).all() else restrict_views(projective, views)
+
+
+def _cores(projective: Reconstruction) -> Iterator[B8]:
+    """Masks (V,) of views: each view, best observed first, with those that share most points with it."""
+    registered = np.flatnonzero(projective.registered)
+    if len(registered) <= CORE_VIEWS:
+        return
+    shared = projective.common_points[np.ix_(registered, registered)]
+    tried = set[bytes]()
+    for first in np.argsort(-shared.diagonal(), kind="stable"):
+        # A view shares most points with itself.
+        nearest = np.argsort(-shared[first], kind="stable")[:CORE_VIEWS]
+        views = np.isin(np.arange(len(projective.registered)), registered[nearest])
+        if views.tobytes() not in tried:
+            tried.add(views.tobytes())
+            yield views
+        if len(tried) == MAX_CORES:
+            return
+
+
+def restrict_views(reconstruction: Reconstruction, views: B8) -> Reconstruction:
+    """The reconstruction of some registered views, with the points that two or more of them see."""
+    t = reconstruction.tracks
+    inlier = reconstruction.inlier & views[t.view_index]
+    valid = reconstruction.valid & (np.bincount(t.point_index[inlier], minlength=t.n_points) >= 2)
+    return replace(
+        reconstruction,
+        registered=views,
+        valid=valid,
+        inlier=inlier & valid[t.point_index],
+        P=np.where(views[:, None, None], reconstruction.P, 0.0),
+        X=np.where(valid[:, None], reconstruction.X, 0.0),
+    )
+
+
+def cameras_from_parts(
+    job: Job, tracks: Tracks, pairs: Sequence[TwoView], attempts: int
+) -> tuple[Reconstruction | None, list[str]]:
     """Reconstruct a large set in parts and align them; None if it is not divided or no part succeeds.
 
-    A part is stored when it is finished.
+    A part is stored when it is finished. Also returns the keys of the parts.
     """
-    run, config, tracks = state.run, state.config, state.result.tracks
-    assert tracks is not None
+    run, config = job.run, job.config
     if not 0 < config.images.part_views < int((np.bincount(tracks.view_index) > 0).sum()):
-        return None
+        return None, []
     graph = neighbour_graph(tracks)
     own = divide_views(graph, config.images.part_views)
     if len(own) < 2:
-        return None
+        return None, []
     parts = overlapping_parts(graph, own)
-    sizes = np.array([image.size for image in state.result.images], dtype=np.int64)
     variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
-    code, upstream, prior = code_digest(reconstruct_part), run.logs["tracks"].keys, state.prior
+    code, upstream, prior, sizes = (
+        code_digest(reconstruct_part),
+        run.logs["tracks"].keys,
+        job.prior,
+        job.sizes,
+    )
     inputs = [sizes, prior.mean, prior.std, prior.shared, prior.kind]
     keys = {
         f"part-{n}": run.key("metric", variants, code, upstream, *inputs, views, run.seed)
@@ -66,11 +151,12 @@ def cameras_from_parts(state: PipelineState, attempts: int) -> Reconstruction | 
 
     def batches(missing: Sequence[int]) -> Iterator[Batch]:
         for n in missing:
-            given = input_of_part(tracks, state.used_pairs, sizes, prior, parts[n])
+            given = input_of_part(tracks, pairs, sizes, prior, parts[n])
             yield [n], (config, given, n, run.seed, attempts)
 
     models: Sequence[Reconstruction] = run.map_cached("metric", keys, reconstruct_part, batches)
-    return align_parts(tracks, sizes, own, parts, models)
+    aligned = align_parts(tracks, sizes, own, parts, models)
+    return aligned, [] if aligned is None else list(run.logs["metric"].keys.values())
 
 
 def neighbour_graph(tracks: Tracks) -> scipy.sparse.csr_array:
@@ -263,15 +349,13 @@ def align_parts(
                     )
                 agreeing, found = links[a, b]
                 if agreeing and (best is None or agreeing > best[0]):
-                    best = agreeing, b, _compose(placed[a], found)
+                    near = placed[a]
+                    t = near.apply(found.t)
+                    best = agreeing, b, Similarity(near.scale * found.scale, near.R @ found.R, t)
         if best is None:
             break
         placed[best[1]] = best[2]
     return _in_one_frame(tracks, sizes, own, list(zip(parts, points, models, strict=True)), placed)
-
-
-_Part = tuple[I64, I64, Reconstruction]
-"""Views, points and model of a part."""
 
 
 def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
@@ -321,7 +405,7 @@ def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
     are left out in each round.
     """
     use = np.ones(len(Ra), dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(5):
         R = nearest_rotation(np.einsum("nji,njk->ik", Ra[use], Rb[use]))
         a, b = Ca - np.median(Ca[use], axis=0), (Cb - np.median(Cb[use], axis=0)) @ R.T
         scale = float(
@@ -335,11 +419,6 @@ def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
             break
         use = new
     return Similarity(scale, R, t)
-
-
-def _compose(a: Similarity, b: Similarity) -> Similarity:
-    """The similarity X -> a(b(X))."""
-    return Similarity(a.scale * b.scale, a.R @ b.R, a.scale * a.R @ b.t + a.t)
 
 
 def _in_one_frame(
@@ -413,3 +492,68 @@ def _reprojection_px(model: Reconstruction) -> F64:
                 xy = project_camera(K, Rt[:, :3], Rt[:, 3], X, distortion=model.distortion[view])
             distance[rows] = np.nan_to_num(np.linalg.norm(xy - t.xy[rows], axis=1), nan=np.inf)
     return distance
+
+
+def pairs_of_missing(pairs: Sequence[TwoView], missing: B8) -> list[TwoView]:
+    """The accepted pairs, and the rejected ones of missing images whose matches mostly agree with one F.
+
+    Pairs that were rejected as repeated structure stay rejected.
+    """
+
+    def of_use(pair: TwoView) -> bool:
+        agree = pair.inliers >= 0.5 * pair.candidates
+        return bool(pair.configuration) and agree and bool(missing[pair.i] or missing[pair.j])
+
+    more = [
+        p if p.accepted else replace(p, accepted=True, reason="") for p in pairs if p.accepted or of_use(p)
+    ]
+    return [pair for pair in reject_repeated_structure(more, len(missing)) if pair.accepted]
+
+
+def register_more(
+    job: Job,
+    views: Sequence[Any],
+    pairs: Sequence[TwoView],
+    calibration: SelfCalibration,
+    metric: MetricResult,
+    attempt: int,
+) -> MetricResult:
+    """Register missing images; return the old model if none is added or the new one is not trusted."""
+    run, more = job.run, pairs_of_missing(pairs, ~metric.reconstruction.registered)
+    if len(more) <= sum(pair.accepted for pair in pairs):
+        return metric
+
+    def register() -> MetricResult:
+        rng, workers, old = stream(run.seed, "metric", attempt, 1), run.workers, metric.reconstruction
+        tracks = job.config.tracks.build(views, more, map_all=workers.map_all, rng=rng)
+        start, known = cameras_on_tracks(old, tracks), from_metric(old, calibration)
+        try:
+            new = job.config.metric.refine(start, known, prior=job.prior, rng=rng, threads=workers.threads)
+        except StageFailure:
+            return metric
+        before, after = old.registered, new.reconstruction.registered
+        joined = after.sum() > before.sum() and (before <= after).all()
+        return new if joined and new.trusted >= metric.trusted else metric
+
+    key = run.key(
+        "metric", run.logs["metric"].keys[f"attempt-{attempt}"], run.variant_key("tracks"), run.seed
+    )
+    found: MetricResult = run.cached("metric", f"attempt-{attempt}-more", key, register)
+    return found
+
+
+def cameras_on_tracks(metric: Reconstruction, tracks: Tracks) -> Reconstruction:
+    """Metric cameras with the points of other tracks, triangulated without distortion."""
+    seen = metric.registered[tracks.view_index]
+    view, point, xy = tracks.view_index[seen], tracks.point_index[seen], tracks.xy[seen]
+    X = triangulate_observations(metric.P, view, point, xy, tracks.n_points)
+    valid = np.bincount(point, minlength=tracks.n_points) >= 2
+    inlier = seen & valid[tracks.point_index]
+    return replace(metric, X=X, valid=valid, inlier=inlier, tracks=tracks)
+
+
+def from_metric(metric: Reconstruction, calibration: SelfCalibration) -> SelfCalibration:
+    """The self-calibration with the cameras of a metric reconstruction as its only candidate."""
+    assert metric.K is not None
+    only = Upgrade(np.eye(4), metric.K, 0.0, calibration.candidates[0].method)
+    return replace(calibration, metric_from_projective=np.eye(4), K=metric.K, candidates=(only,))

@@ -1,10 +1,11 @@
-"""Output files of a run: COLMAP model, points, cameras, surface model, summary and report."""
+"""Output files of a run, written and read back: COLMAP model, points, cameras, surface, summary, report."""
 
 from __future__ import annotations
 
 import resource
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
@@ -14,31 +15,34 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon._threads import ThreadPool
-from thesisrecon.arrays import F32, U8
+from thesisrecon.arrays import F32, I64, U8
 from thesisrecon.camera import finite_cameras
 from thesisrecon.config.text import toml_from_config
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
 from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import as_read, read_json, write_atomically, write_json, write_text
-from thesisrecon.io._meshes import glb_bytes
+from thesisrecon.io._images import image_without_pixels
+from thesisrecon.io._meshes import box_in_file, glb_bytes
 from thesisrecon.io._outputs import claim_folder
-from thesisrecon.pipeline._state import name_images
-from thesisrecon.pipeline._tiles import TILE_FILES, TILES, write_tiles
-from thesisrecon.records import Reconstruction, TexturedMesh
+from thesisrecon.pipeline.job import name_images
+from thesisrecon.pipeline.matching import final_pairs
+from thesisrecon.records import Image, Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult
-from thesisrecon.runtime._run import Run, Until
-from thesisrecon.runtime._run_folder import RUN_FILE, RunDirectory
+from thesisrecon.runtime._run import FOLDERS, Run, Until
+from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirectory, StageFolder
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
+from thesisrecon.surface._mesh import halve_surface
 from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.texture_atlas import TextureAtlas, cut_tile
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
-PAGE = "report.html"
+PAGE, TILES = "report.html", "tiles/tiles.json"
+TILE_FILES = (TILES, "tiles/tile-[0-9]*.glb")
 SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
@@ -47,6 +51,8 @@ REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FIL
 CONFIG = "config.toml"
 WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (CONFIG, RUN_FILE)))
 """Files that a run writes beside the results of its stages."""
+TILE_FACES, TILE_MB = 100_000, 10.0
+"""Largest number of faces and largest size of a tile in megabytes (10^6 bytes)."""
 MAX_AFFINE = 1e3
 """Largest affine coordinate in affine.ply, in median depths of the best observed view."""
 
@@ -344,3 +350,105 @@ def _thinned_maps(result: RunResult) -> dict[int, F32]:
             step = max(1, -(-max(depth.shape) // DEPTH_PX))
             maps[view.view] = depth[::step, ::step].copy()
     return maps
+
+
+def write_tiles(directory: RunDirectory, whole: TexturedMesh, coarse: TexturedMesh) -> int:
+    """Write a mesh in tiles, and their list with ``coarse``, the mesh of model.glb; return their number.
+
+    Boxes are halved across their longest side until each tile is small enough.
+    """
+    folder = directory.path / "tiles"
+    entries = [{"file": "../model.glb", "level": 0, "faces": len(coarse.faces), "box": box_in_file(coarse)}]
+    open_ = _halves(whole, np.arange(len(whole.faces)), TILE_FACES)
+    while open_:
+        faces = open_.pop()
+        tile = cut_tile(whole, faces)
+        content = glb_bytes(tile)
+        if len(content) > 1e6 * TILE_MB and len(faces) > 1:
+            open_ += _halves(tile, faces, -(-len(faces) // 2))
+            continue
+        path = folder / f"tile-{len(entries) - 1:04d}.glb"
+        write_atomically(path, content)
+        entries.append({"file": path.name, "level": 1, "faces": len(faces), "box": box_in_file(tile)})
+    write_json(directory.path / TILES, {"tiles": entries})
+    return len(entries) - 1
+
+
+def _halves(mesh: TexturedMesh, faces: I64, largest: int) -> list[I64]:
+    """Divide the numbers ``faces`` (M,) of faces into parts of at most ``largest``, in reverse order."""
+    part = halve_surface(mesh, np.ones(len(faces), dtype=np.int64), largest)
+    return [faces[part == k] for k in range(part.max(), -1, -1)]
+
+
+def best_result(tried: Sequence[RunResult]) -> RunResult:
+    """The best result: metric before projective, then trusted, then with most cameras, then most points."""
+    return max(tried, key=_quality)
+
+
+def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
+    best = result.best_reconstruction
+    if best is None:
+        return False, False, 0, 0
+    trusted = result.metric is not None and result.metric.trusted
+    return result.metric is not None, trusted, int(best.registered.sum()), int(best.valid.sum())
+
+
+def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
+    # The folders of later stages may be those of a run that this one replaced.
+    finished = {stage: folder / name for stage, name in FOLDERS.items() if stage in summary["seconds"]}
+    reports = [StageFolder(path).finished(_keys(path)) for path in finished.values()]
+    stages: dict[str, dict[str, Any]] = {stage: {} for stage in FOLDERS}
+    stages |= {stage: _records(path) for stage, path in finished.items() if stage != "dense"}
+    views, projective = summary["cameras"], list(stages["projective"].values())
+    sizes = projective[0].sizes if projective else [_working_size(view) for view in views]
+    names = [view["name"] for view in views]
+    unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
+    features = tuple(stages["features"].values())
+    result = RunResult(
+        out=folder,
+        images=tuple(_image(view, size) for view, size in zip(views, sizes, strict=True)),
+        unread=unread,
+        features=features,
+        pairs=final_pairs(stages["matches"], features),
+        groups=np.array([view["camera"] for view in views], dtype=np.int64),
+        settings=run["settings"],
+        pair_choice=stages["pairs"].get("choice"),
+        tracks=stages["tracks"].get("tracks"),
+        mesh=stages["model"].get("model"),
+        held_out=stages["model"].get("held-out"),
+        reports=tuple(report for report in reports if report is not None),
+        warnings=tuple(summary["warnings"]),
+        summary=summary,
+        failure=summary["failure"] or "",
+    )
+    attempts = [
+        replace(
+            result,
+            projective=stages["projective"][item],
+            calibration=stages["selfcalibration"].get(item),
+            metric=stages["metric"].get(f"{item}-more", stages["metric"].get(item)),
+        )
+        for item in stages["projective"]
+    ]
+    return with_image_names(best_result(attempts or [result]))
+
+
+def _keys(folder: Path) -> dict[str, str]:
+    content = read_json(folder / MANIFEST_FILE)
+    return dict(content["keys"]) if isinstance(content, dict) else {}
+
+
+def _records(folder: Path) -> dict[str, Any]:
+    """Item -> record of a stage, in order of the items."""
+    stage = StageFolder(folder)
+    found = {item: stage.load(item, key) for item, key in sorted(_keys(folder).items())}
+    return {item: record for item, record in found.items() if record is not None}
+
+
+def _working_size(view: Mapping[str, Any]) -> I64:
+    return np.array([int(view[side] * view["working_scale"] + 1e-9) for side in ("width_px", "height_px")])
+
+
+def _image(view: Mapping[str, Any], size: I64) -> Image:
+    grey = image_without_pixels(view["name"], (int(size[0]), int(size[1])))
+    return Image(grey.name, grey.rgb, (view["width_px"], view["height_px"]))

@@ -20,11 +20,10 @@ from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels,
 from thesisrecon.matching._prepared import select_matches
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
-from thesisrecon.pipeline._image_pair import values_at, verify_matches
-from thesisrecon.pipeline._matching_stages import finish_matches
-from thesisrecon.pipeline._parts import tracks_of_part
-from thesisrecon.pipeline._stages import finish_tracks, require_accepted_pair
-from thesisrecon.pipeline._state import PipelineState
+from thesisrecon.pipeline.image_pair import values_at, verify_matches
+from thesisrecon.pipeline.job import Job
+from thesisrecon.pipeline.large_sets import tracks_of_part
+from thesisrecon.pipeline.matching import FromImages, report_choice, report_matches, report_tracks
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
 from thesisrecon.runtime._run import Batch, Run, stream
 from thesisrecon.runtime._run_folder import key_of
@@ -39,11 +38,70 @@ MIN_COMMON_POINTS = 16
 
 @dataclass(frozen=True)
 class Given:
-    """Corners (N_i, 2) of V views in working pixels, their matches, and the tracks; None: to be built."""
+    """The front end that takes corners (N_i, 2) of V views, their matches, and tracks; None: to be built."""
 
     corners: Sequence[F64]
     matches: Sequence[Matches]
     tracks: Tracks | None = None
+
+    @property
+    def divides(self) -> bool:
+        """Given tracks are not divided into groups."""
+        return self.tracks is None
+
+    def detect(self, job: Job) -> Sequence[Features]:
+        """The given corners."""
+        run, found = job.run, list[Features]()
+        for i, xy in enumerate(self.corners):
+            ones = np.ones(len(xy), dtype=np.float32)
+            key = run.key("features", "given", xy)
+            found.append(run.cached("features", f"{i:05d}", key, partial(Features, xy, ones, ones)))
+        counts = [len(xy) for xy in self.corners]
+        report = {"images": len(counts), "corners": sum(counts), "fewest_in_one_image": min(counts)}
+        run.finish("features", counts=report)
+        return found
+
+    def prepare(self, job: Job, features: Sequence[Features]) -> Sequence[Any]:
+        """Tracks are built from the corners alone."""
+        return [SimpleNamespace(features=found) for found in features]
+
+    def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
+        """The pairs with given matches."""
+        pairs = np.array([(m.i, m.j) for m in self.matches], dtype=np.int64).reshape(-1, 2)
+        key = job.run.key("pairs", "given", pairs)
+        choice: PairChoice = job.run.cached(
+            "pairs", "choice", key, partial(PairChoice, pairs, "the pairs with matches")
+        )
+        report_choice(job, choice)
+        return choice
+
+    def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
+        """Estimate and verify the epipolar geometry of the given matches (chapter 5)."""
+        run, matches = job.run, self.matches
+        variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
+        given = [[m.xy1, m.xy2, m.index1, m.index2] for m in matches]
+        keys = {
+            f"{m.i:05d}-{m.j:05d}": run.key("matches", "given", variants, content, run.seed)
+            for m, content in zip(matches, given, strict=True)
+        }
+
+        def batches(missing: Sequence[int]) -> Iterator[Batch]:
+            return (([n], (job.config, matches[n], run.seed)) for n in missing)
+
+        return report_matches(job, run.map_cached("matches", keys, _verify, batches))
+
+    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
+        """The given tracks, or those of the matches."""
+        return FromImages().track(job, views, pairs) if self.tracks is None else self.take_tracks(job)
+
+    def take_tracks(self, job: Job, views: Sequence[int] | None = None) -> Tracks:
+        """The given tracks, or those of some views."""
+        tracks, run = self.tracks, job.run
+        assert tracks is not None
+        if views is not None:
+            tracks = tracks_of_part(tracks, np.array(views))
+        key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
+        return report_tracks(run, run.cached("tracks", "tracks", key, lambda: tracks))
 
 
 @dataclass(frozen=True)
@@ -295,62 +353,5 @@ def at_working_size(given: Given, images: Sequence[Image]) -> Given:
     return Given([scaled(xy, s) for xy, s in zip(given.corners, scales, strict=True)], matches, tracks)
 
 
-def take_corners(given: Given, state: PipelineState) -> None:
-    """Set ``result.features`` to the given corners."""
-    run, found = state.run, list[Features]()
-    for i, xy in enumerate(given.corners):
-        ones = np.ones(len(xy), dtype=np.float32)
-        key = run.key("features", "given", xy)
-        found.append(run.cached("features", f"{i:05d}", key, partial(Features, xy, ones, ones)))
-    counts = [len(xy) for xy in given.corners]
-    report = {"images": len(counts), "corners": sum(counts), "fewest_in_one_image": min(counts)}
-    run.finish("features", counts=report)
-    # Tracks are built from the corners alone.
-    state.prepared = [SimpleNamespace(features=features) for features in found]
-    state.result = replace(state.result, features=tuple(found))
-
-
-def take_pairs(given: Given, state: PipelineState) -> None:
-    """Set ``result.pair_choice`` to the pairs with given matches."""
-    run, views = state.run, len(given.corners)
-    pairs = np.array([(m.i, m.j) for m in given.matches], dtype=np.int64).reshape(-1, 2)
-    choice = run.cached(
-        "pairs",
-        "choice",
-        run.key("pairs", "given", pairs),
-        partial(PairChoice, pairs, "the pairs with matches"),
-    )
-    state.result = replace(state.result, pair_choice=choice)
-    run.finish("pairs", counts={"possible": views * (views - 1) // 2, "compared": 0, "chosen": len(pairs)})
-
-
-def verify_pairs(given: Given, state: PipelineState) -> None:
-    """Estimate and verify the epipolar geometry of the given matches (chapter 5); sets ``result.pairs``."""
-    run, matches = state.run, given.matches
-    variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
-    keys = {
-        f"{m.i:05d}-{m.j:05d}": run.key(
-            "matches", "given", variants, m.xy1, m.xy2, m.index1, m.index2, run.seed
-        )
-        for m in matches
-    }
-
-    def batches(missing: Sequence[int]) -> Iterator[Batch]:
-        return (([n], (state.config, matches[n], run.seed)) for n in missing)
-
-    finish_matches(state, run.map_cached("matches", keys, _verify, batches))
-
-
 def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:
     return [verify_matches(config, matches, stream(seed, "matches", matches.i, matches.j))]
-
-
-def take_tracks(given: Given, state: PipelineState) -> None:
-    """Set ``result.tracks`` to the given tracks."""
-    require_accepted_pair(state)
-    tracks, run = given.tracks, state.run
-    assert tracks is not None
-    if state.views is not None:
-        tracks = tracks_of_part(tracks, np.array(state.views))
-    key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
-    finish_tracks(state, run.cached("tracks", "tracks", key, lambda: tracks))

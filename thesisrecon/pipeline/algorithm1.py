@@ -1,0 +1,337 @@
+"""Algorithm 1 of the thesis: from images to cameras, points and a textured model, stage after stage."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.arrays import F64
+from thesisrecon.config.text import tables_from_config
+from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.intrinsics import camera_numbers
+from thesisrecon.io._images import ImageSet
+from thesisrecon.pipeline.job import Job, name_images
+from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, register_more
+from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
+from thesisrecon.pipeline.outputs import (
+    REPLACED_FILES,
+    RESULT_FILES,
+    WRITTEN_FILES,
+    best_result,
+    write_outputs,
+)
+from thesisrecon.pipeline.stages import (
+    build_model,
+    estimate_depth_maps,
+    reconstruct_projective,
+    refine_metric,
+    report_depth_maps,
+    report_metric,
+    report_projective,
+    self_calibrate,
+)
+from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.results import RunResult
+from thesisrecon.runtime._precompilation import precompile
+from thesisrecon.runtime._run import Run
+from thesisrecon.runtime._run_folder import RunDirectory
+
+ATTEMPTS = 3
+"""Maximum number of initial pairs to try until the self-check passes."""
+Source = Mapping[str, str]
+"""Name and digest of the matches or tracks that a run starts from."""
+
+
+def algorithm1(job: Job) -> Iterator[RunResult]:
+    """Yield the result after each stage up to ``job.until``; ``StageFailure`` ends it.
+
+    Of images in several groups that do not overlap, the largest group is reconstructed.
+    """
+    run, front, until = job.run, job.front, job.until
+    job.require_images()
+    precompile(until, run.workers.threads, run.progress)
+    result = empty_result(run, job.inputs)
+
+    # Section 4.2.1: corners and seeds of every image.
+    features = front.detect(job)
+    yield (result := replace(result, features=tuple(features)))
+    if until == "features":
+        return
+
+    # Section 4.2.2 and chapter 5: pairs that may overlap, their matches and fundamental matrices.
+    views = front.prepare(job, features)
+    choice = front.select(job, features)
+    yield (result := replace(result, pair_choice=choice))
+    yield (result := replace(result, pairs=tuple(front.match(job, views, choice))))
+    if until == "matches":
+        return
+
+    # Tracks: the images of one point in several views.
+    pairs = pairs_of_group(job, result.pairs)
+    require_accepted_pair(pairs)
+    tracks = front.track(job, views, pairs)
+    yield (result := replace(result, tracks=tracks))
+
+    # Chapter 6: projective cameras and points.
+    if until == "projective":
+        yield (result := replace(result, projective=reconstruct_projective(job, tracks, pairs)))
+        report_projective(job, result)
+        return
+
+    # Chapter 7: self-calibration and metric refinement.
+    for found in metric_cameras(job, result, views, pairs):
+        yield (result := found)
+    if until == "metric":
+        return
+
+    # Sections 2.5 and 2.6: depth maps, surface and texture.
+    assert result.metric is not None
+    try:
+        maps, undistorted = estimate_depth_maps(job, result.metric.reconstruction)
+        yield (result := replace(result, depth_maps=maps, views=undistorted))
+        report_depth_maps(job, maps)
+        if until == "model":
+            mesh, held_out = build_model(job, maps, undistorted)
+            yield replace(result, mesh=mesh, held_out=held_out)
+    except StageFailure as failure:
+        if job.surface_required:
+            raise
+        run.warnings.append(Notice("no-surface", failure))
+
+
+def metric_cameras(
+    job: Job, result: RunResult, views: Sequence[Any], pairs: Sequence[TwoView]
+) -> Iterator[RunResult]:
+    """Reconstruct, calibrate and refine, from other initial pairs until a result is trusted.
+
+    Then register the images that are still missing, with matches of rejected pairs.
+    """
+    tried, failures = list[RunResult](), list[StageFailure]()
+    for attempt in range(ATTEMPTS):
+        # Large sets are divided once.
+        in_parts = all(other.calibration is None for other in tried)
+        found, failure = last_result(attempt_cameras(job, result, pairs, attempt, in_parts=in_parts), result)
+        tried.append(found)
+        if failure is not None:
+            failures.append(failure)
+        elif found.metric is not None and found.metric.trusted:
+            break
+    best = best_result(tried)
+    yield best
+    report_projective(job, best)
+    if best.metric is None or best.calibration is None:
+        raise failures[0]
+    chosen = next(k for k, other in enumerate(tried) if other is best)
+    metric = register_more(job, views, pairs, best.calibration, best.metric, chosen)
+    report_metric(job, metric)
+    if len(tried) > 1:
+        job.run.warnings.append(Notice("several-starts", len(tried)))
+    yield replace(best, metric=metric)
+
+
+def attempt_cameras(
+    job: Job, result: RunResult, pairs: Sequence[TwoView], attempt: int, *, in_parts: bool
+) -> Iterator[RunResult]:
+    """Chapters 6 and 7 from one initial pair; ``in_parts``: large sets are divided if they can be."""
+    tracks = result.tracks
+    assert tracks is not None
+    projective = reconstruct_projective(job, tracks, pairs, attempt)
+    yield (result := replace(result, projective=projective))
+    calibration = self_calibrate(job, projective, attempt)
+    yield (result := replace(result, calibration=calibration))
+    aligned, keys = None, list[str]()
+    if in_parts:
+        aligned, keys = cameras_from_parts(job, tracks, pairs, ATTEMPTS)
+    start, known = (
+        (calibrated_part(projective, calibration), calibration)
+        if aligned is None
+        else (aligned, from_metric(aligned, calibration))
+    )
+    yield replace(result, metric=refine_metric(job, start, known, attempt, keys))
+
+
+def last_result(stages: Iterator[RunResult], result: RunResult) -> tuple[RunResult, StageFailure | None]:
+    """Run all stages; return the last result, or ``result``, and the failure that ended them."""
+    try:
+        for found in stages:
+            result = found
+    except StageFailure as failure:
+        return result, failure
+    return result, None
+
+
+def pairs_of_group(job: Job, pairs: Sequence[TwoView]) -> Sequence[TwoView]:
+    """The pairs of the largest group of images if there are several groups."""
+    groups = groups_of(job, pairs)
+    return tuple(p for p in pairs if {p.i, p.j} <= set(groups[0])) if groups else pairs
+
+
+def groups_of(job: Job, pairs: Sequence[TwoView]) -> list[list[int]]:
+    """The groups of images that accepted pairs connect, the largest first; none if there is only one."""
+    if not (job.front.divides and job.config.images.groups and any(pair.accepted for pair in pairs)):
+        return []
+    groups = image_groups(len(job.images), pairs)
+    return groups if len(groups) > 1 else []
+
+
+def groups_left_over(job: Job, result: RunResult) -> list[list[int]]:
+    """The groups of images that overlap with each other but are not registered in the model of this job."""
+    model = result.best_reconstruction
+    # A projective run may end at the core of a large set.
+    if (
+        model is None
+        or not model.registered.any()
+        or job.until == "projective"
+        or not job.config.images.groups
+    ):
+        return []
+    return image_groups(len(model.registered), pairs_of_group(job, result.pairs), ~model.registered)
+
+
+def run_job(job: Job) -> RunResult:
+    """Reconstruct the largest group of images, then the rest; write outputs, of failures too."""
+    result, failure = _last_named(job)
+    if job.until not in ("features", "matches"):
+        result = _with_further_models(job, result)
+    result = write_outputs(job.run, result, until=job.until, failure=failure)
+    if failure is not None:
+        raise failure
+    return result
+
+
+def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
+    """The last result of a job; the failure that ended it names images by their files."""
+    result, failure = last_result(algorithm1(job), empty_result(job.run, job.inputs))
+    if failure is not None:
+        parts = (failure.reason, failure.evidence, failure.advice)
+        failure = StageFailure(*(name_images(part, job.names) for part in parts))
+    return result, failure
+
+
+def _with_further_models(job: Job, result: RunResult) -> RunResult:
+    """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
+    run, folder, places = job.run, job.run.directory.path, dict[int, str]()
+    camera = _focals(job, result)
+    pending = deque[tuple[Sequence[int], F64 | None]](
+        (group, None) for group in groups_of(job, result.pairs)[1:]
+    )
+    pending.extend((views, camera) for views in groups_left_over(job, result))
+    while pending:
+        (views, focals), name = pending.popleft(), f"group-{len(run.groups) + 2}"
+        part, found = _run_group(job, result, name, views, focals)
+        pending.extend(([views[k] for k in rest], camera) for rest in groups_left_over(part, found))
+        if (model := found.best_reconstruction) is not None:
+            places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
+    for number in count(len(run.groups) + 2):
+        if not (folder / f"group-{number}" / RESULT_FILES[0]).exists():
+            break
+        RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
+    if not run.groups:
+        return result
+    here = result.best_reconstruction
+    registered = 0 if here is None else int(here.registered.sum())
+    none = len(job.names) - registered - len(places)
+    elsewhere = ", ".join(f"{group['registered']} in {group['folder']}" for group in run.groups)
+    elsewhere += f", {none} in none" if none else ""
+    models = Notice("several-models", len(run.groups) + 1)
+    run.warnings.append(Notice("sizes-of-models", models, counted(registered, "image"), elsewhere))
+    return _with_group_reasons(result, places)
+
+
+def _focals(job: Job, result: RunResult) -> F64 | None:
+    """Focal length and its relative standard deviation (V, 2) from a trusted model; NaN: not estimated."""
+    metric, shared = result.metric, job.prior.group
+    if metric is None or not metric.trusted:
+        return None
+    found = np.full((len(shared), 2), np.nan)
+    for view in np.flatnonzero(metric.reconstruction.registered)[::-1]:
+        focal = metric.intrinsics[view]["focal_px"]
+        found[shared == shared[view]] = focal.value, focal.std / focal.value
+    return found
+
+
+def _run_group(
+    whole: Job, result: RunResult, name: str, views: Sequence[int], focals: F64 | None
+) -> tuple[Job, RunResult]:
+    """Reconstruct a group as a run of its own, and add its entry to the summary of the whole.
+
+    ``focals`` (V, 2) are focal lengths that another model of the same cameras determined, and their relative
+    standard deviations.
+    """
+    directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
+    run = whole.run.inside(directory)
+    inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
+    front = FromRun(whole, views, result.features, result.pairs)
+    own = None if focals is None else focals[list(views)]
+    part = Job(run, inputs, front, whole.until, whole.surface_required, own)
+    identity = identity_of(run, inputs)
+    with directory.claim(identity, overwrite=True):
+        directory.adopt(identity, overwrite=True, results=RESULT_FILES)
+        found, failure = _last_named(part)
+        found = write_outputs(run, found, until=part.until, failure=failure)
+    facts = {fact: found.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
+    model = found.best_reconstruction
+    there = [model is not None and bool(model.registered[k]) for k in range(len(views))]
+    missing = [image for image, registered in zip(part.names, there, strict=True) if not registered]
+    whole.run.groups.append({"folder": name, "names": part.names, "missing": missing, **facts})
+    return part, found
+
+
+def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResult:
+    """The result in which the reason against each image that another model contains is that model."""
+
+    def named(found: Reconstruction) -> Reconstruction:
+        reasons = [
+            Notice("other-group", places[i]) if i in places else reason
+            for i, reason in enumerate(found.reasons)
+        ]
+        return replace(found, reasons=tuple(reasons))
+
+    if result.projective is not None:
+        result = replace(result, projective=named(result.projective))
+    if result.metric is not None:
+        metric = replace(result.metric, reconstruction=named(result.metric.reconstruction))
+        result = replace(result, metric=metric)
+    return result
+
+
+@contextmanager
+def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Iterator[None]:
+    """Start the workers and lock the output folder of a run."""
+    claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite, results=WRITTEN_FILES)
+    with run.workers, claim, run.resumable():
+        yield
+
+
+def run_adopted(job: Job, *, overwrite: bool, source: Source | None = None) -> RunResult:
+    """Make the output folder that of this job, and run it."""
+    identity = identity_of(job.run, job.inputs, source)
+    job.run.directory.adopt(identity, overwrite=overwrite, results=REPLACED_FILES)
+    return run_job(job)
+
+
+def _settings_identity(run: Run, source: Source | None) -> dict[str, Any]:
+    """The part of a run's identity that is known before its images are read."""
+    given = {} if source is None else {"source": source}
+    return {"version": 1, **given, "seed": run.seed, "settings": tables_from_config(run.config)}
+
+
+def identity_of(run: Run, inputs: ImageSet, source: Source | None = None) -> dict[str, Any]:
+    """Settings, seed and content of the images: runs with equal identity are the same."""
+    digests = {p.image.name: p.digest for p in inputs.decoded}
+    refused = {name: f"refused: {reason}" for name, reason in inputs.refused.items()}
+    return _settings_identity(run, source) | {"images": digests | refused}
+
+
+def empty_result(run: Run, inputs: ImageSet) -> RunResult:
+    """The result before the first stage."""
+    sizes = [image.original_size for image in inputs.images]
+    groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
+    settings = tables_from_config(run.config)
+    return RunResult(run.directory.path, inputs.images, inputs.refused, (), (), groups, settings)

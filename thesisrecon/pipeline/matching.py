@@ -1,0 +1,405 @@
+"""The front end of Algorithm 1: features, pairs and matches of many images (chapters 4 and 5), and tracks."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.arrays import B8, rows_of_views
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.imaging.on_demand import RecentlyUsed
+from thesisrecon.matching._prepared import strongest_corners, strongest_share
+from thesisrecon.matching._repeated_structure import reject_repeated_structure
+from thesisrecon.matching.growth import SeedsAndGrowth
+from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
+from thesisrecon.matching.tracks import tracks_of_corners
+from thesisrecon.optimize.bundle.observations import cached_pair_order
+from thesisrecon.pipeline.image_pair import detect_features, match_views, oblique_pairs, prepare_oblique
+from thesisrecon.pipeline.job import Job
+from thesisrecon.pipeline.large_sets import has_narrow_cut
+from thesisrecon.records import Features, Image, PairChoice, Tracks, TwoView
+from thesisrecon.runtime._run import Batch, Run, stream
+
+FEWER, FINAL = "-fewer", "final"
+"""Suffix of the records of pairs matched with part of the corners, and name of the record of final pairs."""
+MIN_VERIFIED = 240
+"""Number of verified matches from part of the corners above which a pair is not matched again with all."""
+MIN_GROUP = 3
+"""Minimum number of images of a group that is reconstructed separately."""
+CACHE_BYTES = 2**30
+"""Prepared views take several times the memory of their image and are quickly prepared again."""
+MAX_BATCH, BATCHES_PER_WORKER, MAX_RESULT_BYTES = 64, 8, 2**25
+"""Pairs of a batch, batches, and pickled bytes of the result of a batch, at most."""
+PAIR_BYTES, MATCH_BYTES = 2**14, 80
+"""Pickled bytes of a :class:`TwoView` without matches, at most, and of each match."""
+Prepare = Callable[[Image, Features], Any]
+
+
+class FromImages:
+    """The front end that computes everything from the images."""
+
+    divides = True
+
+    def detect(self, job: Job) -> Sequence[Features]:
+        """Detect the features of all images."""
+        run, images, variant = job.run, job.images, job.run.variant_key("features")
+        digests = enumerate(image.digest for image in job.inputs.decoded)
+        keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
+
+        def batches(missing: Sequence[int]) -> Iterator[Batch]:
+            return (([i], (job.config, images[i])) for i in missing)
+
+        return report_features(job, run.map_cached("features", keys, _detect, batches))
+
+    def prepare(self, job: Job, features: Sequence[Features]) -> Any:
+        """The views prepared by the matching method, which tracks are aligned with too."""
+        return _prepared(job, features, job.config.matching.prepare)
+
+    def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
+        """Select the pairs of images to match."""
+        run, names = job.run, job.names
+        key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
+        run.progress("pairs", 0, 1)
+        select, rng = job.config.pairs.select, stream(run.seed, "pairs")
+        compute = partial(select, names, features, map_all=run.workers.map_all, rng=rng)
+        choice: PairChoice = run.cached("pairs", "choice", key, compute)
+        report_choice(job, choice)
+        run.progress("pairs", 1, 1)
+        return choice
+
+    def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
+        """Match the pairs and estimate their epipolar geometry; weak ones again with oblique views."""
+        assert isinstance(views, PreparedViews)
+        assert choice is not None
+        pairs = [(int(i), int(j)) for i, j in choice.pairs]
+        found, kinds = _matched_in_turn(job, views, pairs)
+        again = pairs_to_connect(views.features, found, oblique_pairs(job.config))
+        if again:
+            oblique = _prepared(job, views.features, partial(prepare_oblique, job.config))
+            second = _matched(job, oblique, [pairs[n] for n in again], "-oblique")
+            for n, pair in zip(again, second, strict=True):
+                if pair.accepted:
+                    found[n], kinds[n] = pair, "-oblique"
+        final = reject_repeated_structure(found, len(job.images))
+        rejected = {n: pair.reason for n, pair in enumerate(final) if pair is not found[n]}
+        return report_matches(job, final, kinds, rejected)
+
+    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
+        """Build tracks from the accepted pairs."""
+        run, accepted = job.run, [(pair.i, pair.j) for pair in pairs if pair.accepted]
+        key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, accepted, run.seed)
+        build, map_all, rng = job.config.tracks.build, run.workers.map_all, stream(run.seed, "tracks")
+        tracks: Tracks = run.cached(
+            "tracks", "tracks", key, lambda: build(views, pairs, map_all=map_all, rng=rng)
+        )
+        return report_tracks(run, tracks)
+
+
+class FromRun(FromImages):
+    """The front end of some images of another run, from which it takes features and pairs."""
+
+    divides = False
+
+    def __init__(
+        self, whole: Job, views: Sequence[int], features: Sequence[Features], pairs: Sequence[TwoView]
+    ) -> None:
+        self.whole, self.views, self.features, self.pairs = whole, views, features, pairs
+
+    def detect(self, job: Job) -> Sequence[Features]:
+        """The features of the images."""
+        keys = list(self.whole.run.logs["features"].keys.values())
+        found = [
+            job.run.cached("features", f"{k:05d}", keys[i], partial(self.features.__getitem__, i))
+            for k, i in enumerate(self.views)
+        ]
+        return report_features(job, found)
+
+    def prepare(self, job: Job, features: Sequence[Features]) -> Any:
+        """The views as the other run takes them."""
+        return self.whole.front.prepare(job, features)
+
+    def select(self, job: Job, features: Sequence[Features]) -> None:  # type: ignore[override]
+        """No choice: the pairs are those of the other run."""
+
+    def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
+        """The pairs within the images."""
+        run, number = job.run, {view: k for k, view in enumerate(self.views)}
+        keys, found = list(self.whole.run.logs["matches"].keys.values()), list[TwoView]()
+        for key, pair in zip(keys, self.pairs, strict=False):
+            if {pair.i, pair.j} <= number.keys():
+                pair = replace(pair, i=number[pair.i], j=number[pair.j])
+                # The final matches and the decision about a pair depend on all images, not only on its two.
+                content = [pair.index1, pair.index2, pair.xy1, pair.xy2, pair.affine]
+                key = run.key("matches", key, pair.i, pair.j, content, pair.accepted, pair.reason)
+                item = _item(pair.i, pair.j, "")
+                found.append(run.cached("matches", item, key, partial(replace, pair)))
+        return report_matches(job, found)
+
+    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
+        """Build tracks, or take given ones of these images."""
+        front = self.whole.front
+        if getattr(front, "tracks", None) is None:
+            return super().track(job, views, pairs)
+        found: Tracks = front.take_tracks(job, self.views)  # type: ignore[attr-defined]
+        return found
+
+
+class PreparedViews(Sequence[Any]):
+    """Views prepared for matching on demand, in a least-recently-used cache that is never pickled."""
+
+    def __init__(self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]]) -> None:
+        self._prepare, self._given = prepare, dict(given)
+        self._made: RecentlyUsed[int, Any] = RecentlyUsed(CACHE_BYTES)
+
+    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Prepare, dict[int, tuple[Image, Features]]]]:
+        return PreparedViews, (self._prepare, self._given)
+
+    def __len__(self) -> int:
+        return len(self._given)
+
+    def __getitem__(self, view: int) -> Any:  # type: ignore[override]
+        if view not in self._given:
+            raise IndexError(f"view {view} is not among those given")
+        return self._made.get(view, lambda: self._prepare(*self._given[view]))
+
+    @property
+    def features(self) -> list[Features]:
+        """Features of the views."""
+        return [features for _, features in self._given.values()]
+
+    def masks(self, i: int, j: int) -> tuple[B8 | None, B8 | None]:
+        """Masks of two views, None: all pixels."""
+        return self._given[i][0].mask, self._given[j][0].mask
+
+    def subset(self, views: Iterable[int]) -> PreparedViews:
+        """The same for some views, with an empty cache."""
+        return PreparedViews(self._prepare, {view: self._given[view] for view in views})
+
+
+def batch_pairs(
+    pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
+) -> list[list[int]]:
+    """Divide the ``numbers`` of pairs into batches, each of pairs of few different views.
+
+    The smaller view is first in a pair. A corner is matched once in a pair, so the ``corners`` of each view
+    bound the bytes of a result. ``workers`` None: batches of one pair, in an order that reuses cached views.
+    """
+    first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
+    left = {pairs[numbers[k]]: numbers[k] for k in cached_pair_order(first, second)}
+    if workers is None:
+        return [[n] for n in left.values()]
+    size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
+    near: dict[int, set[int]] = {view: set() for pair in left for view in pair}
+    for i, j in left:
+        near[i].add(j)
+        near[j].add(i)
+    batches = []
+    while left:
+        batch, room = list[int](), MAX_RESULT_BYTES
+        for i, j in _pairs_of_few_views(left, near):
+            room -= PAIR_BYTES + MATCH_BYTES * min(corners[i], corners[j])
+            if len(batch) == size or (batch and room < 0):
+                break
+            batch.append(left.pop((i, j)))
+            near[i].remove(j)
+            near[j].remove(i)
+        batches.append(batch)
+    return batches
+
+
+def _pairs_of_few_views(
+    left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
+) -> Iterator[tuple[int, int]]:
+    """Yield pairs of a growing set of views; the view added next has most pairs with the set and few others.
+
+    The caller removes each pair from ``left`` and from ``near`` (view -> views of its pairs).
+    """
+    views, ties = set[int](), Counter[int]()
+    while left:
+        added: tuple[int, ...]
+        if ties:
+            added = (max(ties, key=lambda view: (ties[view], -len(near[view]), -view)),)
+            for view in sorted(views & near[added[0]]):
+                yield min(view, *added), max(view, *added)
+        else:
+            added = first = next(iter(left))
+            yield first
+        views.update(added)
+        for view in added:
+            del ties[view]
+            ties.update(near[view])
+
+
+def _prepared(job: Job, features: Sequence[Features], prepare: Prepare) -> PreparedViews:
+    return PreparedViews(prepare, dict(enumerate(zip(job.images, features, strict=True))))
+
+
+def _detect(config: PipelineConfig, image: Image) -> list[Features]:
+    return [detect_features(config, image)]
+
+
+def _matched_in_turn(
+    job: Job, views: PreparedViews, pairs: Sequence[tuple[int, int]]
+) -> tuple[list[TwoView], list[str]]:
+    """Match pairs; in large sets first with part of the corners, then with all where this is not enough.
+
+    It is not enough for weak pairs, and for all pairs of a long sequence, where errors accumulate. Returns
+    the pairs, and the kind of record of each.
+    """
+    features, matching = views.features, job.config.matching
+    if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
+        return _matched(job, views, pairs, ""), [""] * len(pairs)
+    found = _matched(job, _prepared(job, features, partial(_prepare_share, matching)), pairs, FEWER)
+    found, kinds = _of_all_corners(found, features, matching.many_share), [FEWER] * len(pairs)
+    kept = reject_repeated_structure(found, len(features))
+    long = has_narrow_cut(tracks_of_corners([found.xy for found in features], kept))
+    again = [n for n, pair in enumerate(found) if long or not pair.accepted or pair.inliers < MIN_VERIFIED]
+    second = _matched(job, views, [pairs[n] for n in again], "")
+    for n, pair in zip(again, second, strict=True):
+        if pair.accepted or not found[n].accepted:
+            found[n], kinds[n] = pair, ""
+    return found, kinds
+
+
+def _of_all_corners(pairs: Sequence[TwoView], features: Sequence[Features], share: float) -> list[TwoView]:
+    """Pairs matched with part of the corners, with indices into all corners."""
+    rows = [strongest_corners(f, share) for f in features]
+    return [replace(p, index1=rows[p.i][p.index1], index2=rows[p.j][p.index2]) for p in pairs]
+
+
+def _prepare_share(matching: SeedsAndGrowth, image: Image, features: Features) -> Any:
+    return matching.prepare(image, strongest_share(features, matching.many_share))
+
+
+def _matched(job: Job, views: PreparedViews, pairs: Sequence[tuple[int, int]], kind: str) -> list[TwoView]:
+    """Match pairs of prepared views; ``kind`` names another way of preparation."""
+    run, shared = job.run, job.run.workers.in_process
+    variants = [run.variant_key(stage) for stage in ("matching", "epipolar", "verification")]
+    features = list(run.logs["features"].keys.values())
+    inputs = {(i, j): (features[i], features[j], run.seed, i, j, *([kind] if kind else [])) for i, j in pairs}
+    keys = {_item(i, j, kind): run.key("matches", variants, *inputs[i, j]) for i, j in pairs}
+
+    def batches(missing: Sequence[int]) -> Iterator[Batch]:
+        corners = [len(f.xy) for f in views.features]
+        for numbers in batch_pairs(pairs, missing, None if shared else run.workers.parallel(), corners):
+            some = [pairs[n] for n in numbers]
+            given = views if shared else views.subset({view for pair in some for view in pair})
+            yield numbers, (job.config, given, some, run.seed)
+
+    return list(run.map_cached("matches", keys, _match_all, batches))
+
+
+def _match_all(
+    config: PipelineConfig, views: PreparedViews, pairs: Sequence[tuple[int, int]], seed: int
+) -> list[TwoView]:
+    return [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
+
+
+def _item(i: int, j: int, kind: str) -> str:
+    return f"{i:05d}-{j:05d}{kind}"
+
+
+def report_features(job: Job, features: Sequence[Features]) -> Sequence[Features]:
+    """Report the features of all images; return them."""
+    min_corners, found = 16, [len(f.xy) for f in features]
+    few = [(image, n) for image, n in zip(job.images, found, strict=True) if n < min_corners]
+    poor = [Notice("few-corners", image.name, counted(n, "corner")) for image, n in few]
+    counts = {"images": len(found), "corners": sum(found), "fewest_in_one_image": min(found)}
+    job.run.finish("features", counts=counts, warnings=poor)
+    return features
+
+
+def report_choice(job: Job, choice: PairChoice) -> None:
+    """Report the pairs that are to be matched."""
+    possible = len(job.images) * (len(job.images) - 1) // 2
+    counts = {"possible": possible, "compared": choice.compared, "chosen": len(choice.pairs)}
+    job.run.finish("pairs", counts=counts)
+
+
+def report_matches(
+    job: Job,
+    pairs: Sequence[TwoView],
+    kinds: Sequence[str] | None = None,
+    rejected: Mapping[int, str] | None = None,
+) -> Sequence[TwoView]:
+    """Report the matched pairs; return them.
+
+    If the final pairs are not exactly the stored records, another record lists the final ones with their
+    ``kinds``, and the reasons of those that are ``rejected`` (by number) because of other pairs.
+    """
+    run, rejected, kinds = job.run, rejected or {}, kinds or [""] * len(pairs)
+    items = [_item(pair.i, pair.j, kind) for pair, kind in zip(pairs, kinds, strict=True)]
+    if rejected or any(kinds) or items != sorted(run.logs["matches"].keys):
+        final = {"items": items, "rejected": {items[n]: reason for n, reason in rejected.items()}}
+        run.cached("matches", FINAL, run.key("matches", FINAL, final), lambda: final)
+    accepted = [pair for pair in pairs if pair.accepted]
+    counts = {
+        "pairs": len(pairs),
+        "accepted": len(accepted),
+        "verified": sum(pair.inliers for pair in accepted),
+        "undetermined": sum(pair.undetermined for pair in accepted),
+    }
+    metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
+    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+    return pairs
+
+
+def final_pairs(records: Mapping[str, Any], features: Sequence[Features]) -> tuple[TwoView, ...]:
+    """The pairs that :func:`report_matches` reported, from the records of the stage."""
+    if FINAL not in records:
+        return tuple(records.values())
+    final = records[FINAL]
+    fewer = [item for item in final["items"] if item.endswith(FEWER)]
+    whole = _of_all_corners([records[item] for item in fewer], features, SeedsAndGrowth.many_share)
+    pairs = {item: records[item] for item in final["items"]} | dict(zip(fewer, whole, strict=True))
+    for item, reason in final["rejected"].items():
+        pairs[item] = replace(pairs[item], accepted=False, reason=reason)
+    return tuple(pairs.values())
+
+
+def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
+    """A warning if the epipolar geometry of most pairs is degenerate."""
+    undetermined = [pair for pair in accepted if pair.undetermined]
+    if 2 * len(undetermined) <= len(accepted):
+        return []
+    kinds = Counter(pair.configuration for pair in undetermined)
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
+    return [Notice("degenerate-pairs", of_all, listed)]
+
+
+def require_accepted_pair(pairs: Sequence[TwoView]) -> None:
+    """Raise ``StageFailure`` if no pair is accepted."""
+    if not any(pair.accepted for pair in pairs):
+        best = max(pairs, key=lambda pair: pair.inliers)
+        tried, verified = counted(len(pairs), "pair"), counted(best.inliers, "verified match")
+        evidence = f"the best of {tried} has {verified}: {best.reason}"
+        advice = "add images with more overlap, all of one textured scene"
+        raise StageFailure("no two images could be matched", evidence, advice)
+
+
+def report_tracks(run: Run, tracks: Tracks) -> Tracks:
+    """Report the tracks; return them."""
+    seen = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    counts = {"points": tracks.n_points, "observations": len(tracks.xy)}
+    run.finish("tracks", counts=counts | {"seen_3_times": int((seen >= 3).sum())})
+    return tracks
+
+
+def image_groups(n_views: int, pairs: Sequence[TwoView], among: B8 | None = None) -> list[list[int]]:
+    """The groups of images that accepted pairs connect, the largest first; ``among``: of these images only.
+
+    Groups of less than ``MIN_GROUP`` images are left out.
+    """
+    inside = np.ones(n_views, dtype=bool) if among is None else among
+    label = connected_groups(
+        n_views, [(p.i, p.j) for p in pairs if p.accepted and inside[p.i] and inside[p.j]]
+    )
+    groups = [group.tolist() for group in rows_of_views(label, label.max() + 1)]
+    return sorted((group for group in groups if len(group) >= MIN_GROUP), key=lambda group: -len(group))

@@ -1,0 +1,241 @@
+"""The stages of Algorithm 1 from tracks on: cameras (chapters 6 and 7), depth maps and surface (2).
+
+Each function computes one record of the result, or reads it if the run has computed it before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from thesisrecon._code_digest import code_digest
+from thesisrecon.camera import Camera
+from thesisrecon.config import PipelineConfig
+from thesisrecon.errors import Notice, StageFailure
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.imaging.on_demand import OnDemand
+from thesisrecon.pipeline.job import Job, name_images
+from thesisrecon.pipeline.large_sets import calibrate_with_core
+from thesisrecon.records import (
+    DepthMap,
+    HeldOut,
+    IdentifiabilityReport,
+    MetricResult,
+    PinholeView,
+    Reconstruction,
+    SelfCalibration,
+    TexturedMesh,
+    Tracks,
+    TwoView,
+)
+from thesisrecon.results import RunResult
+from thesisrecon.runtime._run import Batch, stream
+from thesisrecon.selfcalibration.stratified import with_images
+from thesisrecon.stereo.depth import MultiViewScene
+from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views.render import render_mesh
+
+MAP_BYTES = 2**29
+"""Depth maps in memory, those before and those after confirmation; more are read when they are used."""
+
+
+def _cached(
+    job: Job, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], Any]
+) -> Any:
+    """The record of one attempt, which depends on ``inputs``."""
+    run = job.run
+    key = run.key(stage, run.variant_key(stage), inputs, run.seed, attempt)
+    run.progress(stage, 0, 1)
+    found = run.cached(stage, f"attempt-{attempt}", key, lambda: compute(stream(run.seed, stage, attempt)))
+    run.progress(stage, 1, 1)
+    return found
+
+
+def reconstruct_projective(
+    job: Job, tracks: Tracks, pairs: Sequence[TwoView], attempt: int = 0
+) -> Reconstruction:
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair.
+
+    Of large sets only a core of ``projective.core_views`` views is reconstructed: the metric stage registers
+    the others by calibrated resection.
+    """
+    sizes, method = job.sizes, job.config.projective
+    projective: Reconstruction = _cached(
+        job, "projective", attempt, [job.run.logs["tracks"].keys, sizes],
+        lambda rng: method.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt),
+    )  # fmt: skip
+    return projective
+
+
+def self_calibrate(job: Job, projective: Reconstruction, attempt: int) -> SelfCalibration:
+    """Calibrate all views of a projective reconstruction, or a core of them (chapter 7)."""
+    prior, upstream = job.prior, job.run.logs["projective"].keys[f"attempt-{attempt}"]
+    method, images = job.config.selfcalibration, job.images
+    pixels = images if all(image.has_pixels for image in images) else ()
+    calibration: SelfCalibration = _cached(
+        job, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
+        lambda rng: calibrate_with_core(with_images(method, pixels), projective, prior=prior, rng=rng),
+    )  # fmt: skip
+    return calibration
+
+
+def refine_metric(
+    job: Job, start: Reconstruction, calibration: SelfCalibration, attempt: int, upstream: Sequence[str]
+) -> MetricResult:
+    """Upgrade and refine a reconstruction, register the other views, and test the result (chapter 7)."""
+    prior, threads = job.prior, job.run.workers.threads
+    metric: MetricResult = _cached(
+        job, "metric", attempt, [job.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], upstream],
+        lambda rng: job.config.metric.refine(start, calibration, prior=prior, rng=rng, threads=threads),
+    )  # fmt: skip
+    return metric
+
+
+def report_projective(job: Job, result: RunResult) -> None:
+    """Report the projective reconstruction, and its self-calibration if there is one."""
+    projective, calibration = result.projective, result.calibration
+    if projective is not None:
+        sigma = {"sigma_px": projective.sigma_px}
+        job.run.finish("projective", counts=_sizes_of(projective), metrics=sigma)
+    if calibration is not None:
+        counts = {"hypotheses": len(calibration.candidates), "identifiable": int(calibration.identifiable)}
+        # A metric model has its own report.
+        found = calibration.identifiability if result.metric is None else None
+        job.run.finish("selfcalibration", counts=counts, warnings=_critical(found))
+
+
+def report_metric(job: Job, metric: MetricResult) -> None:
+    """Report the metric reconstruction with its warnings."""
+    texts = (*_critical(metric.identifiability), *metric.warnings)
+    warnings = [name_images(text, job.names) for text in texts]
+    found = metric.reconstruction
+    metrics = {"sigma_px": found.sigma_px}
+    job.run.finish("metric", counts=_sizes_of(found), metrics=metrics, warnings=warnings)
+
+
+def _sizes_of(reconstruction: Reconstruction) -> dict[str, int]:
+    return {"registered": int(reconstruction.registered.sum()), "points": int(reconstruction.valid.sum())}
+
+
+def _critical(found: IdentifiabilityReport | None) -> tuple[str, ...]:
+    """A warning about a critical motion that the prior resolves; others fail the self-check."""
+    resolved = found is not None and found.critical and found.identifiable
+    return ("; ".join(found.sentences),) if found is not None and resolved else ()
+
+
+def _depths(
+    config: PipelineConfig, scene: MultiViewScene, view: int, pool: Executor | None
+) -> list[DepthMap]:
+    return [config.dense.depth_map(scene, view, pool=pool)]
+
+
+def _confirmed(
+    config: PipelineConfig, scene: MultiViewScene, maps: Mapping[int, DepthMap], view: int
+) -> list[DepthMap]:
+    return [config.dense.confirm(scene, maps, view)]
+
+
+def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap], Sequence[PinholeView]]:
+    """Estimate and cross-check the depth maps of all registered views (2.5); return them with the views."""
+    run, dense, images = job.run, job.config.dense, job.images
+    run.progress("dense", 0, int(r.registered.sum()))
+    with run.clock("dense"):
+        scene = dense.prepare(images, r, threads=run.workers.threads)
+        order = sorted(scene.views)
+        near = {view: dense.required_views(scene, view) for view in order}
+    pixels = [(image.rgb, image.mask) for image in images]
+    given = [r.P, r.K, r.distortion, r.X, r.registered, r.valid, r.inlier, pixels]
+    key = run.key("dense", run.variant_key("dense"), given)
+    place = {view: n for n, view in enumerate(order)}
+
+    def part(view: int) -> MultiViewScene:
+        """Part of the scene that the depth map of one view needs."""
+        return scene if run.workers.in_process else scene.subset(near[view])
+
+    def estimated(missing: Sequence[int]) -> Iterator[Batch]:
+        for n in missing:
+            yield [n], (job.config, part(order[n]), order[n], run.workers.pool)
+
+    def confirmed(missing: Sequence[int]) -> Iterator[Batch]:
+        for n in missing:
+            own = {j: maps[place[j]] for j in sorted(near[order[n]])}
+            yield [n], (job.config, scene, own, order[n])
+
+    keys = {f"{i:05d}": run.key("dense", key, i) for i in order}
+    maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
+    keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
+    # The maps of 12 neighbours take longer to send than to compare.
+    final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True, here=True)
+    # The views for stereo matching need not stay in memory.
+    undistorted = scene.views
+    return final, OnDemand(len(order), lambda n: undistorted[order[n]])
+
+
+def report_depth_maps(job: Job, maps: Sequence[DepthMap]) -> None:
+    """Report the depth maps; raise ``StageFailure`` if none has a depth."""
+    known, depths, empty = [], 0, []
+    for m in maps:
+        finite = np.isfinite(m.depth)
+        known.append(float(finite.mean()))
+        depths += int(finite.sum())
+        empty += [] if known[-1] else [job.images[m.view].name]
+    counts = {"views": len(known), "depths": depths}
+    warnings = [Notice("no-depth-values", name) for name in empty]
+    metrics = {"median_share_known": float(np.median(known))}
+    job.run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
+    if not depths:
+        evidence = f"none of {len(known)} views agrees with another on any surface"
+        advice = "add images with more overlap of a textured scene"
+        raise StageFailure("no depth was found", evidence, advice)
+
+
+def build_model(
+    job: Job, maps: Sequence[DepthMap], views: Sequence[PinholeView]
+) -> tuple[TexturedMesh, HeldOut | None]:
+    """Fuse the depth maps to a textured mesh (2.6) and compare it with a held-out view."""
+    run = job.run
+    key = run.key("model", run.variant_key("model"), list(run.logs["dense"].keys.values()))
+    run.progress("model", 0, 1)
+    build = partial(job.config.model.build, maps, views, threads=run.workers.threads)
+    mesh: TexturedMesh = run.cached("model", "model", key, build)
+    compare = partial(_compare_held_out, job, views, mesh)
+    held_out_key = run.key("model", key, "held-out", code_digest(_compare_held_out))
+    held_out: HeldOut | None = run.cached("model", "held-out", held_out_key, compare)
+    without_texture = 0.0 if mesh.untextured is None else float(mesh.untextured.mean())
+    counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    run.finish("model", counts=counts, metrics={"share_untextured": without_texture})
+    run.progress("model", 1, 1)
+    return mesh, held_out
+
+
+def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
+    """The view with the smallest sum of distances to the other cameras."""
+    C = np.array([camera_centre(view.P) for view in views])
+    centres = C[:, :3] / C[:, 3:]
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
+    return views[int(np.argmin(apart))]
+
+
+def _compare_held_out(job: Job, views: Sequence[PinholeView], mesh: TexturedMesh) -> HeldOut | None:
+    """Compare the middle view with the model textured without it; None if they cannot be compared."""
+    threads = job.run.workers.threads
+    # Of fewer than three views the others may not see the surface of the middle one.
+    if len(views) < 3 or not len(mesh.faces):
+        return None
+    view = _middle_view(views)
+    try:
+        painted = job.config.model.color(mesh, views, without=view.view, threads=threads)
+    except StageFailure:
+        return None
+    height, width = view.rgb.shape[:2]
+    rendered = render_mesh(painted, Camera.from_matrix(view.P, (width, height)), threads=threads)
+    compared = covered_pixels(rendered) & view.seen
+    if not compared.any():
+        return None
+    matched = match_exposure(view.rgb, rendered.color, compared)
+    similarity = (psnr_db(view.rgb, matched, compared), ssim(view.rgb, matched, compared))
+    return HeldOut(view.view, view.rgb, matched, compared, *similarity)
