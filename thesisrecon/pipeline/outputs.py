@@ -83,22 +83,17 @@ def with_image_names(result: RunResult) -> RunResult:
     """Replace image numbers by file names in all sentences of a result."""
     names = [image.name for image in result.images]
 
-    def named(texts: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(name_images(text, names) for text in texts)
+    def named(record: Any, *fields: str) -> Any:
+        texts = {name: [name_images(text, names) for text in getattr(record, name)] for name in fields}
+        return replace(record, **{name: tuple(found) for name, found in texts.items()})
 
     metric, calibration = result.metric, result.calibration
     if metric is not None:
-        metric = replace(
-            metric,
-            failed_checks=named(metric.failed_checks),
-            warnings=named(metric.warnings),
-            limitations=named(metric.limitations),
-        )
+        metric = named(metric, "failed_checks", "warnings", "limitations")
     if calibration is not None:
-        calibration = replace(calibration, reasons=named(calibration.reasons))
+        calibration = named(calibration, "reasons")
         if (report := calibration.identifiability) is not None:
-            report = replace(report, sentences=named(report.sentences))
-            calibration = replace(calibration, identifiability=report)
+            calibration = replace(calibration, identifiability=named(report, "sentences"))
     return replace(result, metric=metric, calibration=calibration)
 
 
