@@ -17,11 +17,11 @@ from tests.synthetic import reconstruction_of, texture
 from thesisrecon.api.pairs import epipolar_lines
 from thesisrecon.camera import compose_camera
 from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, plane_homography
-from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._images import read_image
 from thesisrecon.records import Image, Tracks
 from thesisrecon.report._data import point_colors

@@ -12,8 +12,8 @@ from tests.conftest import refuses
 from thesisrecon.api.views import match_images, prepare_trilinear_views
 from thesisrecon.cli.view_files import interpolate_images, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.views.tensor import VirtualCamera, camera_at
 from validation.scenes.real import load_fixture_scene
 

@@ -10,6 +10,7 @@ import pytest
 from tests.conftest import refuses
 from thesisrecon.api.reconstruct import _exif_warnings
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
+from thesisrecon.config.intrinsics import IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.config.text import (
     _parse,
     _toml_lines,
@@ -22,8 +23,8 @@ from thesisrecon.config.text import (
     toml_from_config,
 )
 from thesisrecon.errors import UsageError
-from thesisrecon.intrinsics import INTRINSICS, IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
+from thesisrecon.records import INTRINSICS
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric._uncertainty import (
     PerCameraEstimates,
     estimate_hierarchical_prior,

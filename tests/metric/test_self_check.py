@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric._adjustment import SETTLED, MetricAdjustment
 from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
 from thesisrecon.metric._model import (

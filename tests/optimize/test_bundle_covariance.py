@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from tests.optimize.bundle_scenes import make_block, project_block
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle import covariance as bundle_covariance
 from thesisrecon.optimize.bundle import reduced_solvers as kernels
 from thesisrecon.optimize.bundle.covariance import robust_sigma
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.records import IntrinsicsPrior
 
 FREE = np.array([True, False, False, True, True, True])
 

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.small_matrices import floored_diagonal
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize import least_squares
 from thesisrecon.optimize.bundle import metric_kernels, scatter, schur
 from thesisrecon.optimize.bundle import projective_kernels as kernels
@@ -21,6 +20,7 @@ from thesisrecon.optimize.bundle.scatter import _gram_matrix, block_scatter, lin
 from thesisrecon.optimize.bundle.schur import BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import invert_information
 from thesisrecon.optimize.noise import huber
+from thesisrecon.records import IntrinsicsPrior
 from validation.scenes.walks import make_walk
 
 

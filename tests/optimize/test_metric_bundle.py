@@ -4,13 +4,13 @@ import pytest
 from tests.conftest import refuses
 from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.similarity import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.intrinsic_unknowns import number_unknowns
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.reduced_solvers import BandedCholesky
+from thesisrecon.records import IntrinsicsPrior
 
 FOCAL = np.array([True, False, False, False, False, False])
 FOCAL_CENTRE_RADIAL = np.array([True, False, False, True, True, True])

@@ -7,7 +7,7 @@ import pytest
 
 from tests.metric.test_metric_refinement import centre_error
 from tests.synthetic import TrueScene, make_scene, true_pairs, with_poses
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle import schur

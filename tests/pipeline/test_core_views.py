@@ -7,8 +7,8 @@ import pytest
 
 from tests.metric.test_metric_refinement import centre_error
 from tests.synthetic import make_scene, projective_reconstruction
+from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import prior_for
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.pipeline.large_sets import (
     CORE_VIEWS,

@@ -18,8 +18,8 @@ from thesisrecon.api.reconstruct import _exif_warnings, reconstruct
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
 from thesisrecon.pipeline import algorithm1, matching, outputs, stages

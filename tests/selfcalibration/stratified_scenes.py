@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import projective_reconstruction
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.selfcalibration._frame import projective_scene
 
 NOTHING_BUT_CONSTANT = IntrinsicsOptions(

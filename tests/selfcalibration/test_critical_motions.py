@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.geometry.critical_motions import (
     UpgradedCameras,
     _infinite_homography_shift,
@@ -17,7 +18,6 @@ from thesisrecon.geometry.critical_motions import (
     projective_infinity_shifts,
 )
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.optimize.bundle.identifiability import (
     MAX_FOCAL_STD,
     MAX_NOISE_RATIO,

@@ -14,9 +14,9 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
+from thesisrecon.records import IntrinsicsPrior
 from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion

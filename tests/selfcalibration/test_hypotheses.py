@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.selfcalibration._candidates import (
     _biased_focal,
     _no_candidate_failure,

@@ -8,9 +8,9 @@ import pytest
 from tests.conftest import refuses
 from tests.selfcalibration import stratified_scenes as scenes
 from tests.synthetic import make_scene
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
-from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.selfcalibration._frame import infinite_homographies, square_pixel_constraints
 from thesisrecon.selfcalibration._image_conic import (
     dual_conic_of_constant_camera,

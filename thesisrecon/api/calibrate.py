@@ -9,11 +9,11 @@ import numpy as np
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.arrays import F64, I64, require_finite, require_shapes
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
+from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.runtime._run import stream
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch

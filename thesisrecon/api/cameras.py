@@ -20,13 +20,12 @@ from thesisrecon.api.arguments import (
 from thesisrecon.arrays import B8, F64, I64, Stratum, require_calibration, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
 from thesisrecon.optimize.robust_resection import Resection, resect_robust
 from thesisrecon.optimize.triangulation import Method, triangulate_points
-from thesisrecon.records import Reconstruction, Tracks
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),

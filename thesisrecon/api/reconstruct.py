@@ -9,9 +9,9 @@ from typing import Unpack
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.config.text import Config, Pairs, Settings, build_config
 from thesisrecon.errors import Notice, UsageError, counted
-from thesisrecon.intrinsics import IntrinsicsOptions
 from thesisrecon.io._frames import FrameSource
 from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
 from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder

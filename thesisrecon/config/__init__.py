@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
+from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.config.plug_ins import FunctionMatcher, as_method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
@@ -24,7 +25,6 @@ from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import UsageError, in_words, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
-from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior
 from thesisrecon.matching._prepared import EstimateFundamental, MapAll
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
@@ -40,6 +40,7 @@ from thesisrecon.records import (
     Features,
     FundamentalFit,
     Image,
+    IntrinsicsPrior,
     Matches,
     MetricResult,
     PairChoice,

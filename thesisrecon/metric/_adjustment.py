@@ -8,7 +8,6 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
 from thesisrecon.optimize.bundle.metric import (
     MAX_ITERATIONS,
@@ -26,6 +25,7 @@ from thesisrecon.optimize.bundle.scatter import (
     pose_uncertainty,
 )
 from thesisrecon.optimize.noise import best_huber_width, noise_from_distances
+from thesisrecon.records import IntrinsicsPrior
 
 MIN_OBSERVATIONS = 40
 MAX_LOSS_SIGMAS = 20.0

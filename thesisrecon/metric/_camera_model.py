@@ -15,10 +15,10 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.geometry.similarity import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
 from thesisrecon.optimize.bundle.scatter import point_blocks
+from thesisrecon.records import IntrinsicsPrior
 
 FOLDS = 5
 """In each view one of this number of blocks of the scene is held out."""

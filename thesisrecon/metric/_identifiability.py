@@ -8,7 +8,6 @@ import numpy as np
 
 from thesisrecon.arrays import I64
 from thesisrecon.geometry.critical_motions import UpgradedCameras
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import FOCAL, MetricEstimate
 from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
@@ -19,7 +18,7 @@ from thesisrecon.optimize.bundle.identifiability import (
 )
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.records import IdentifiabilityReport, IntrinsicInterval
+from thesisrecon.records import IdentifiabilityReport, IntrinsicInterval, IntrinsicsPrior
 
 MIN_OBSERVATIONS = 10
 """Views with fewer of the observations used are left out: their poses may be undetermined."""

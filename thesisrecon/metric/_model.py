@@ -11,10 +11,9 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import undistort
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, MetricModel, image_points
 from thesisrecon.optimize.bundle.partial import refine_points
-from thesisrecon.records import Reconstruction, Tracks, Upgrade
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8

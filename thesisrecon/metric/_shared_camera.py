@@ -15,7 +15,6 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._camera_model import MAX_CHANGE
 from thesisrecon.metric._model import (
@@ -32,6 +31,7 @@ from thesisrecon.optimize.bundle.metric import MetricBundleResult, refine_metric
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, move_poses
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.scatter import BlockScatter, linearise_fit
+from thesisrecon.records import IntrinsicsPrior
 
 CENTRE_STD = 0.1
 """Prior of free principal points in long sides; images may be crops."""

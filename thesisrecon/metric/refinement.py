@@ -13,7 +13,6 @@ import numpy as np
 
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.critical_motions import measure_motion, nearest_critical_motion
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
     MIN_OBSERVATIONS,
@@ -70,7 +69,14 @@ from thesisrecon.metric._uncertainty import (
 from thesisrecon.optimize.bundle.identifiability import excess_noise
 from thesisrecon.optimize.bundle.scatter import BlockScatter
 from thesisrecon.optimize.noise import noise_from_distances
-from thesisrecon.records import MetricResult, Reconstruction, SelfCalibration, Tracks, Upgrade
+from thesisrecon.records import (
+    IntrinsicsPrior,
+    MetricResult,
+    Reconstruction,
+    SelfCalibration,
+    Tracks,
+    Upgrade,
+)
 
 MIN_CHANGE = 0.002
 """Fraction of observations that become inliers or outliers in a round, below which the rounds end."""

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.intrinsics import camera_numbers
 from thesisrecon.io._images import ImageSet
 from thesisrecon.pipeline.job import Job, name_images
 from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, register_more

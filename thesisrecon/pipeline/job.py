@@ -12,10 +12,10 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.intrinsics import IntrinsicsPrior, prior_from_options
 from thesisrecon.io._images import ImageSet
-from thesisrecon.records import Features, Image, PairChoice, Tracks, TwoView
+from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, Tracks, TwoView
 from thesisrecon.runtime._run import Run, Until
 
 

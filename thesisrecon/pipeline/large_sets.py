@@ -26,10 +26,10 @@ from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.similarity import nearest_rotation
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.matching._repeated_structure import reject_repeated_structure, strong_pairs
 from thesisrecon.pipeline.job import Job
 from thesisrecon.records import (
+    IntrinsicsPrior,
     MetricResult,
     Reconstruction,
     SelfCalibration,

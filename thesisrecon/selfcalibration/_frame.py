@@ -12,8 +12,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.records import Reconstruction
+from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
 # Error of a unit-free infinite homography: the weight of linear constraints from approximate intrinsics.
 HOMOGRAPHY_NOISE = 0.01

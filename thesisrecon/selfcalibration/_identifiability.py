@@ -9,7 +9,6 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.critical_motions import nearest_critical_motion, projective_infinity_shifts
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
     excess_equations,
@@ -19,7 +18,7 @@ from thesisrecon.optimize.bundle.identifiability import (
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.noise import noise_from_distances
-from thesisrecon.records import IdentifiabilityReport, Reconstruction, Tracks, Upgrade
+from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 from thesisrecon.selfcalibration._frame import build_frame
 
 _MAX_OBSERVATIONS = 12000

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.records import Reconstruction, SelfCalibration
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     Candidate,
     as_stage_failure,

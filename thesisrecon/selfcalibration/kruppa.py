@@ -20,10 +20,9 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.conditioning import pixel_from_unit, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.least_squares import minimize_residuals
 from thesisrecon.optimize.noise import soft_l1
-from thesisrecon.records import Reconstruction, SelfCalibration
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     Candidate,
     as_stage_failure,

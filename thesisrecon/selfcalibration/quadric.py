@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.records import Reconstruction, SelfCalibration
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
     as_stage_failure,
     candidates_from_parameters,

@@ -12,8 +12,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
-from thesisrecon.intrinsics import IntrinsicsPrior
-from thesisrecon.records import Image, Reconstruction, SelfCalibration
+from thesisrecon.records import Image, IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration._dual_quadric import minimize_quadric
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene

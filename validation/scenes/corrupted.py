@@ -9,10 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.metric._model import MetricEstimate, camera_rows
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.records import Reconstruction
+from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
 
 def model_from_reconstruction(found: Reconstruction, prior: IntrinsicsPrior) -> MetricEstimate:

@@ -14,8 +14,8 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import prior_for
 from thesisrecon.records import MetricResult
 from thesisrecon.runtime._run import stream
 from validation.metrics.intervals import LEVEL, IntervalScores, holding_std, interval_scores, join_scores

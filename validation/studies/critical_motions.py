@@ -17,11 +17,11 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.projective._track_selection import require_pair_with_parallax

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline.large_sets import calibrate_with_core, calibrated_part
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.runtime._run import stream

@@ -107,8 +107,8 @@ def record_tracks(name: str, preset_name: str) -> dict[str, Any]:
     """Digest projective reconstruction, self-calibration and metric refinement of given tracks."""
     from thesisrecon import self_calibrate
     from thesisrecon.config import preset
+    from thesisrecon.config.intrinsics import prior_for
     from thesisrecon.errors import StageFailure
-    from thesisrecon.intrinsics import prior_for
     from thesisrecon.records import Tracks
     from thesisrecon.runtime._run import stream
     from validation.scenes.cube import make_cube

@@ -16,15 +16,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.similarity import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
 from thesisrecon.metric._shared_camera import contradicted_focal_priors
 from thesisrecon.metric.refinement import finish_metric, settle_camera_model
-from thesisrecon.records import IntrinsicInterval, SelfCalibration
+from thesisrecon.records import IntrinsicInterval, IntrinsicsPrior, SelfCalibration
 from thesisrecon.results import RunResult
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import Rows, text_table

@@ -19,8 +19,8 @@ import numpy as np
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.errors import StageFailure
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.pipeline.algorithm1 import ATTEMPTS
 from thesisrecon.records import MetricResult, Tracks, TwoView
 from thesisrecon.runtime._run import stream

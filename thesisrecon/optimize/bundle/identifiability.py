@@ -25,11 +25,10 @@ from thesisrecon.geometry.critical_motions import (
     measure_motion,
     nearest_critical_motion,
 )
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.metric import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.records import IdentifiabilityReport
+from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior
 
 # A focal length with a larger relative standard deviation is undetermined.
 MAX_FOCAL_STD = 0.15

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF, MetricCameras
+from thesisrecon.records import IntrinsicsPrior
 
 NONE = -1
 # Larger steps of log f are rejected anyway; the bound avoids overflow.

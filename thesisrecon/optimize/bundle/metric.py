@@ -8,7 +8,6 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.covariance import (
     SIMILARITY_DOF,
     bundle_covariances,
@@ -47,6 +46,7 @@ from thesisrecon.optimize.bundle.schur import (
     build_layout,
 )
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
+from thesisrecon.records import IntrinsicsPrior
 
 # Below a relative gain of NEWTON_GAIN the second derivative of the loss is used; at least MIN_CURVATURE of
 # the curvature along a residual is kept. Reweighting is safe far from the minimum, Newton's method faster

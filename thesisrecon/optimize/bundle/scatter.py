@@ -15,11 +15,11 @@ import scipy
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.intrinsics import IntrinsicsPrior
 from thesisrecon.optimize.bundle.covariance import fixed_coordinates, gauge_directions, invert_in_inner_gauge
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
 from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
+from thesisrecon.records import IntrinsicsPrior
 
 # Number of pose unknowns tested besides all intrinsics.
 _MAX_POSES = 30

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.errors import UsageError, unknown_word
-from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_from_options
-from thesisrecon.records import Reconstruction
+from thesisrecon.records import IntrinsicsPrior, Reconstruction
 from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.scenes.cube import OFF_FACE

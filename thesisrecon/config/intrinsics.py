@@ -12,15 +12,12 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.records import Reconstruction
+from thesisrecon.records import INTRINSICS, IntrinsicsPrior, Reconstruction
 
 Mode = Literal["known", "constant", "free"]
 """``known``: the value is given; ``constant``: one unknown value per camera; ``free``: one per image."""
-
-INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
-"""Columns of every per-view table of intrinsics."""
 
 _OF_COLUMN = ("focal", "aspect", "skew", "principal_point", "principal_point", "k1")
 """Mode setting of each column."""
@@ -34,62 +31,6 @@ _STD_SETTINGS = {
     "k1_std": "k1",
 }
 """Setting of each standard deviation -> its intrinsic."""
-
-
-@dataclass(frozen=True)
-class IntrinsicsPrior:
-    """Gaussian prior of the intrinsics of V views or cameras.
-
-    Parameters
-    ----------
-    mean, std : ndarray (V, C)
-        C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew
-        and principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value
-        does not move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
-    shared : ndarray (V, C) of int
-        Rows with equal numbers in a column share the value of this column. Bundle adjustment takes the
-        sharing from its cameras instead.
-    kind : ndarray (V,) of int
-        Rows with equal numbers are cameras of the same kind (the same lens model); -1 for none.
-    spread : ndarray (C,) or (V, C), optional
-        Hierarchical prior: standard deviation of the values of a kind about their unknown common mean
-        (relative for the focal; inf = no such prior; the first row of a kind is used). None: not yet
-        estimated.
-    """
-
-    mean: F64
-    std: F64
-    shared: I64
-    kind: I64
-    spread: F64 | None = None
-
-    @classmethod
-    def unshared(
-        cls, mean: F64, std: F64, *, kind: I64 | None = None, spread: F64 | None = None
-    ) -> IntrinsicsPrior:
-        """Return a prior whose rows share no value.
-
-        Parameters
-        ----------
-        mean, std, kind, spread
-            As the fields; ``kind`` None: no kinds.
-
-        Returns
-        -------
-        IntrinsicsPrior
-        """
-        shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
-        return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)
-
-    @property
-    def group(self) -> I64:
-        """(V,) camera number of each view by its focal, 0-based and dense."""
-        return np.unique(self.shared[:, 0], return_inverse=True)[1].astype(np.int64)
-
-    @property
-    def focal_known(self) -> B8:
-        """(V,) whether a focal length is given, exactly or with a standard deviation."""
-        return np.isfinite(self.std[:, 0]) & np.isfinite(self.mean[:, 0])
 
 
 @dataclass(frozen=True)
