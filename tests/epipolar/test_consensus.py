@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare, norm
 
 from tests.conftest import refuses
-from thesisrecon.epipolar._matches import (
+from thesisrecon.epipolar._noise import (
     TAIL,
     NoiseMixture,
     _fit_mixture,

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair, oriented
 from thesisrecon.epipolar import _sampling as kernels
+from thesisrecon.epipolar import criteria as rank2
 from thesisrecon.epipolar import linear
-from thesisrecon.epipolar import refinement as rank2
-from thesisrecon.epipolar._matches import PairFrame
+from thesisrecon.epipolar._frame import PairFrame
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals

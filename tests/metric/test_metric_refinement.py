@@ -11,12 +11,7 @@ from thesisrecon.camera import project_camera
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
-<<<<<<< HEAD
-from thesisrecon.geometry.strata import estimate_similarity
-=======
-from thesisrecon.geometry.strata import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsOptions, prior_for
->>>>>>> baec70b4 (One file an algorithm in geometry, epipolar, projective and selfcalibration: helpers stand beside their only user; the exact seven-point solver is NumPy)
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.robust_resection import resect_calibrated

@@ -16,17 +16,14 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
-<<<<<<< HEAD
 from thesisrecon.records import IntrinsicsPrior
-from thesisrecon.selfcalibration.quadric import linear_quadric, rank_three
-=======
->>>>>>> baec70b4 (One file an algorithm in geometry, epipolar, projective and selfcalibration: helpers stand beside their only user; the exact seven-point solver is NumPy)
+from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations, _kruppa_cost, _kruppa_residuals, _Pairs
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, linear_quadric, rank_three
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)

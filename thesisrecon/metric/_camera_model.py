@@ -14,12 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
-<<<<<<< HEAD
-from thesisrecon.geometry.strata import estimate_similarity
-=======
-from thesisrecon.geometry.strata import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsPrior
->>>>>>> baec70b4 (One file an algorithm in geometry, epipolar, projective and selfcalibration: helpers stand beside their only user; the exact seven-point solver is NumPy)
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
 from thesisrecon.optimize.bundle.scatter import point_blocks

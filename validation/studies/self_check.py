@@ -18,12 +18,7 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-<<<<<<< HEAD
-from thesisrecon.geometry.strata import estimate_similarity
-=======
-from thesisrecon.geometry.strata import estimate_similarity
-from thesisrecon.intrinsics import IntrinsicsOptions, IntrinsicsPrior, prior_for
->>>>>>> baec70b4 (One file an algorithm in geometry, epipolar, projective and selfcalibration: helpers stand beside their only user; the exact seven-point solver is NumPy)
+from thesisrecon.geometry.similarity import estimate_similarity
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks
