@@ -18,7 +18,7 @@ from thesisrecon.api.pairs import estimate_homography as estimate_homography
 from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
 from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
 from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
-from thesisrecon.epipolar.estimation import FundamentalEstimate as FundamentalEstimate
+from thesisrecon.epipolar.degeneracy import FundamentalEstimate as FundamentalEstimate
 from thesisrecon.records import FundamentalFit as FundamentalFit
 from thesisrecon.records import TwoView as TwoView
 

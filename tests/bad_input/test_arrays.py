@@ -7,10 +7,10 @@ import numpy as np
 from thesisrecon.camera import decompose_camera
 from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
 from thesisrecon.geometry.conditioning import normalizing_transform
-from thesisrecon.geometry.homography import homography_linear
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.resection import resect_linear
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.geometry.two_view import homography_linear
 
 RNG = np.random.default_rng(0)
 P, OTHER = RNG.normal(size=(2, 3, 4))

@@ -18,7 +18,7 @@ from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.homography import homography_residuals, homography_sampson_residuals
+from thesisrecon.geometry.two_view import homography_residuals, homography_sampson_residuals
 from thesisrecon.optimize.least_squares import minimize_residuals
 from validation.scenes.two_views import make_two_views
 

@@ -1,6 +1,5 @@
 """RANSAC, and the noise among wrong residuals."""
 
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -10,16 +9,20 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare, norm
 
 from tests.conftest import refuses
-from thesisrecon.epipolar._noise import (
+from tests.epipolar.pairs import make_pair
+from thesisrecon.epipolar._matches import (
     TAIL,
     NoiseMixture,
+    PairFrame,
     _fit_mixture,
     noise_scale,
     noise_width,
     trimmed_noise_scale,
 )
 from thesisrecon.epipolar._sampling import draw_sample, required_samples
-from thesisrecon.epipolar.ransac import _SampleConsensus
+from thesisrecon.epipolar.linear import seven_point
+from thesisrecon.epipolar.ransac import _search
+from thesisrecon.geometry.two_view import sampson_residuals
 
 
 @settings(max_examples=100, deadline=None)
@@ -71,52 +74,42 @@ def test_noise_scale_has_the_small_sample_factor_and_refuses_too_few_residuals()
         refuses(ValueError, "noise_scale", noise_scale, residuals, parameters=7)
 
 
-@dataclass(frozen=True)
-class Line:
-    """y = a x + b through two points."""
-
-    x: np.ndarray
-    y: np.ndarray
-
-    def solve(self, sample):
-        x, y = self.x[sample], self.y[sample]
-        if x[0] == x[1]:
-            return []
-        a = (y[1] - y[0]) / (x[1] - x[0])
-        return [(a, y[0] - a * x[0])]
-
-    def residuals(self, model):
-        return self.y - model[0] * self.x - model[1]
-
-
-def search_line(x, y, rng, *args, **options):
-    line = Line(x, y)
-    return _SampleConsensus(*args, **options).search(line.solve, line.residuals, 2, len(x), rng)
-
-
-def test_consensus_finds_the_line_among_outliers():
+def test_consensus_takes_most_inliers_then_the_least_spread_or_the_least_median():
     rng = np.random.default_rng(1)
-    x = rng.uniform(0, 10, 100)
-    y = 2 * x + 1
-    y[:40] = rng.uniform(0, 20, 40)
-    model, inliers, samples = search_line(x, y, rng, 0.01, max_samples=200)
-    assert model == pytest.approx((2.0, 1.0))
-    assert inliers[40:].all()
-    assert samples == 200
+    pair = make_pair(40, rng)
+    frame = PairFrame.of(pair.xy1, pair.xy2)
+    points = frame.points(pair.xy1, pair.xy2)
+    points[:15, 2:] = rng.uniform(-1.5, 1.5, (15, 2))
 
+    def distances(f):
+        return np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
 
-def test_consensus_stops_at_the_share_that_is_enough_and_breaks_ties_by_the_spread():
-    x = np.arange(10.0)
+    sample, models, after = np.empty(7, np.int64), [], np.random.default_rng(0)
+    for _ in range(120):
+        draw_sample(after.random(7), 40, sample)
+        models += list(seven_point(points[sample][None])[0])
+    r = np.array([distances(f) for f in models])
+    for gate, best in (
+        (
+            0.05,
+            np.argmax(
+                (r < 0.05).sum(axis=1) - 1e-3 * np.sqrt(np.mean(np.where(r < 0.05, r, 0) ** 2, axis=1))
+            ),
+        ),
+        (1e3, np.argmin(np.mean(r**2, axis=1))),
+        (np.inf, np.argmin(np.sort(r, axis=1)[:, 20])),
+    ):
+        rng = np.random.default_rng(0)
+        f, inliers, drawn = _search(points, distances, rng, gate=gate, samples=120)
+        np.testing.assert_allclose(f, models[best])
+        expected = r[best] < gate if gate < np.inf else r[best] <= np.sort(r[best])[20]
+        np.testing.assert_array_equal(inliers, expected)
+        assert drawn == 120
+        assert rng.random() == np.random.default_rng(0).random(841)[-1]
     rng = np.random.default_rng(0)
-    assert search_line(x, x, rng, 0.1, max_samples=500, stop_inlier_ratio=0.9)[2] == 1
-    y = x + np.array([0, 0, 0, 0, 0, 0, 0, 0, 0.2, 0.0])
-    model, inliers, _ = search_line(x, y, rng, 0.25, max_samples=300)
-    assert inliers.all()
-    assert np.std(Line(x, y).residuals(model)) < np.std(y - x) * 1.05
-
-
-def test_consensus_without_a_model_is_none():
-    assert search_line(np.zeros(5), np.arange(5.0), np.random.default_rng(0), 1.0, max_samples=10) is None
+    assert _search(points[15:], lambda _: np.zeros(25), rng, gate=1.0, samples=500, enough=20.0)[2] == 1
+    assert rng.random() == np.random.default_rng(0).random(8)[-1]
+    assert _search(np.ones((9, 4)), distances, rng, gate=1.0, samples=10)[0] is None
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0, 2.0])

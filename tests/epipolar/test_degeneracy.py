@@ -10,19 +10,20 @@ from tests.conftest import refuses
 from tests.epipolar.facade import FacadeMaker
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.api.pairs import estimate_fundamental
-from thesisrecon.epipolar import _degeneracy as assessment
-from thesisrecon.epipolar import _planes
-from thesisrecon.epipolar._degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
-from thesisrecon.epipolar._frame import PairFrame
-from thesisrecon.epipolar._noise import log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar import degeneracy as assessment
+from thesisrecon.epipolar import homography
+from thesisrecon.epipolar._matches import PairFrame, log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar.degeneracy import NEIGHBOURS, _contradicted_ratios, assess_degeneracy
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.geometry.homography import (
+from thesisrecon.geometry.two_view import (
+    epipoles,
     homography_linear,
     homography_residuals,
     homography_sampson_residuals,
+    sampson_residuals,
+    symmetric_residuals,
 )
-from thesisrecon.geometry.two_view import epipoles, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit
 
 RELIEF = FacadeMaker(matches=500, relief=0.03, off_plane=0.15, wrong=0.2, repeated=0.2, sigma_px=0.3)
@@ -189,7 +190,7 @@ def test_plane_distances_match_their_numpy_twin():
     H = homography_linear(pair.xy1, pair.xy2)
     expected = np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2, axis=1)
     np.testing.assert_allclose(
-        _planes._plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6
+        homography._plane_distances(H.ravel(), np.hstack([xy1, xy2])), expected, rtol=1e-6
     )
 
 
@@ -210,7 +211,7 @@ def test_normal_equations_of_a_plane_match_their_numpy_twin():
         total += share
         expected += (1.0 - share) ** 2 * A.T @ inverse @ A
     G = np.empty((9, 9))
-    assert _planes._plane_normal_equations(h, np.hstack([xy1, xy2]), 0.05, G) == pytest.approx(
+    assert homography._plane_normal_equations(h, np.hstack([xy1, xy2]), 0.05, G) == pytest.approx(
         total, rel=1e-9
     )
     assert 1.0 < total < 29.0
@@ -239,7 +240,7 @@ def test_transfers_are_counted_as_by_numpy():
     pair = make_pair(60, np.random.default_rng(3))
     H = np.stack([homography_linear(pair.xy1[k : k + 12], pair.xy2[k : k + 12]) for k in (0, 12, 24)])
     expected = [int(np.sum(homography_residuals(h, pair.xy1, pair.xy2) < 30.0)) for h in H]
-    np.testing.assert_array_equal(_planes.count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
+    np.testing.assert_array_equal(homography.count_transferred(H, pair.xy1, pair.xy2, 30.0), expected)
 
 
 def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():
@@ -250,7 +251,9 @@ def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():
     h = homography_linear(points[:, :2], points[:, 2:]).ravel()
     away = points[:6].copy()
     away[:, 2:] += rng.uniform(0.2, 0.5, (6, 2))
-    F, agree, sums = _planes.fundamentals_of_plane(h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6)
+    F, agree, sums = homography.fundamentals_of_plane(
+        h, away, np.ones((1, 6)), np.array([[0, 1], [2, 5]]), 1e-6
+    )
     for f, (a, b) in zip(F, ((0, 1), (2, 5)), strict=True):
         r = np.abs(sampson_residuals(f.reshape(3, 3), points[:, :2], points[:, 2:]))
         assert r.max() < 1e-9
@@ -268,7 +271,7 @@ def test_the_dominant_plane_is_found_among_others():
     xy1 = np.r_[flat.xy1, far1[:, :2] / far1[:, 2:]] + rng.normal(0.0, 0.3, (200, 2))
     xy2 = np.r_[flat.xy2, far2[:, :2] / far2[:, 2:]] + rng.normal(0.0, 0.3, (200, 2))
     frame = PairFrame.of(xy1, xy2)
-    plane = _planes.find_dominant_plane(
+    plane = homography.find_dominant_plane(
         frame.matrix_in_frame(flat.F),
         frame.points(xy1, xy2),
         np.ones(200, bool),
@@ -276,7 +279,7 @@ def test_the_dominant_plane_is_found_among_others():
         rng=np.random.default_rng(0),
     )
     assert plane is not None
-    off = plane[1] > _planes.OFF_PLANE
+    off = plane[1] > homography.OFF_PLANE
     assert not off[:120].any()
     assert off[120:].mean() > 0.9
 
@@ -289,9 +292,9 @@ def test_the_covariance_of_a_homography_is_that_of_trials():
     truth = homography_linear(exact[:, :2], exact[:, 2:]).ravel()
     for _ in range(300):
         h = truth.copy()
-        _planes.refine_plane(h, exact + rng.normal(0.0, 1e-3, exact.shape), 1e3, 5)
+        homography.refine_plane(h, exact + rng.normal(0.0, 1e-3, exact.shape), 1e3, 5)
         found.append(h * np.sign(h @ truth))
-    predicted = np.trace(_planes.plane_covariance(truth, exact, 1e-3))
+    predicted = np.trace(homography.plane_covariance(truth, exact, 1e-3))
     assert np.trace(np.cov(np.array(found).T)) == pytest.approx(predicted, rel=0.15)
 
 

@@ -8,7 +8,7 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
-from thesisrecon.epipolar.estimation import Method
+from thesisrecon.epipolar.degeneracy import Method
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize

@@ -10,9 +10,9 @@ from tests.constants import with_constants
 from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import estimate_fundamental
-from thesisrecon.epipolar._degeneracy import assess_degeneracy
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.configuration import Configuration, _refine_translation, classify_configuration
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from tests.epipolar.pairs import make_pair, oriented
 from thesisrecon.epipolar import _sampling as kernels
-from thesisrecon.epipolar import criteria as rank2
-from thesisrecon.epipolar import linear
-from thesisrecon.epipolar._frame import PairFrame
+from thesisrecon.epipolar import refinement as rank2
+from thesisrecon.epipolar._matches import PairFrame
+from thesisrecon.epipolar.linear import distinct_real_roots, seven_point, singular_members
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.two_view import _algebraic_residuals, sampson_residuals, symmetric_residuals
@@ -30,59 +30,42 @@ def equations(points):
     return (x2[:, :, None] * x1[:, None, :]).reshape(-1, 9)
 
 
-@settings(max_examples=30, deadline=None)
-@given(seeds)
-def test_pencil_spans_the_null_space(seed):
-    points, _ = noisy_points(seed)
-    pencil = np.empty((2, 9))
-    sample = np.arange(10, 17)
-    assert linear._null_pencil(points, sample, pencil)
-    np.testing.assert_allclose(pencil @ pencil.T, np.eye(2), atol=1e-12)
-    assert np.abs(equations(points[sample]) @ pencil.T).max() < 1e-12
-
-
-def test_dependent_equations_have_no_pencil():
+def test_the_exact_solver_has_the_members_of_all_samples_and_none_of_dependent_ones():
     points, _ = noisy_points(0)
-    points[16] = points[15]
-    assert not linear._null_pencil(points, np.arange(10, 17), np.empty((2, 9)))
+    samples = np.stack([points[k : k + 7] for k in range(0, 49, 7)])
+    samples[3, 6] = samples[3, 5]
+    found = seven_point(samples)
+    for k, F in enumerate(found):
+        assert (len(F) == 0) == (k == 3)
+        assert np.abs(equations(samples[k]) @ F.T).max(initial=0.0) < 1e-12
+        np.testing.assert_allclose(np.linalg.norm(F, axis=1), 1.0)
+        np.testing.assert_allclose(np.linalg.det(F.reshape(-1, 3, 3)), 0.0, atol=1e-12)
 
 
-@settings(max_examples=50, deadline=None)
-@given(seeds)
-def test_determinants(seed):
-    f, g = np.random.default_rng(seed).normal(size=(2, 9))
-    assert linear._det3(f) == pytest.approx(np.linalg.det(f.reshape(3, 3)), abs=1e-12)
-    h = 1e-5
-    slope = (linear._det3(f + h * g) - linear._det3(f - h * g)) / (2 * h)
-    assert linear._mixed_det3(f, g) == pytest.approx(slope, abs=1e-7)
+def newton_roots(c):
+    roots = np.empty(3)
+    return np.sort(roots[: kernels._newton_cubic_roots(*c[1:], roots)])
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.floats(-5, 5), min_size=3, max_size=3))
 def test_cubic_with_three_real_roots(expected):
-    """Newton's method is for roots that are apart."""
+    """Double roots are found once; Newton's method is for roots that are apart."""
     expected = np.unique(np.round(expected, 2))
-    roots = np.empty(3)
-    full = np.concatenate([expected, np.repeat(expected[-1:], 3 - len(expected))])
-    _, a, b, c = np.poly(full)
-    found = np.sort(roots[: linear._cubic_roots(a, b, c, roots)])
-    for x in expected:
-        assert np.abs(found - x).min() < 1e-3
-    if len(expected) == 3:
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-        if np.diff(expected).min() >= 0.05:
-            assert kernels._newton_cubic_roots(a, b, c, roots) == 3
-            np.testing.assert_allclose(np.sort(roots), expected, atol=1e-8)
+    c = np.poly(np.concatenate([expected, np.repeat(expected[-1:], 3 - len(expected))]))
+    found = distinct_real_roots(np.roots(c))
+    assert len(found) == len(expected)
+    np.testing.assert_allclose(np.sort(found), expected, atol=1e-6 if len(expected) == 3 else 1e-3)
+    if len(expected) == 3 and np.diff(expected).min() >= 0.05:
+        np.testing.assert_allclose(newton_roots(c), expected, atol=1e-8)
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0.1, 5))
 def test_cubic_with_one_real_root(x, re, im):
-    _, a, b, c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
-    roots = np.empty(3)
-    for find_roots, error in ((linear._cubic_roots, 1e-6), (kernels._newton_cubic_roots, 1e-8)):
-        assert find_roots(a, b, c, roots) == 1
-        assert roots[0] == pytest.approx(x, abs=error)
+    c = np.real(np.poly([x, re + 1j * im, re - 1j * im]))
+    np.testing.assert_allclose(distinct_real_roots(np.roots(c)), [x], atol=1e-6)
+    np.testing.assert_allclose(newton_roots(c), [x], atol=1e-8)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, np.pi / 2])
@@ -92,19 +75,16 @@ def test_no_singular_member_is_lost_at_infinity(turn):
     second = np.diag([1.0, -1.0, 1.0]).ravel()
     basis = np.linalg.qr(np.stack([first, second]).T)[0].T
     c, s = np.cos(turn), np.sin(turn)
-    F = np.empty((3, 9))
-    count = linear._singular_members(np.array([[c, s], [-s, c]]) @ basis, F)
-    found = [np.diag(f.reshape(3, 3)) for f in F[:count]]
-    assert count == 3
+    found = [
+        np.diag(f.reshape(3, 3)) for f in singular_members((np.array([[c, s], [-s, c]]) @ basis)[None])[0]
+    ]
+    assert len(found) == 3
     for expected in (np.array([1.0, 2.0, 0.0]), np.array([0.0, 3.0, -1.0]), np.array([3.0, 0.0, 2.0])):
         unit = expected / np.linalg.norm(expected)
         assert min(min(np.linalg.norm(f - unit), np.linalg.norm(f + unit)) for f in found) < 1e-6
-
-
-def test_a_pencil_of_singular_matrices_has_no_answer():
-    pencil = np.zeros((2, 9))
-    pencil[0, 0] = pencil[1, 4] = 1.0
-    assert linear._singular_members(pencil, np.empty((3, 9))) == 0
+    pencil = np.zeros((1, 2, 9))
+    pencil[0, 0, 0] = pencil[0, 1, 4] = 1.0
+    assert singular_members(pencil)[0].shape == (0, 9)
 
 
 @settings(max_examples=30, deadline=None)
@@ -303,14 +283,9 @@ def test_every_oriented_solution_of_the_exact_solver_is_found_and_no_other(seed)
     rng = np.random.default_rng(seed)
     points = points_with_outliers(rng)
     samples, Y = batch_of(points, rng)
-    exact, found = np.empty((3, 9)), np.empty((3, 9))
-    differences, counts = [], 0
-    for lane, sample in enumerate(samples):
-        expected = [
-            f
-            for f in exact[: linear.seven_point(points, sample, exact)].copy()
-            if oriented(f, points, sample)
-        ]
+    found, differences, counts = np.empty((3, 9)), [], 0
+    for lane, (sample, exact) in enumerate(zip(samples, seven_point(points[samples]), strict=True)):
+        expected = [f for f in exact if oriented(f, points, sample)]
         count = kernels.seven_point_batch_solutions(Y, lane, np.empty(9), found)
         counts += count != len(expected)
         for f in expected[: count if count == len(expected) else 0]:

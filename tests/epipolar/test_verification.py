@@ -17,8 +17,7 @@ from thesisrecon.epipolar.verification import (
     homography_inlier_ratio,
 )
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.homography import homography_residuals
-from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
+from thesisrecon.geometry.two_view import fundamental_from_cameras, homography_residuals, sampson_residuals
 from thesisrecon.records import FundamentalFit, Matches
 
 

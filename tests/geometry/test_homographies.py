@@ -8,8 +8,8 @@ from tests.geometry.properties import gap, holds_for_every, incidence_sine, rand
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
-from thesisrecon.geometry.homography import homography_residuals
 from thesisrecon.geometry.strata import transform
+from thesisrecon.geometry.two_view import homography_residuals
 from validation.scenes.transforms import random_transform
 
 

@@ -11,7 +11,7 @@ from tests.epipolar.pairs import angle_between, make_pair
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.geometry.homography import (
+from thesisrecon.geometry.two_view import (
     homography_linear,
     homography_residuals,
     require_parallax_of_matches,

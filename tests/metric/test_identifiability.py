@@ -19,7 +19,7 @@ from thesisrecon.geometry.critical_motions import UpgradedCameras, measure_motio
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.pipeline.large_sets import restrict_views
 from thesisrecon.records import IdentifiabilityReport
-from thesisrecon.selfcalibration._identifiability import check_identifiability
+from thesisrecon.selfcalibration._candidates import check_identifiability
 
 DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SETS = (

@@ -11,7 +11,7 @@ from thesisrecon.camera import project_camera
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.robust_resection import resect_calibrated

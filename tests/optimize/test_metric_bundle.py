@@ -3,7 +3,7 @@ import pytest
 
 from tests.conftest import refuses
 from tests.optimize.bundle_scenes import make_block, perturbed, project_block
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.intrinsic_unknowns import number_unknowns
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle

@@ -3,8 +3,13 @@
 import numpy as np
 
 from tests.synthetic import make_scene
-from thesisrecon.projective._model import ProjectiveModel, project_observations, update_inliers
-from thesisrecon.projective._track_selection import coverage_of_views, observation_cells
+from thesisrecon.projective._model import (
+    ProjectiveModel,
+    coverage_of_views,
+    observation_cells,
+    project_observations,
+    update_inliers,
+)
 
 
 def test_projected_observations_equal_their_numpy_twin():

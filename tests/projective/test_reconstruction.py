@@ -14,20 +14,22 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.optimize.robust_resection import resect_projective
-from thesisrecon.projective._model import ProjectiveModel, consistent_observations, retriangulate_points
-from thesisrecon.projective._track_selection import (
+from thesisrecon.projective._model import (
+    ProjectiveModel,
+    consistent_observations,
     initial_cameras,
     rank_initial_pairs,
+    retriangulate_points,
     select_tracks,
     select_tracks_with_parallax,
 )
 from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import (
     IncrementalProjective,
+    SequentialProjective,
     _find_inconsistent_view,
     _projection_std_px,
 )
-from thesisrecon.projective.sequential import SequentialProjective
 from thesisrecon.records import DegeneracyReport, Tracks
 
 VARIANTS = [IncrementalProjective(), SequentialProjective(), Factorization()]

@@ -26,11 +26,11 @@ from thesisrecon.optimize.bundle.identifiability import (
     excess_equations,
 )
 from thesisrecon.records import Tracks, Upgrade
-from thesisrecon.selfcalibration._frame import normalized_frame
-from thesisrecon.selfcalibration._identifiability import (
+from thesisrecon.selfcalibration._candidates import (
     check_identifiability,
     identifiability_without_calibration,
 )
+from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 

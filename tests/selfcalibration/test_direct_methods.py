@@ -17,13 +17,12 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import IntrinsicsPrior
-from thesisrecon.selfcalibration._dual_quadric import linear_quadric, rank_three
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations, _kruppa_cost, _kruppa_residuals, _Pairs
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
+from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, linear_quadric, rank_three
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)

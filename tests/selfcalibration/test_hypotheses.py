@@ -14,10 +14,10 @@ from thesisrecon.selfcalibration._candidates import (
     plane_from_focals,
     select_candidate,
 )
-from thesisrecon.selfcalibration._dual_quadric import quadric_hypotheses
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from thesisrecon.selfcalibration.stratified import Stratified
 
 METHODS = [HypothesesAndRefinement(), Stratified()]

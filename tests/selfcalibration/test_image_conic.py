@@ -12,15 +12,13 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conics import calibration_from_image
 from thesisrecon.selfcalibration._frame import infinite_homographies, square_pixel_constraints
-from thesisrecon.selfcalibration._image_conic import (
-    dual_conic_of_constant_camera,
-    solve_conic,
-    solve_conic_batch,
-)
 from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,
     LinearAbsoluteConic,
     _largest_rotation,
+    dual_conic_of_constant_camera,
+    solve_conic,
+    solve_conic_batch,
 )
 
 WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]

@@ -11,11 +11,12 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.io._images import read_images
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration._frame import projective_scene
-from thesisrecon.selfcalibration._line_segments import LineSegments, _fit_segments
 from thesisrecon.selfcalibration.parallel_lines import (
+    LineSegments,
     ParallelLines,
     VanishingPoints,
     _find_parallel_directions,
+    _fit_segments,
     _normalize_segments,
     _propose_vanishing_points,
     _refine_plane,

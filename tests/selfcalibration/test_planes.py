@@ -13,14 +13,18 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch, _local_minima
+from thesisrecon.selfcalibration.cheirality import (
+    CheiralityRegion,
+    CheiralitySearch,
+    _local_minima,
+    _plane_box,
+)
 from thesisrecon.selfcalibration.modulus import (
     ModulusConstraint,
     _modulus_coefficients,
     _modulus_residuals,
     _pairs_of_constant_cameras,
 )
-from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion, _plane_box
 from thesisrecon.selfcalibration.stratified import Stratified
 
 PAIRS = [

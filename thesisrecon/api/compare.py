@@ -14,7 +14,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words
 from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.geometry.similarity import estimate_similarity, rotation_errors_deg
+from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import Similarity
 from thesisrecon.results import (
     THRESHOLDS,

@@ -16,7 +16,7 @@ from scipy.special import gammaincinv
 from thesisrecon.arrays import B8, F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, unknown_word
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model
 from thesisrecon.io._positions import read_positions

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64, U8, require_finite, require_shapes
 from thesisrecon.config.text import Config, as_config
-from thesisrecon.epipolar._frame import MAX_PX
-from thesisrecon.epipolar.estimation import FundamentalEstimate, Method, fit_all, fit_seven
+from thesisrecon.epipolar._matches import MAX_PX
+from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
 from thesisrecon.epipolar.homography import HomographyFit, fit_homography
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
@@ -308,15 +308,15 @@ def estimate_fundamental(
         threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
     if method == "locally-optimised":
         fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
-    elif method == "seven-point":
-        fit = fit_seven(xy1, xy2)
     elif method not in get_args(Method):
         raise ValueError(unknown_word("method", method, get_args(Method)))
     else:
         # Imported on use: the default method does not need it.
-        from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
+        from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, fit_all, fit_seven
 
-        if method == "ransac":
+        if method == "seven-point":
+            fit = fit_seven(xy1, xy2)
+        elif method == "ransac":
             fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
         elif method == "least-median":
             fit = LeastMedianOfSquares().estimate(xy1, xy2, rng)

@@ -19,8 +19,7 @@ from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.camera_matrix import calibration_matrix
-from thesisrecon.geometry.homography import require_parallax_of_matches
-from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io._images import read_image, read_levels, read_pixels
 from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, require_mesh
 from thesisrecon.stereo._planar import PlanarRectification

@@ -32,8 +32,7 @@ from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.projective.factorization import Factorization
-from thesisrecon.projective.incremental import IncrementalProjective
-from thesisrecon.projective.sequential import SequentialProjective
+from thesisrecon.projective.incremental import IncrementalProjective, SequentialProjective
 from thesisrecon.records import (
     DepthMap,
     DisparityMap,

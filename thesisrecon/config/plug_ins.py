@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._noise import noise_scale
-from thesisrecon.epipolar.criteria import fundamental_covariance
+from thesisrecon.epipolar._matches import PairFrame, check_matches, noise_scale
+from thesisrecon.epipolar.refinement import fundamental_covariance
 from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
 from thesisrecon.geometry.two_view import sampson_residuals
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice

@@ -15,26 +15,28 @@ import scipy
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar._frame import PairFrame, check_matches, check_start
-from thesisrecon.epipolar._noise import (
+from thesisrecon.epipolar._matches import (
+    PairFrame,
     chance_of_agreement,
+    check_matches,
+    check_start,
     log10_false_alarms,
     multiplicity_weights,
     noise_scale,
     trimmed_noise_scale,
 )
-from thesisrecon.epipolar._planes import (
+from thesisrecon.epipolar._sampling import sampson_distances
+from thesisrecon.epipolar.homography import (
     find_dominant_plane,
     fundamentals_of_plane,
     plane_covariance,
     refine_plane,
 )
-from thesisrecon.epipolar._sampling import sampson_distances
-from thesisrecon.epipolar.criteria import SAMPSON, UNBOUNDED, refine
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.geometry.homography import homography_sampson_residuals
-from thesisrecon.geometry.similarity import nearest_rotation
 from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.geometry.strata import nearest_rotation
+from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.optimize.least_squares import minimize_residuals
 
 # Initial focal lengths in units of the point spread: fields of view of 150 to 10 degrees.

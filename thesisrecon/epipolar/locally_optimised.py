@@ -8,10 +8,9 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._noise import NoiseMixture, noise_scale, noise_width
+from thesisrecon.epipolar._matches import NoiseMixture, PairFrame, check_matches, noise_scale, noise_width
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
-from thesisrecon.epipolar.criteria import SAMPSON, fundamental_covariance, refine
+from thesisrecon.epipolar.refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.errors import StageFailure
 from thesisrecon.optimize.noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit

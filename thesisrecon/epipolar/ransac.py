@@ -1,21 +1,23 @@
-"""Section 5.4: RANSAC of the thesis (Algorithm 2), its inlier tests, and least median of squares."""
+"""Section 5.4: RANSAC of the thesis (Algorithm 2), its inlier tests, and least median of squares.
+
+Beside them the estimates from all matches and from seven, with the same noise and covariance.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._noise import noise_scale
+from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar._matches import PairFrame, check_matches, noise_scale
 from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
-from thesisrecon.epipolar.criteria import fundamental_covariance
-from thesisrecon.epipolar.linear import seven_point
-from thesisrecon.epipolar.refinement import Criterion, refine_fundamental
+from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point, seven_point
+from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import epipolar_distances, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit
@@ -23,11 +25,8 @@ from thesisrecon.records import FundamentalFit
 # 95 % quantiles of the chi-square distribution with one and two degrees of freedom.
 CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979
 MINIMUM = 8
-# Residuals below this are rounding errors, not noise.
-EXACT_PX = 1e-6
-# The last rounds take the median over the matches within this many sigma; that of all matches is biased by
-# the wrong ones.
-NEAR_SIGMAS = 2.5
+# Samples solved at once.
+_BATCH = 50
 
 
 class _InlierTest(NamedTuple):
@@ -68,53 +67,9 @@ def discard_outliers(
     residuals = np.abs(distances(F, xy1, xy2))
     limit = max(ratio * limit_px, float(np.partition(residuals, MINIMUM - 1)[MINIMUM - 1]))
     sigma = noise_scale(residuals[residuals <= limit]) / ratio
-    inliers = residuals**2 <= max(most * sigma**2, EXACT_PX**2)
+    # Residuals below 1e-6 px are rounding errors, not noise.
+    inliers = residuals**2 <= max(most * sigma**2, 1e-12)
     return sigma, inliers if inliers.sum() >= MINIMUM else residuals <= limit
-
-
-@dataclass(frozen=True)
-class _SampleConsensus:
-    """Algorithm 2: the model with the most data within a threshold.
-
-    Between models with the same number of inliers the lower standard deviation decides (Fischler and
-    Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
-    n! / s!). ``stop_inlier_ratio`` ends the search; ``least_median`` ranks models by the median of their
-    residuals instead (Rousseeuw, 1984).
-    """
-
-    threshold: float
-    max_samples: int = 1000
-    stop_inlier_ratio: float = 1.0
-    least_median: bool = False
-
-    def search(
-        self,
-        solve: Callable[[I64], list[F64]],
-        residuals: Callable[[F64], F64],
-        sample_size: int,
-        n: int,
-        rng: Generator,
-    ) -> tuple[F64, B8, int] | None:
-        """Return the best model of n data, its inliers (n,) and the number of samples, or None."""
-        best: tuple[F64, B8] | None = None
-        best_rank, drawn = (-np.inf, 0.0), 0
-        sample = np.empty(sample_size, dtype=np.int64)
-        while drawn < self.max_samples and best_rank[0] <= self.stop_inlier_ratio * n:
-            draw_sample(rng.random(sample_size), n, sample)
-            drawn += 1
-            for model in solve(sample):
-                rank, inliers = self._rank(residuals(model))
-                if rank > best_rank:
-                    best, best_rank = (model, inliers), rank
-        return None if best is None else (*best, drawn)
-
-    def _rank(self, residuals: F64) -> tuple[tuple[float, float], B8]:
-        if self.least_median:
-            median = float(np.partition(residuals, len(residuals) // 2)[len(residuals) // 2])
-            return (-median, 0.0), residuals <= median
-        inliers = np.abs(residuals) < self.threshold
-        rms = float(np.sqrt(np.mean(residuals[inliers] ** 2))) if inliers.any() else 0.0
-        return (int(inliers.sum()), -rms), inliers
 
 
 @dataclass(frozen=True)
@@ -165,11 +120,11 @@ class ThesisRansac:
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
-        gate_px = INLIER_TESTS[self.inlier_test].ratio * self.threshold_px
-        search = _SampleConsensus(gate_px, self.samples, self.stop_inlier_ratio)
-        criterion: Criterion = "epipolar-distance" if self.epipolar_distance else "sampson"
-        limit_px, test = self.threshold_px, self.inlier_test
-        return _search_and_refine(xy1, xy2, rng, search, self.rounds, limit_px, test, criterion)
+        return _search_and_refine(
+            xy1, xy2, rng, samples=self.samples, rounds=self.rounds, threshold_px=self.threshold_px,
+            enough=self.stop_inlier_ratio, test=self.inlier_test,
+            criterion="epipolar-distance" if self.epipolar_distance else "sampson",
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -197,48 +152,101 @@ class LeastMedianOfSquares:
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
-        search = _SampleConsensus(np.inf, self.samples, least_median=True)
-        return _search_and_refine(xy1, xy2, rng, search, self.rounds)
+        return _search_and_refine(xy1, xy2, rng, samples=self.samples, rounds=self.rounds)
+
+
+def _search(
+    points: F64, distances: Callable[[F64], F64], rng: Generator, *,
+    gate: float = np.inf, samples: int, enough: float = np.inf,
+) -> tuple[F64 | None, B8, int]:  # fmt: skip
+    """Algorithm 2: F (9,) of seven points with the most of them within the gate, these, and the samples.
+
+    Between models with the same number of inliers the lower standard deviation decides (Fischler and
+    Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
+    n! / s!). More than ``enough`` inliers end the search; without a gate the lowest median of the distances
+    decides (Rousseeuw, 1984).
+    """
+    best, inliers, best_rank, drawn = None, np.zeros(len(points), dtype=bool), (-np.inf, 0.0), 0
+    chosen, middle = np.empty((samples, 7), dtype=np.int64), len(points) // 2
+    for sample, uniforms in zip(chosen, deepcopy(rng).random((samples, 7)), strict=True):
+        draw_sample(uniforms, len(points), sample)
+    while drawn < samples and best_rank[0] <= enough:
+        if drawn % _BATCH == 0:
+            solved = seven_point(points[chosen[drawn : drawn + _BATCH]])
+        for model in solved[drawn % _BATCH]:
+            r = np.abs(distances(model))
+            if np.isinf(gate):
+                median = float(np.partition(r, middle)[middle])
+                rank, inside = (-median, 0.0), r <= median
+            else:
+                inside = r < gate
+                rms = float(np.sqrt(np.mean(r[inside] ** 2))) if inside.any() else 0.0
+                rank = (float(inside.sum()), -rms)
+            if rank > best_rank:
+                best, inliers, best_rank = model, inside, rank
+        drawn += 1
+    # Numbers of samples that were not needed are left to others.
+    rng.random((drawn, 7))
+    return best, inliers, drawn
 
 
 def _search_and_refine(
-    xy1: F64,
-    xy2: F64,
-    rng: Generator,
-    search: _SampleConsensus,
-    rounds: int,
-    limit_px: float | None = None,
-    test: InlierTest = "sampson",
-    criterion: Criterion = "sampson",
-) -> FundamentalFit:
-    """Search, then refine and discard outliers; without ``limit_px`` the limit follows from sigma."""
+    xy1: F64, xy2: F64, rng: Generator, *, samples: int, rounds: int,
+    threshold_px: float = np.inf, enough: float = np.inf,
+    test: InlierTest = "sampson", criterion: Criterion = "sampson",
+) -> FundamentalFit:  # fmt: skip
+    """Search, then refine and discard outliers; without ``threshold_px`` the limit follows from sigma."""
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     frame = PairFrame.of(xy1, xy2)
-    points = frame.points(xy1, xy2)
-    search = replace(search, threshold=search.threshold * frame.scale)
+    points, known = frame.points(xy1, xy2), np.isfinite(threshold_px)
 
-    def solve(sample: I64) -> list[F64]:
-        solutions = np.empty((3, 9))
-        return list(solutions[: seven_point(points, sample, solutions)])
-
-    def residuals(model: F64) -> F64:
+    def distances(model: F64) -> F64:
         if test == "sampson":
-            return np.asarray(sampson_distances(model, points))
+            return np.asarray(sampson_distances(np.ascontiguousarray(model), points))
         return INLIER_TESTS[test].distances(model.reshape(3, 3), points[:, :2], points[:, 2:])
 
-    found = search.search(solve, residuals, 7, len(points), rng)
-    needed = MINIMUM if limit_px else 1
-    if found is None or found[1].sum() < needed:
+    gate = INLIER_TESTS[test].ratio * threshold_px * frame.scale
+    f, inliers, drawn = _search(
+        points, distances, rng, gate=gate, samples=samples, enough=enough * len(points)
+    )
+    needed = MINIMUM if known else 1
+    if f is None or inliers.sum() < needed:
         raise StageFailure(
             "no epipolar geometry explains the matches",
-            f"none of {search.max_samples} samples has {needed} inliers among {len(xy1)} matches",
+            f"none of {samples} samples has {needed} inliers among {len(xy1)} matches",
             "check that the images overlap and that the matches are correct",
         )
-    F = frame.matrix_in_pixels(found[0])
-    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or np.inf, test=test)
+    F = frame.matrix_in_pixels(f)
+    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=threshold_px, test=test)
     for _ in range(rounds):
         F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
-        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px or NEAR_SIGMAS * sigma, test=test)
-    f = frame.matrix_in_frame(F)
-    covariance = fundamental_covariance(frame, f, points[inliers], sigma * frame.scale)
-    return FundamentalFit(F, inliers, sigma, covariance, found[2])
+        # The median of all matches is biased by the wrong ones: later rounds take those within 2.5 sigma.
+        limit_px = threshold_px if known else 2.5 * sigma
+        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px, test=test)
+    covariance = fundamental_covariance(frame, frame.matrix_in_frame(F), points[inliers], sigma * frame.scale)
+    return FundamentalFit(F, inliers, sigma, covariance, drawn)
+
+
+def fit_all(xy1: F64, xy2: F64, *, refined: bool) -> FundamentalFit:
+    """Estimate F from all matches; arguments as for :func:`thesisrecon.estimate_fundamental`."""
+    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    F = estimate_eight_point(xy1, xy2)
+    F = refine_fundamental(F, xy1, xy2, "reprojection") if refined else F
+    sigma, inliers = discard_outliers(F, xy1, xy2)
+    frame = PairFrame.of(xy1, xy2)
+    points = frame.points(xy1[inliers], xy2[inliers])
+    covariance = fundamental_covariance(frame, frame.matrix_in_frame(F), points, sigma * frame.scale)
+    return FundamentalFit(F, inliers, sigma, covariance)
+
+
+def fit_seven(xy1: F64, xy2: F64) -> FundamentalFit:
+    """Estimate F of seven matches; see :func:`thesisrecon.estimate_fundamental`."""
+    solutions = estimate_seven_point(xy1, xy2)
+    if not len(solutions):
+        raise StageFailure(
+            "the seven matches do not determine the fundamental matrix",
+            "their equations are dependent",
+            "choose seven matches in general position, no four of them in one plane of the scene",
+        )
+    every = np.ones(len(xy1), dtype=bool)
+    return FundamentalFit(solutions[0], every, np.nan, np.full((9, 9), np.nan), 0, solutions[1:])

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.epipolar._degeneracy import assess_degeneracy
-from thesisrecon.epipolar._planes import SUBSET, count_transferred, induced_homography
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
+from thesisrecon.epipolar.degeneracy import assess_degeneracy
+from thesisrecon.epipolar.homography import SUBSET, count_transferred, induced_homography
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.geometry.homography import homography_linear, homography_residuals
-from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_residuals
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 # 99 % of a plane's matches: sqrt(chi-square(2)) = 3.03, times sqrt(2) for noise in both images.

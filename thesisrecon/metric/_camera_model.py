@@ -14,7 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import CENTRE, FOCAL, MetricEstimate, camera_rows, reproject_observations
 from thesisrecon.optimize.bundle.scatter import point_blocks

@@ -24,7 +24,7 @@ from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import project_camera
 from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.similarity import nearest_rotation
+from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.matching._repeated_structure import reject_repeated_structure, strong_pairs
 from thesisrecon.pipeline.job import Job

@@ -17,15 +17,17 @@ from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry.camera_matrix import orient_signs
 from thesisrecon.geometry.conditioning import normalizing_transform
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.homography import homography_linear, homography_sampson_residuals
-from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.noise import noise_from_distances
-from thesisrecon.projective._model import ProjectiveModel, adjust_all, retriangulate_points, to_reconstruction
-from thesisrecon.projective._track_selection import (
+from thesisrecon.projective._model import (
     NO_PARALLAX,
+    ProjectiveModel,
+    adjust_all,
     expand_to_all_tracks,
     rank_initial_pairs,
     require_pair_with_parallax,
+    retriangulate_points,
+    to_reconstruction,
     working_tracks,
 )
 from thesisrecon.projective.incremental import IncrementalProjective

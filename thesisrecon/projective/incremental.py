@@ -1,7 +1,8 @@
 """Incremental projective reconstruction (chapter 6; P. Beardsley, A. Zisserman, D. Murray, IJCV 23, 1997).
 
 A camera is accepted if its covariance shows that it is determined (a view of a single plane fits its points
-with an arbitrary P), and kept if it agrees with its points and verified matches; others are deferred.
+with an arbitrary P), and kept if it agrees with its points and verified matches; others are deferred. The
+sequential reconstruction of the thesis, used by the preset ``thesis``, does without these tests.
 """
 
 from __future__ import annotations
@@ -23,16 +24,14 @@ from thesisrecon.projective._model import (
     ProjectiveModel,
     adjust_all,
     adjust_locally,
-    retriangulate_points,
-    to_reconstruction,
-)
-from thesisrecon.projective._track_selection import (
     coverage_of_views,
     expand_to_all_tracks,
     initial_cameras,
     rank_initial_pairs,
     require_pair_with_parallax,
+    retriangulate_points,
     select_core,
+    to_reconstruction,
     tracks_of_views,
     working_tracks,
 )
@@ -274,3 +273,39 @@ class IncrementalProjective:
         model.reasons[view] = reason
         retriangulate_points(model, self.outlier_sigmas[0])
         return True
+
+
+class _WithoutAdjustment(IncrementalProjective):
+    """Resection and triangulation alone, without a test of the new camera."""
+
+    outlier_sigmas = (12.0, 12.0)
+    max_projection_std_rel = None
+    bundle_iterations, final_rounds = 0, 0
+
+
+@dataclass(frozen=True)
+class SequentialProjective:
+    """Projective reconstruction of one view after the other in image order (6.6).
+
+    Starts with the pair of neighbours with most matches; each further view is resected, new points are
+    triangulated and outliers removed. One bundle adjustment at the end replaces a lost chapter of the thesis.
+    """
+
+    def reconstruct(
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
+    ) -> Reconstruction:
+        """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
+        require_pair_with_parallax(pairs)
+        accepted = [p for p in pairs if p.accepted]
+        neighbours = [p for p in accepted if p.j == p.i + 1]
+        candidates = sorted(neighbours or accepted, key=lambda p: (-p.inliers, p.i, p.j))
+        if attempt >= len(candidates):
+            raise StageFailure(
+                Notice("no-initial-pair"), f"{counted(len(candidates), 'image pair')} accepted"
+            )
+        incremental = _WithoutAdjustment()
+        model = incremental.begin(tracks, candidates[attempt], sizes)
+        while incremental.add_next_camera(model, rng) is not None:
+            pass
+        adjust_all(model, 10, incremental.outlier_sigmas[1])
+        return to_reconstruction(model, incremental.min_points)

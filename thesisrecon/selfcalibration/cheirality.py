@@ -1,13 +1,19 @@
-"""Hartley's search for the plane at infinity within the cheirality bounds (HZ 21; IJCV 26(1), 1998)."""
+"""Cheirality bounds on the plane at infinity, and Hartley's search within them (HZ 21; IJCV 26(1), 1998).
+
+The inequalities X'v > 0, delta C'v > 0 of planes that keep points and cameras on one side form a polytope,
+bounded in a quasi-affine frame. The orientation delta is unknown: of the two polytopes one is usually empty.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
 from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._frame import (
     ConicConstraints,
@@ -16,9 +22,172 @@ from thesisrecon.selfcalibration._frame import (
     ReferenceFrame,
     infinite_homographies,
 )
-from thesisrecon.selfcalibration._image_conic import solve_conic_batch
 from thesisrecon.selfcalibration._refinement import minimize_batch
-from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion, Polytope, distinct_planes
+from thesisrecon.selfcalibration.absolute_conic import solve_conic_batch
+
+# Planes closer than this, relative to 1 + |p|, are the same.
+_SAME_PLANE = 1e-3
+
+
+@dataclass(frozen=True)
+class Polytope:
+    """Planes (v, 1), v in a ``box`` (3, 2), with ``rows`` (M, 4) (v, 1) > 0 in a quasi-affine frame."""
+
+    rows: F64
+    quasi_affine: F64
+    box: F64
+
+    def contains(self, v: F64) -> B8:
+        """Return whether planes (B, 3) of the quasi-affine frame satisfy every inequality."""
+        planes = np.column_stack([v, np.ones(len(v))])
+        parts = np.array_split(planes, max(1, len(planes) // 512))
+        return np.concatenate([(part @ self.rows.T > 0).all(axis=1) for part in parts])
+
+    def reference_planes(self, v: F64) -> F64:
+        """Return planes p (B, 3) of the reference frame from planes (B, 3) of the quasi-affine frame."""
+        back = np.column_stack([v, np.ones(len(v))]) @ self.quasi_affine
+        return np.asarray(back[:, :3] / np.where(back[:, 3:] == 0, 1e-12, back[:, 3:]))
+
+    def sample(self, n: int, rng: np.random.Generator) -> F64:
+        """Return ``n`` planes (n, 3) inside, by hit-and-run from the plane of the origin."""
+        v = np.zeros((n, 3))
+        for _ in range(12):
+            direction = rng.normal(size=(n, 3))
+            speed, room = direction @ self.rows[:, :3].T, v @ self.rows[:, :3].T + self.rows[:, 3]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                reach = -room / speed
+            far = np.where(speed < 0, reach, np.inf).min(axis=1)
+            near = np.where(speed > 0, reach, -np.inf).max(axis=1)
+            step = near + (far - near) * rng.random(n)
+            v += np.where(np.isfinite(step), step, 0.0)[:, None] * direction
+        return v
+
+
+@dataclass(frozen=True)
+class CheiralityRegion:
+    """Oriented points (M, 4) and centres (R, 4) in the reference frame, and the non-empty polytopes."""
+
+    points: F64
+    centres: F64
+    polytopes: tuple[Polytope, ...]
+
+    @classmethod
+    def of(
+        cls, frame: ReferenceFrame, reconstruction: Reconstruction, *,
+        max_points: int, rng: np.random.Generator,
+    ) -> CheiralityRegion:  # fmt: skip
+        """Compute the region, without polytopes below eight usable points; ``rng`` selects ``max_points``."""
+        X, C = _cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
+        found = [_polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []
+        return cls(X, C, tuple(part for part in found if part is not None))
+
+    def sample(self, n: int, rng: np.random.Generator) -> F64:
+        """Draw ``n`` planes p (n, 3) in equal shares; standard normal if both polytopes are empty."""
+        if not self.polytopes:
+            return rng.normal(size=(n, 3))
+        share = -(-n // len(self.polytopes))
+        return np.concatenate([p.reference_planes(p.sample(share, rng)) for p in self.polytopes])[:n]
+
+    def wrong_side_ratio(self, planes: F64) -> F64:
+        """Return the share (B,) of points and cameras on the wrong side of planes (B, 3)."""
+        v = np.column_stack([planes, np.ones(len(planes))])
+        behind = (v @ self.points.T <= 0).sum(axis=1), (v @ self.centres.T <= 0).sum(axis=1)
+        n, m = len(self.points), len(self.centres)
+        wrong = np.minimum(behind[0], n - behind[0]) + np.minimum(behind[1], m - behind[1])
+        return np.asarray(wrong / max(n + m, 1))
+
+
+def _polytope_of(X: F64, C: F64) -> Polytope | None:
+    """Return the polytope of oriented points (N, 4) and centres (R, 4) by linear programs.
+
+    None if it is empty, or if all points are one.
+    """
+    v = _deepest_plane(np.concatenate([X, C]))
+    extent = np.linalg.svd(X, compute_uv=False)
+    if v is None or not extent[1] > 1e-12 * extent[0]:
+        return None
+    T = _quasi_affine_frame(X, v)
+    rows = _unit_rows(np.concatenate([X, C]) @ T.T)
+    box = _plane_box(rows)
+    return None if box is None else Polytope(rows, T, box)
+
+
+def distinct_planes(planes: F64, cost: F64) -> list[int]:
+    """Select planes (B, 3) that differ, lowest finite cost first; return their indices."""
+    kept: list[int] = []
+    for k in np.argsort(cost, kind="stable"):
+        limit = _SAME_PLANE * (1.0 + np.linalg.norm(planes[k]))
+        if np.isfinite(cost[k]) and all(np.linalg.norm(planes[k] - planes[m]) > limit for m in kept):
+            kept.append(int(k))
+    return kept
+
+
+def _cheirality_inequalities(
+    frame: ReferenceFrame, reconstruction: Reconstruction, *, max_points: int, rng: np.random.Generator
+) -> tuple[F64, F64]:
+    """Return oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
+
+    Only points of at least three views are used: a single wrong two-view point, which no other view can
+    contradict, would exclude the true plane. Points whose depths have no consistent sign are omitted.
+    """
+    tracks, inlier = reconstruction.tracks, reconstruction.inlier
+    view, point = tracks.view_index[inlier], tracks.point_index[inlier]
+    views, points, _ = orient_signs(reconstruction.P, reconstruction.X, view, point)
+    P = reconstruction.P * views[:, None, None]
+    X = reconstruction.X * points[:, None]
+    positive = np.einsum("kj,kj->k", P[view, 2], X[point]) > 0
+    seen = np.bincount(point, minlength=len(X))
+    usable = (seen >= 3) & (np.bincount(point, positive, minlength=len(X)) == seen)
+    chosen = np.flatnonzero(usable)
+    if len(chosen) > max_points:
+        chosen = np.sort(rng.choice(chosen, max_points, replace=False))
+    T = frame.reference_from_projective
+    sign = np.sign(np.linalg.det(T))
+    X_reference = X[chosen] @ T.T
+    P_reference = P[frame.views] @ np.linalg.inv(T)
+    C = camera_centre(P_reference) * sign
+    return _unit_rows(X_reference), _unit_rows(C)
+
+
+def _unit_rows(A: F64) -> F64:
+    return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
+
+
+def _deepest_plane(rows: F64) -> F64 | None:
+    """Return the plane v with rows v >= d, |v| <= 1 and the largest d (HZ 21); None unless d > 0."""
+    A = np.column_stack([-rows, np.ones(len(rows))])
+    solution = scipy.optimize.linprog(
+        [0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)]
+    )
+    if solution.x is None or not solution.x[4] > 0:
+        return None
+    return np.asarray(solution.x[:4], dtype=np.float64)
+
+
+def _quasi_affine_frame(X: F64, v: F64) -> F64:
+    """Return the transform (4, 4) that sends the plane v to infinity and whitens the points."""
+    basis = np.linalg.svd(v[None])[2][1:]
+    Y = X @ basis.T / (X @ v)[:, None]
+    centre = Y.mean(axis=0)
+    value, vector = np.linalg.eigh(np.cov((Y - centre).T))
+    whiten = vector @ np.diag(np.maximum(value, np.finfo(np.float64).eps * value.max()) ** -0.5) @ vector.T
+    T = np.zeros((4, 4))
+    T[:3] = whiten @ (basis - np.outer(centre, v))
+    T[3] = v
+    return T
+
+
+def _plane_box(rows: F64) -> F64 | None:
+    """Return bounds (3, 2) of v for planes (v, 1) that satisfy the inequalities; None if unbounded."""
+    box = np.zeros((3, 2))
+    for k, side in np.ndindex(3, 2):
+        goal = np.zeros(3)
+        goal[k] = (1.0, -1.0)[side]
+        solution = scipy.optimize.linprog(goal, A_ub=-rows[:, :3], b_ub=rows[:, 3], bounds=[(None, None)] * 3)
+        if solution.x is None or not solution.success:
+            return None
+        box[k, side] = solution.x[k]
+    return box
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from thesisrecon.selfcalibration._candidates import (
     plane_from_focals,
     select_candidate,
 )
-from thesisrecon.selfcalibration._dual_quadric import minimize_quadric, quadric_hypotheses
 from thesisrecon.selfcalibration._frame import (
     ReferenceFrame,
     SolverUnknowns,
@@ -29,6 +28,7 @@ from thesisrecon.selfcalibration._frame import (
 )
 from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.quadric import minimize_quadric, quadric_hypotheses
 
 # Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
 # alone is insufficient.

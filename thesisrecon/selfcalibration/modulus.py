@@ -16,7 +16,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene
 from thesisrecon.selfcalibration._refinement import minimize_batch
-from thesisrecon.selfcalibration.plane_bounds import CheiralityRegion, distinct_planes
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion, distinct_planes
 
 _SLACK = _LOSS_SCALE = 0.05
 

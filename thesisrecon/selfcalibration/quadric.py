@@ -1,4 +1,9 @@
-"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3)."""
+"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
+
+Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
+principal point gives six equations linear in the quadric, whose weights assume a focal length near 1.
+Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999, over the plane and all unknown intrinsics.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +11,133 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thesisrecon.arrays import F64
+from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.noise import huber
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
+    FOCAL_LIMITS,
+    Candidate,
     as_stage_failure,
     candidates_from_parameters,
     group_focals_from_planes,
     select_candidate,
 )
-from thesisrecon.selfcalibration._dual_quadric import minimize_quadric, quadric_hypotheses
-from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
-from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration._frame import (
+    ReferenceFrame,
+    SolverUnknowns,
+    normalized_frame,
+    solver_unknowns,
+)
+from thesisrecon.selfcalibration._refinement import (
+    RotationCriterion,
+    central_differences,
+    dual_image_residuals,
+    quadratic_rows,
+)
+
+_MIN_NOISE = 1e-9
+_REWEIGHTINGS = 4
+# Maximum number of noise estimates.
+_NOISE_PASSES = 6
+
+
+def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
+    """Solve the weighted linear equations for normalizing focal lengths (B,); return quadrics Q (B, 4, 4).
+
+    Rows are divided by uncertainties, 9 (focal length), 0.2 (aspect), 0.01 (skew), 0.1 (principal point), and
+    by w33 of the previous iterate; the first iteration divides by the norm of the row of w33, since the 1 of
+    the paper depends on the camera scale. Q has unit norm, and rank 4 under noise.
+    """
+    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
+    P[:, :, :2] /= focals[:, None, None, None]
+    p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
+    w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
+    rows = np.stack(
+        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, quadratic_rows(p1, p2) / 0.01,
+         quadratic_rows(p1, p3) / 0.1, quadratic_rows(p2, p3) / 0.1], axis=2,
+    )  # fmt: skip
+    nu = np.linalg.norm(w33, axis=-1)
+    q = np.zeros((len(focals), 10))
+    for _ in range(_REWEIGHTINGS):
+        weighted = rows / np.maximum(nu, 1e-9 * nu.max(axis=1, keepdims=True))[:, :, None, None]
+        A = weighted.reshape(len(focals), -1, 10)
+        # SVD of A, since A'A would lose half the digits.
+        q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
+        nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
+    upper, Q = np.triu_indices(4), np.zeros((len(q), 4, 4))
+    Q[:, upper[0], upper[1]] = Q[:, upper[1], upper[0]] = q
+    Q *= np.where(np.trace(Q[:, :3, :3], axis1=1, axis2=2) < 0, -1.0, 1.0)[:, None, None]
+    return Q
+
+
+def rank_three(Q: F64) -> tuple[F64, F64]:
+    """Return the nearest quadrics of rank 3 to Q (B, 4, 4) and their null vectors, the planes at infinity."""
+    value, vector = np.linalg.eigh(Q)
+    smallest = np.abs(value).argmin(axis=1)
+    null = np.take_along_axis(vector, smallest[:, None, None], axis=2)[:, :, 0]
+    np.put_along_axis(value, smallest[:, None], 0.0, axis=1)
+    return np.asarray((vector * value[:, None, :]) @ vector.swapaxes(1, 2)), null
+
+
+def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
+    """Planes at infinity (B', 3) and reference focals (B',) of linear quadrics from focals (B,)."""
+    try:
+        Q, null = rank_three(linear_quadric(frame, focals))
+    except np.linalg.LinAlgError:
+        return np.zeros((0, 3)), np.zeros(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        p = null[:, :3] / null[:, 3:]
+        f2 = (Q[:, 0, 0] + Q[:, 1, 1]) / (2.0 * Q[:, 2, 2])
+    f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, focals**2))
+    good = np.isfinite(p).all(axis=1)
+    return p[good], np.clip(f[good], *FOCAL_LIMITS)
+
+
+def minimize_quadric(
+    frame: ReferenceFrame, unknown: SolverUnknowns, plane: F64, log_f: F64, *,
+    method: str, loss_scale: float = 0.05,
+) -> Candidate:  # fmt: skip
+    """Minimize the nonlinear criterion from one plane (3,) and log focal lengths (R,).
+
+    The priors are weighted relative to the noise of the residuals: the first pass assumes 1 %, each further
+    one uses the previous estimate until it no longer falls. Huber's loss is linear beyond ``loss_scale``.
+    """
+    # The residuals also vanish as all focal lengths go to 0: the weak prior makes this cost more than noise.
+    unknown = unknown.with_focal_prior()
+    theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
+    for _ in range(_NOISE_PASSES):
+        supposed = noise
+        theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
+        if noise > 0.7 * supposed:
+            break
+    K = unknown.calibrations(theta[None, 3:])[0]
+    K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
+    return Candidate(theta[:3], K, cost, method, K_std)
+
+
+def _minimize(
+    frame: ReferenceFrame, unknown: SolverUnknowns, theta: F64, noise: float, loss_scale: float
+) -> tuple[F64, float, F64, float]:
+    def residuals(batch: F64) -> F64:
+        K = unknown.calibrations(batch[:, 3:])
+        data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], batch[:, :3])
+        return np.concatenate(
+            [data.reshape(len(batch), -1), noise * unknown.prior_residuals(batch[:, 3:])], axis=1
+        )
+
+    found = minimize_residuals(
+        lambda x: residuals(x[None])[0], theta,
+        jacobian=lambda x: central_differences(residuals, x, 1e-6 * (1.0 + np.abs(x))),
+        loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
+    )  # fmt: skip
+    data = found.residual[: 6 * len(frame.views)]
+    # Five independent entries per camera except the reference, whose residuals vanish.
+    free = np.isinf(unknown.std).sum() + 3
+    dof = max(5 * (len(frame.views) - 1) - int(free), 1)
+    noise = max(float(np.sqrt(np.sum(data**2) / dof)), _MIN_NOISE)
+    scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
+    return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.records import Image, IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
-from thesisrecon.selfcalibration._dual_quadric import minimize_quadric
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
+from thesisrecon.selfcalibration.quadric import minimize_quadric
 
 M = TypeVar("M")
 

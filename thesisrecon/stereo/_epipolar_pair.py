@@ -18,12 +18,12 @@ from thesisrecon.arrays import F64, require_finite, require_shapes
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.homography import require_parallax_of_matches
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
     infinite_homography,
     quasi_euclidean_planes,
+    require_parallax_of_matches,
 )
 from thesisrecon.optimize.triangulation import triangulate_points
 

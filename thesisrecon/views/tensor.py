@@ -21,8 +21,7 @@ from thesisrecon.camera import rq
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
-from thesisrecon.geometry.homography import require_parallax_of_matches
-from thesisrecon.geometry.two_view import enforce_rank_two, epipoles
+from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, require_parallax_of_matches
 
 OFF_ROTATION = 1e-4
 """Tolerance of R'R - I: a rotation written with four digits passes."""

@@ -9,7 +9,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.camera import project_camera
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.similarity import estimate_similarity, rotation_errors_deg
+from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import Reconstruction
 
 

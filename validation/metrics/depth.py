@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.records import DepthMap, DisparityMap, Reconstruction, Similarity
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.stereo import StereoPair

@@ -9,8 +9,8 @@ import scipy
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar._frame import PairFrame, as_matches, check_matches
-from thesisrecon.epipolar.criteria import fundamental_covariance
+from thesisrecon.epipolar._matches import PairFrame, as_matches, check_matches
+from thesisrecon.epipolar.refinement import fundamental_covariance
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.two_view import epipolar_distance_std, epipoles, fundamental_from_cameras
 from thesisrecon.records import FundamentalFit

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.records import Reconstruction, Similarity
 from validation.references.open3d_geometry import refine_by_icp
 from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task, slug

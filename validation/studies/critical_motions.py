@@ -24,7 +24,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
-from thesisrecon.projective._track_selection import require_pair_with_parallax
+from thesisrecon.projective._model import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.runs.study import Part, pick, report_progress

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import thesisrecon
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.similarity import estimate_similarity
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, retriangulate_tracks

@@ -6,21 +6,32 @@ matches off the plane, and a wrong F has as many inliers as the right one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
 
 from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._frame import PairFrame, check_matches
-from thesisrecon.epipolar._noise import chance_of_agreement, log10_false_alarms, multiplicity_weights
-from thesisrecon.epipolar._planes import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
+from thesisrecon.epipolar._matches import (
+    PairFrame,
+    chance_of_agreement,
+    check_matches,
+    log10_false_alarms,
+    multiplicity_weights,
+)
 from thesisrecon.epipolar._sampling import sampson_distances
-from thesisrecon.epipolar.criteria import SAMPSON, refine
+from thesisrecon.epipolar.homography import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
+from thesisrecon.epipolar.refinement import SAMPSON, refine
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.optimize.noise import student_factor
 from thesisrecon.records import DegeneracyReport, FundamentalFit
+
+Method = Literal[
+    "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
+]  # fmt: skip
 
 NEIGHBOURS = 5
 # Epipoles tried and matches off the plane that each is scored on.
@@ -275,3 +286,34 @@ def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
     some = some[:: max(1, len(some) // SAMPLED)]
     std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
     return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
+
+
+@dataclass(frozen=True)
+class FundamentalEstimate(FundamentalFit):
+    """An estimate of F with its matches, and whether they determine it, tested when it is first read.
+
+    Parameters
+    ----------
+    xy1, xy2 : ndarray (M, 2)
+        The matches, px.
+    """
+
+    xy1: F64 = field(kw_only=True, repr=False)
+    xy2: F64 = field(kw_only=True, repr=False)
+
+    @cached_property
+    def degeneracy(self) -> DegeneracyReport:
+        """The test of section 5.5 with its evidence; the same for the same matches and F."""
+        if len(self.xy1) < MINIMUM:
+            return DegeneracyReport(False, (f"{len(self.xy1)} matches are too few to test F",))
+        return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0))
+
+    @property
+    def determined(self) -> bool:
+        """Whether the matches determine F; many inliers alone do not show it."""
+        return self.degeneracy.determined
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the matches do not determine F, in sentences; empty if they do."""
+        return self.degeneracy.reasons
