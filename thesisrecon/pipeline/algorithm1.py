@@ -9,15 +9,19 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
-import numpy as np
-
-from thesisrecon.arrays import F64
 from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.pipeline.job import Job, name_images
-from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, register_more
+from thesisrecon.pipeline.large_sets import (
+    calibrated_part,
+    cameras_from_parts,
+    from_metric,
+    prior_of_views,
+    register_more,
+)
+from thesisrecon.pipeline.left_over import join_left_over, known_cameras
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (
     REPLACED_FILES,
@@ -36,7 +40,7 @@ from thesisrecon.pipeline.stages import (
     report_projective,
     self_calibrate,
 )
-from thesisrecon.records import Reconstruction, TwoView
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run import Run
@@ -110,7 +114,8 @@ def metric_cameras(
 ) -> Iterator[RunResult]:
     """Reconstruct, calibrate and refine, from other initial pairs until a result is trusted.
 
-    Then register the images that are still missing, with matches of rejected pairs.
+    Then register the images that are still missing, with matches of rejected pairs and as models that are
+    joined by common points.
     """
     tried, failures = list[RunResult](), list[StageFailure]()
     for attempt in range(ATTEMPTS):
@@ -129,6 +134,7 @@ def metric_cameras(
         raise failures[0]
     chosen = next(k for k, other in enumerate(tried) if other is best)
     metric = register_more(job, views, pairs, best.calibration, best.metric, chosen)
+    metric = join_left_over(job, pairs, best.calibration, metric, chosen, ATTEMPTS)
     report_metric(job, metric)
     if len(tried) > 1:
         job.run.warnings.append(Notice("several-starts", len(tried)))
@@ -217,15 +223,12 @@ def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
 def _with_further_models(job: Job, result: RunResult) -> RunResult:
     """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
     run, folder, places = job.run, job.run.directory.path, dict[int, str]()
-    camera = _focals(job, result)
-    pending = deque[tuple[Sequence[int], F64 | None]](
-        (group, None) for group in groups_of(job, result.pairs)[1:]
-    )
-    pending.extend((views, camera) for views in groups_left_over(job, result))
+    known = known_cameras(job.prior, result.metric)
+    pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *groups_left_over(job, result)])
     while pending:
-        (views, focals), name = pending.popleft(), f"group-{len(run.groups) + 2}"
-        part, found = _run_group(job, result, name, views, focals)
-        pending.extend(([views[k] for k in rest], camera) for rest in groups_left_over(part, found))
+        views, name = pending.popleft(), f"group-{len(run.groups) + 2}"
+        part, found = _run_group(job, result, name, views, prior_of_views(known, views))
+        pending.extend([views[k] for k in rest] for rest in groups_left_over(part, found))
         if (model := found.best_reconstruction) is not None:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
     for number in count(len(run.groups) + 2):
@@ -244,37 +247,29 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
     return _with_group_reasons(result, places)
 
 
-def _focals(job: Job, result: RunResult) -> F64 | None:
-    """Focal length and its relative standard deviation (V, 2) from a trusted model; NaN: not estimated."""
-    metric, shared = result.metric, job.prior.group
-    if metric is None or not metric.trusted:
-        return None
-    found = np.full((len(shared), 2), np.nan)
-    for view in np.flatnonzero(metric.reconstruction.registered)[::-1]:
-        focal = metric.intrinsics[view]["focal_px"]
-        found[shared == shared[view]] = focal.value, focal.std / focal.value
-    return found
-
-
 def _run_group(
-    whole: Job, result: RunResult, name: str, views: Sequence[int], focals: F64 | None
+    whole: Job, result: RunResult, name: str, views: Sequence[int], known: IntrinsicsPrior
 ) -> tuple[Job, RunResult]:
     """Reconstruct a group as a run of its own, and add its entry to the summary of the whole.
 
-    ``focals`` (V, 2) are focal lengths that another model of the same cameras determined, and their relative
-    standard deviations.
+    ``known`` is the prior of its intrinsics, with those that another model determined.
     """
     directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
-    run = whole.run.inside(directory)
     inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
     front = FromRun(whole, views, result.features, result.pairs)
-    own = None if focals is None else focals[list(views)]
-    part = Job(run, inputs, front, whole.until, whole.surface_required, own)
+    run = whole.run.inside(directory)
+    part = Job(run, inputs, front, whole.until, whole.surface_required, known)
     identity = identity_of(run, inputs)
     with directory.claim(identity, overwrite=True):
         directory.adopt(identity, overwrite=True, results=RESULT_FILES)
         found, failure = _last_named(part)
-        found = write_outputs(run, found, until=part.until, failure=failure)
+        alone = replace(part, run=whole.run.inside(directory), known=None)
+        # Images of equal size may have another zoom.
+        refuted = (known.std < alone.prior.std).any() and not (found.metric and found.metric.trusted)
+        if refuted and part.until != "projective":
+            part = alone
+            found, failure = _last_named(part)
+        found = write_outputs(part.run, found, until=part.until, failure=failure)
     facts = {fact: found.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
     model = found.best_reconstruction
     there = [model is not None and bool(model.registered[k]) for k in range(len(views))]

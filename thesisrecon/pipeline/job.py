@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.errors import Notice, StageFailure, counted
@@ -58,8 +58,8 @@ class Job:
     until: Until
     surface_required: bool = False
     """Whether a surface that fails is a failure; otherwise it is a warning."""
-    focals: F64 | None = None
-    """Focal lengths of the same cameras in another model, and relative standard deviations (V, 2), or NaN."""
+    known: IntrinsicsPrior | None = None
+    """Prior of the intrinsics, if another model determined them."""
 
     @property
     def config(self) -> PipelineConfig:
@@ -84,13 +84,11 @@ class Job:
     @property
     def prior(self) -> IntrinsicsPrior:
         """Prior of the intrinsics at working size."""
+        if self.known is not None:
+            return self.known
         scales = np.array([image.scale for image in self.images])
         sizes = [image.original_size for image in self.images]
-        prior = prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
-        if self.focals is not None:
-            better = self.focals[:, 1] < prior.std[:, 0]
-            prior.mean[better, 0], prior.std[better, 0] = self.focals[better].T
-        return prior
+        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
 
     def require_images(self) -> None:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""

@@ -279,8 +279,13 @@ def input_of_part(
         replace(p, i=int(view[p.i]), j=int(view[p.j]), index1=none, index2=none, affine=affine)
         for p in inside
     )
+    return PartInput(tracks_of_part(tracks, views), renumbered, sizes[views], prior_of_views(prior, views))
+
+
+def prior_of_views(prior: IntrinsicsPrior, views: I64 | Sequence[int]) -> IntrinsicsPrior:
+    """The prior of some views."""
     rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
-    return PartInput(tracks_of_part(tracks, views), renumbered, sizes[views], replace(prior, **rows))
+    return replace(prior, **rows)
 
 
 def reconstruct_part(
@@ -531,15 +536,20 @@ def register_more(
             new = job.config.metric.refine(start, known, prior=job.prior, rng=rng, threads=workers.threads)
         except StageFailure:
             return metric
-        before, after = old.registered, new.reconstruction.registered
-        joined = after.sum() > before.sum() and (before <= after).all()
-        return new if joined and new.trusted >= metric.trusted else metric
+        return better_model(metric, new)
 
     key = run.key(
         "metric", run.logs["metric"].keys[f"attempt-{attempt}"], run.variant_key("tracks"), run.seed
     )
     found: MetricResult = run.cached("metric", f"attempt-{attempt}-more", key, register)
     return found
+
+
+def better_model(old: MetricResult, new: MetricResult) -> MetricResult:
+    """``new`` if it has more images, all of the old ones, and is as trusted; otherwise ``old``."""
+    before, after = old.reconstruction.registered, new.reconstruction.registered
+    joined = after.sum() > before.sum() and (before <= after).all()
+    return new if joined and new.trusted >= old.trusted else old
 
 
 def cameras_on_tracks(metric: Reconstruction, tracks: Tracks) -> Reconstruction:

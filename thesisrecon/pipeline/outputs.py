@@ -421,11 +421,16 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
             result,
             projective=stages["projective"][item],
             calibration=stages["selfcalibration"].get(item),
-            metric=stages["metric"].get(f"{item}-more", stages["metric"].get(item)),
+            metric=_last_metric(stages["metric"], item),
         )
         for item in stages["projective"]
     ]
     return with_image_names(best_result(attempts or [result]))
+
+
+def _last_metric(records: Mapping[str, Any], item: str) -> Any:
+    """The last of the metric records of an attempt, or None."""
+    return next((records[name] for name in (f"{item}-joined", f"{item}-more", item) if name in records), None)
 
 
 def _keys(folder: Path) -> dict[str, str]:

@@ -1,0 +1,243 @@
+"""Metric models of one set of tracks are joined by a similarity on which their common points agree.
+
+Growth ends at an image that sees few points of the model. Beyond it, a further model may share points with
+the first one that no single image sees in number. A track that one of the models observes in a single image
+is a point of unknown depth there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.camera import undistort
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.records import Reconstruction, Similarity
+
+MIN_COMMON, MIN_SHARE = 6, 0.6
+"""Common points that must agree, and the smallest share of the common points."""
+SIGMAS = 15.0
+"""Largest distance of two estimates of a point, in standard deviations given the cameras; the errors of the
+cameras, largest at the ends of a row, come on top."""
+MAX_CHANCE = 1e-4
+"""Largest expected number of similarities on which as many wrong points agree."""
+MAX_STD = 0.01
+"""Largest standard deviation of the rotation in rad and of the relative scale, given the cameras."""
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Estimates (N, 3) of the same points in two models and their covariances (N, 3, 3).
+
+    ``whole`` (N,) marks those of which both models know the depth.
+    """
+
+    a: F64
+    b: F64
+    cov_a: F64
+    cov_b: F64
+    whole: B8
+
+    def covariance(self, s: Similarity) -> F64:
+        """Covariance (N, 3, 3) of a - s(b)."""
+        return np.asarray(self.cov_a + s.scale**2 * s.R @ self.cov_b @ s.R.T)
+
+    def whitened(self, s: Similarity) -> F64:
+        """The differences a - s(b) (N, 3) in standard deviations."""
+        difference = (self.a - s.apply(self.b))[:, :, None]
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(self.covariance(s)), difference)[:, :, 0])
+
+    def distances(self, s: Similarity) -> F64:
+        """Distances (N,) of a and s(b) in standard deviations."""
+        return np.asarray(np.linalg.norm(self.whitened(s), axis=1))
+
+    def cost(self, s: Similarity) -> float:
+        """Truncated quadratic cost of a similarity."""
+        return float(np.minimum((self.distances(s) / SIGMAS) ** 2, 1.0).sum())
+
+    def moved(self, s: Similarity, step: F64) -> Similarity:
+        """The similarity after a small rotation, scaling and translation (7,) about the points a."""
+        a = self.a[self.whole]
+        centre, size = a.mean(axis=0), float(np.linalg.norm(a.std(axis=0)))
+        turn = np.exp(step[3]) * scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
+        t = turn @ (s.t - centre) + centre + size * step[4:]
+        return Similarity(float(np.exp(step[3]) * s.scale), np.exp(-step[3]) * turn @ s.R, t)
+
+    def select(self, some: B8) -> _Points:
+        """Some of the points."""
+        return _Points(self.a[some], self.b[some], self.cov_a[some], self.cov_b[some], self.whole[some])
+
+
+def joinable(model: Reconstruction, groups: Sequence[Sequence[int]]) -> list[Sequence[int]]:
+    """The groups of views that may share enough points with a model, or with another such group."""
+    t, reached, left = model.tracks, model.registered.copy(), list(groups)
+
+    def shares_points(views: Sequence[int]) -> bool:
+        masks = reached, np.isin(np.arange(t.n_views), views)
+        a, b = (np.bincount(t.point_index[m[t.view_index]], minlength=t.n_points) for m in masks)
+        common = (a > 0) & (b > 0) & (a + b > 2)
+        return bool(common.sum() >= MIN_COMMON and ((a > 1) & (b > 1)).sum() >= 3)
+
+    while found := next((views for views in left if shares_points(views)), None):
+        reached[list(found)] = True
+        left.remove(found)
+    return [views for views in groups if reached[views[0]]]
+
+
+def join_all(
+    first: Reconstruction, others: Sequence[Reconstruction], rng: np.random.Generator
+) -> Reconstruction:
+    """Join one model after another with the first, until none of the others can be joined."""
+    left = list(others)
+    while True:
+        tried = [join_models(first, other, rng) for other in left]
+        k = next((k for k, joined in enumerate(tried) if joined is not None), None)
+        if k is None:
+            return first
+        first = tried[k] or first
+        del left[k]
+
+
+def join_models(
+    first: Reconstruction, second: Reconstruction, rng: np.random.Generator
+) -> Reconstruction | None:
+    """Join two metric models of the same tracks, without a common image, in the world of the first one.
+
+    None if fewer than ``MIN_COMMON`` of their common points agree, if chance explains the agreement, or if
+    the similarity is not determined.
+    """
+    numbers = np.flatnonzero(_observed(first, second) & _observed(second, first))
+    whole = (first.valid & second.valid)[numbers]
+    if len(numbers) < MIN_COMMON or whole.sum() < 3 or not (first.used.any() and second.used.any()):
+        return None
+    (a, cov_a), (b, cov_b) = (_estimates(model, numbers) for model in (first, second))
+    points = _Points(a, b, cov_a, cov_b, whole)
+    best = sorted(_hypotheses(points, rng), key=points.cost)[:5]
+    found = min((_refined(points, s) for s in best), key=points.cost)
+    agree = points.distances(found) < SIGMAS
+    if agree.sum() < max(MIN_COMMON, MIN_SHARE * len(agree)):
+        return None
+    if _log_chance(points, found, agree) > np.log(MAX_CHANCE) or _std(points, found, agree) > MAX_STD:
+        return None
+    return _merged(first, second, found, numbers[agree])
+
+
+def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> list[Similarity]:
+    """Similarities of three points: of all triples up to ``most``, or of as many random ones."""
+    whole = np.flatnonzero(points.whole)
+    chosen = whole[rng.random((most, len(whole))).argpartition(2, axis=1)[:, :3]]
+    if scipy.special.comb(len(whole), 3) <= most:
+        chosen = np.array(list(combinations(whole, 3)))
+    a, b = points.a[chosen], points.b[chosen]
+    mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
+    a, b = a - mean_a[:, None], b - mean_b[:, None]
+    U, _, Vt = np.linalg.svd(np.einsum("nki,nkj->nij", a, b))
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    R, scale = U @ Vt, np.linalg.norm(a, axis=(1, 2)) / np.linalg.norm(b, axis=(1, 2))
+    t = mean_a - scale[:, None] * np.einsum("nij,nj->ni", R, mean_b)
+    return [Similarity(float(f), *pose) for f, *pose in zip(scale, R, t, strict=True)]
+
+
+def _refined(points: _Points, s: Similarity) -> Similarity:
+    """The similarity of least squares of the points within a gate that narrows."""
+    for factor in (3.0, 2.0, 1.0, 1.0):
+        near = points.distances(s) < factor * SIGMAS
+        if points.whole[near].sum() < 3:
+            break
+        some = points.select(near)
+
+        def residuals(step: F64, s: Similarity = s, some: _Points = some) -> F64:
+            return some.whitened(some.moved(s, step)).ravel()
+
+        found = scipy.optimize.least_squares(residuals, np.zeros(7), loss="soft_l1", max_nfev=20)
+        s = min((s, some.moved(s, found.x)), key=points.cost)
+    return s
+
+
+def _log_chance(points: _Points, s: Similarity, agree: B8) -> float:
+    """Logarithm of the expected number of similarities on which as many random points agree.
+
+    A random point agrees if it lies in the ellipsoid of the gate, out of the extent of all points. Three
+    points, of which any may be chosen, determine the similarity.
+    """
+    variance, axes = np.linalg.eigh(points.covariance(s)[agree])
+    spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a[points.whole].T), axes)
+    gate = 2.0 * SIGMAS * np.sqrt(variance / np.maximum(12.0 * spread, 1e-300))
+    # The most telling three are spent on the similarity.
+    chance = np.sort(np.log(np.minimum(gate, 1.0)).sum(axis=1))[3:].sum()
+    n, k = len(agree), int(agree.sum())
+    return float(chance + np.log(scipy.special.comb(n, k)) + np.log(scipy.special.comb(k, 3)))
+
+
+def _std(points: _Points, s: Similarity, agree: B8) -> float:
+    """Largest standard deviation of the rotation (rad) and the relative scale."""
+    some, steps = points.select(agree), 1e-4 * np.eye(7)
+    change = [some.whitened(some.moved(s, h)) - some.whitened(some.moved(s, -h)) for h in steps]
+    singular, Vt = np.linalg.svd(np.reshape(change, (7, -1)).T / 2e-4, full_matrices=False)[1:]
+    std = np.linalg.norm(Vt.T / np.maximum(singular, 1e-300), axis=1)
+    return float(std[:4].max())
+
+
+def _observed(model: Reconstruction, other: Reconstruction) -> B8:
+    """Tracks (N,) that are points of a model, or points of the other one that the model observes once."""
+    t = model.tracks
+    count = np.bincount(t.point_index[model.registered[t.view_index]], minlength=t.n_points)
+    return model.valid | (other.valid & (count == 1))
+
+
+def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
+    """Points (N, 3) of a model and their covariances (N, 3, 3) given its cameras.
+
+    A point that is not valid lies at the median depth of the model on the ray of its only observation.
+    """
+    assert model.K is not None
+    assert model.distortion is not None
+    t, place = model.tracks, np.full(model.tracks.n_points, -1)
+    place[numbers] = np.arange(len(numbers))
+    used = np.flatnonzero(model.used)
+    depth = float(
+        np.median(np.einsum("ni,ni->n", model.P[t.view_index[used], 2], model.X[t.point_index[used]]))
+    )
+    alone = ~model.valid[t.point_index]
+    k = np.flatnonzero((model.inlier | alone) & model.registered[t.view_index] & (place[t.point_index] >= 0))
+    view, point = t.view_index[k], place[t.point_index[k]]
+    P, K = model.P[view], model.K[view]
+    normalized = np.linalg.solve(K, homogenize(t.xy[k])[:, :, None])[:, :2, 0]
+    normalized = undistort(normalized, model.distortion[view])
+    ray = np.linalg.solve(P[:, :, :3], K @ homogenize(normalized)[:, :, None])[:, :, 0]
+    X = np.where(model.valid[numbers, None], model.X[numbers, :3], 0.0)
+    lone = alone[k]
+    X[point[lone]] = depth * ray[lone] - np.linalg.solve(P[lone, :, :3], P[lone, :, 3:])[:, :, 0]
+    x = (P @ homogenize(X[point])[:, :, None])[:, :, 0]
+    J = (P[:, :2, :3] - (x[:, :2] / x[:, 2:])[:, :, None] * P[:, 2:, :3]) / x[:, 2:, None] / model.sigma_px
+    # The depth of a single observation is free: its standard deviation is 10 median depths.
+    J = np.concatenate([J, ray[:, None] / (10.0 * depth)], axis=1)
+    information = np.zeros((len(numbers), 3, 3))
+    np.add.at(information, point, np.swapaxes(J, 1, 2) @ J)
+    return X, np.linalg.inv(information)
+
+
+def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree: I64) -> Reconstruction:
+    """Both models in the world of the first one; points that do not ``agree`` have inliers of one model."""
+    t, new, both = first.tracks, second.registered, np.isin(np.arange(first.tracks.n_points), agree)
+    assert second.K is not None
+    assert first.K is not None
+    Rt = np.linalg.solve(second.K[new], second.P[new])
+    R = Rt[:, :, :3] @ s.R.T
+    P, K = first.P.copy(), first.K.copy()
+    P[new] = second.K[new] @ np.concatenate([R, s.scale * Rt[:, :, 3:] - R @ s.t[:, None]], axis=2)
+    K[new] = second.K[new]
+    only = second.valid & ~first.valid
+    X = np.where(only[:, None], homogenize(s.apply(second.X[:, :3])), first.X)
+    of_first = np.where((both & only)[t.point_index], first.registered[t.view_index], first.inlier)
+    of_second = np.where((both & ~second.valid)[t.point_index], new[t.view_index], second.inlier)
+    inlier = of_first | (of_second & (only | both)[t.point_index])
+    distortion = np.where(new[:, None], second.distortion, first.distortion)
+    registered, valid, reasons = first.registered | new, first.valid | only, ("",) * len(P)
+    seen = (registered, valid, inlier, t, first.sizes, first.sigma_px, reasons, K, distortion)
+    return Reconstruction("metric", P, X, *seen)
