@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from thesisrecon.pipeline._image_pair import match_views
+from thesisrecon.pipeline.image_pair import match_views
 
 from benchmarks.conftest import Bench
 from thesisrecon.config import preset
