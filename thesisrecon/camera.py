@@ -189,38 +189,14 @@ _CONVERGED = 1e-9
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
-    """Return P = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21).
-
-    Parameters
-    ----------
-    K, R, t : ndarray (..., 3, 3), (..., 3, 3) and (..., 3)
-        Calibration matrix, rotation world-to-camera and translation.
-
-    Returns
-    -------
-    ndarray (..., 3, 4)
-    """
+    """Return P (..., 3, 4) = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21)."""
     return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
 
 
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
-    """Decompose P of any scale and sign into K, R and t (3.21).
+    """Decompose P (3, 4) of any scale and sign into K, R and t with K33 = 1 and det R = 1 (3.21).
 
-    Parameters
-    ----------
-    P : ndarray (3, 4)
-        Finite camera; a singular left 3x3 part is a ``ValueError``.
-
-    Returns
-    -------
-    K, R, t : ndarray (3, 3), (3, 3) and (3,)
-        K33 = 1, positive focal lengths, det R = 1.
-
-    Examples
-    --------
-    >>> K, R, t = decompose_camera(-3.0 * np.hstack([np.diag([2.0, 2.0, 1.0]), [[0.0], [0.0], [5.0]]]))
-    >>> np.allclose(K, np.diag([2.0, 2.0, 1.0])), np.allclose(R, np.eye(3)), np.allclose(t, [0.0, 0.0, 5.0])
-    (True, True, True)
+    A singular left 3x3 part is a ``ValueError``.
     """
     P = P * np.sign(_left_determinant(P, "decompose_camera"))
     K, R = rq(P[:, :3])
@@ -238,34 +214,16 @@ def _left_determinant(P: F64, caller: str) -> F64:
 
 
 def finite_cameras(P: F64) -> B8:
-    """Whether the centres of cameras are finite: their left 3x3 parts are not singular to rounding.
+    """Whether the centres of cameras (..., 3, 4) are finite: left 3x3 parts not singular to rounding.
 
-    Parameters
-    ----------
-    P : ndarray (..., 3, 4)
-        Cameras; the scale of each row, and so the unit of the pixels, has no influence.
-
-    Returns
-    -------
-    ndarray (...) of bool
+    The scale of each row, and so the unit of the pixels, has no influence.
     """
     rows = np.linalg.norm(P[..., :3], axis=-1)
     return np.asarray(np.abs(np.linalg.det(P[..., :3])) > 1e-14 * rows.prod(axis=-1))
 
 
 def rq(M: F64) -> tuple[F64, F64]:
-    """Factor M = K R with K upper triangular, of positive diagonal, and R orthogonal.
-
-    Parameters
-    ----------
-    M : ndarray (3, 3)
-        Matrix.
-
-    Returns
-    -------
-    K, R : ndarray (3, 3)
-        R is a rotation if det M > 0.
-    """
+    """Factor M (3, 3) = K R with K upper triangular, of positive diagonal; R is a rotation if det M > 0."""
     Q, U = np.linalg.qr(M[::-1].T)
     K = U.T[::-1, ::-1]
     R = Q.T[::-1]
@@ -275,16 +233,9 @@ def rq(M: F64) -> tuple[F64, F64]:
 
 
 def distort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """Apply radial distortion (x, y) (1 + k1 r^2 + k2 r^4 + ...).
+    """Apply radial distortion (x, y) (1 + k1 r^2 + k2 r^4 + ...) to normalised points (N, 2).
 
-    Parameters
-    ----------
-    xy_normalized, distortion : ndarray (N, 2); float or ndarray (C,) or (N, C)
-        Normalised image points and k1, or the coefficients k1, k2, ...
-
-    Returns
-    -------
-    ndarray (N, 2)
+    ``distortion`` is k1, or k1, k2, ... (C,) or (N, C).
     """
     r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     return np.asarray(xy_normalized * _radial_factor(distortion, r2))
@@ -293,15 +244,7 @@ def distort(xy_normalized: F64, distortion: float | F64) -> F64:
 def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
     """Invert :func:`distort` by Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2.
 
-    Parameters
-    ----------
-    xy_normalized, distortion
-        As in :func:`distort`, distorted points.
-
-    Returns
-    -------
-    ndarray (N, 2)
-        Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
+    Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
     """
     distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     k = np.atleast_1d(distortion)
@@ -329,18 +272,6 @@ def _radial_factor(distortion: float | F64, r2: F64) -> F64:
 
 
 def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 0.0) -> F64:
-    """Project space points with a metric camera and radial distortion.
-
-    Parameters
-    ----------
-    K, R, t, X : ndarray (3, 3), (3, 3), (3,) and (N, 3)
-        Calibration matrix, rotation world-to-camera, translation and points.
-    distortion : float or ndarray (C,) or (N, C)
-        Coefficients of :func:`distort`.
-
-    Returns
-    -------
-    ndarray (N, 2)
-    """
+    """Project points (N, 3) with a metric camera and radial distortion as of :func:`distort`."""
     X = X @ R.T + t
     return distort(X[:, :2] / X[:, 2:], distortion) @ K[:2, :2].T + K[:2, 2]

@@ -37,29 +37,13 @@ T = TypeVar("T")
 
 
 def counted(number: int, noun: str, shown: str = "") -> str:
-    """Return a number with its noun, singular or plural, such as "1 image" or "2 matches".
-
-    Parameters
-    ----------
-    number, noun, shown : int, str, str
-        The number, the singular noun, and the formatted number if other than ``str(number)``.
-
-    Returns
-    -------
-    str
-    """
+    """Return a number with its noun, such as "1 image" or "2 matches"; ``shown``: the formatted number."""
     ending = "" if number == 1 else "es" if noun.endswith("ch") else "s"
     return f"{shown or number} {noun}{ending}"
 
 
 def require_at_least(method: object, **least: float) -> None:
-    """Raise ``ValueError`` if a setting of a method is below its least value.
-
-    Parameters
-    ----------
-    method, **least : object, float
-        The method, and the least value of some of its fields.
-    """
+    """Raise ``ValueError`` if one of these settings of a method is below its least value."""
     for name, bound in least.items():
         # NaN is below every bound.
         if not getattr(method, name) >= bound:
@@ -67,17 +51,7 @@ def require_at_least(method: object, **least: float) -> None:
 
 
 def in_words(value: Any) -> str:
-    """Return the ``repr`` of a value for a message, shortened.
-
-    Parameters
-    ----------
-    value : object
-        Any value.
-
-    Returns
-    -------
-    str
-    """
+    """Return the ``repr`` of a value for a message, shortened."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):
@@ -87,17 +61,7 @@ def in_words(value: Any) -> str:
 
 
 def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
-    """Return a message about an unknown word with the nearest known ones, or all.
-
-    Parameters
-    ----------
-    what, word, known : str, object, iterable of str
-        Kind of word, the word, and the known words.
-
-    Returns
-    -------
-    str
-    """
+    """Return a message about an unknown word of a kind with the nearest known ones, or all."""
     known = list(known)
     near = difflib.get_close_matches(word, known, n=3, cutoff=0.6) if isinstance(word, str) else []
     hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known)}"
@@ -202,26 +166,10 @@ class OutputError(UsageError):
 
 
 def made(what: str, make: Callable[[], T], warnings: list[str], otherwise: T) -> T:
-    """Make one figure, page or file; an error costs a warning, not the result.
+    """Make the output ``what``; an error costs a warning, not the result, which is then ``otherwise``.
 
-    Parameters
-    ----------
-    what, make : str, callable
-        Name of the output in the warning, and the function that makes it.
-    warnings : list of str
-        Receives the warning, whose code is ``output-not-made``; one is enough for outputs of the same name.
-    otherwise : object
-        Returned after an error.
-
-    Returns
-    -------
-    object
-        Result of ``make``.
-
-    Raises
-    ------
-    UsageError
-        If another program changed a file of the folder, or removed the folder, in the meantime.
+    The warning has the code ``output-not-made``; one is enough for outputs of the same name. A
+    ``UsageError``, if another program changed files of the folder in the meantime, is raised.
     """
     try:
         return make()

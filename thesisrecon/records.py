@@ -326,17 +326,7 @@ class IntrinsicsPrior:
     def unshared(
         cls, mean: F64, std: F64, *, kind: I64 | None = None, spread: F64 | None = None
     ) -> IntrinsicsPrior:
-        """Return a prior whose rows share no value.
-
-        Parameters
-        ----------
-        mean, std, kind, spread
-            As the fields; ``kind`` None: no kinds.
-
-        Returns
-        -------
-        IntrinsicsPrior
-        """
+        """Return a prior whose rows share no value; ``kind`` None: no kinds."""
         shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
         return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)
 
@@ -583,32 +573,14 @@ def require_mesh(caller: str, mesh: TexturedMesh) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """The similarity y = scale R x + t.
-
-    Parameters
-    ----------
-    scale : float
-        Positive factor.
-    R, t : ndarray (3, 3), ndarray (3,)
-        Rotation and translation.
-    """
+    """The similarity y = scale R x + t."""
 
     scale: float
     R: F64
     t: F64
 
     def apply(self, X: F64) -> F64:
-        """Transform points.
-
-        Parameters
-        ----------
-        X : ndarray (N, 3)
-            Points.
-
-        Returns
-        -------
-        ndarray (N, 3)
-        """
+        """Transform points (N, 3)."""
         return np.asarray(self.scale * X @ self.R.T + self.t)
 
     @property

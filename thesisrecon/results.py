@@ -43,18 +43,7 @@ class SeenPoints(NamedTuple):
 
 
 def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
-    """Convert an intrinsic from working to original pixels, undoing (x + 0.5) scale - 0.5.
-
-    Parameters
-    ----------
-    name, interval, scale : str, IntrinsicInterval, float
-        Name of the intrinsic, which is converted only if it ends in ``_px``; its value; and working size over
-        original size.
-
-    Returns
-    -------
-    IntrinsicInterval
-    """
+    """Convert an intrinsic, if its name ends in ``_px``, from working to original pixels."""
     if not name.endswith("_px"):
         return interval
     shift = 0.5 / scale - 0.5 if name.startswith("principal") else 0.0
@@ -62,18 +51,7 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
 
 
 def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
-    """Return the standard deviations of a pose as in :attr:`thesisrecon.Camera.std`.
-
-    Parameters
-    ----------
-    metric, i : MetricResult, int
-        Result of the metric stage, and the number of the image.
-
-    Returns
-    -------
-    dict of str to float
-        Empty if unknown.
-    """
+    """Return the standard deviations of a pose as in :attr:`thesisrecon.Camera.std`, none if unknown."""
     if metric.pose_std is None or not np.isfinite(metric.pose_std[i]).all():
         return {}
     values = np.concatenate([np.degrees(metric.pose_std[i, :3]), metric.pose_std[i, 3:]])
@@ -315,17 +293,7 @@ class SparseModel:
         return [view.name for view in self.views]
 
     def transformed(self, similarity: Similarity) -> SparseModel:
-        """Return the model in another world: y = scale R x + t of its points and camera centres.
-
-        Parameters
-        ----------
-        similarity : Similarity
-            From the world of this model to the new one.
-
-        Returns
-        -------
-        SparseModel
-        """
+        """Return the model in another world: y = scale R x + t of its points and camera centres."""
         rotations = [view.R @ similarity.R.T for view in self.views]
         shifts = [similarity.scale * view.t for view in self.views]
         views = [

@@ -190,20 +190,7 @@ def require_separate(
     images: str | Path | None = None,
     masks: str | Path | None = None,
 ) -> None:
-    """Raise ``UsageError`` if an export would replace the files that it reads.
-
-    Parameters
-    ----------
-    folder, to : Path, str
-        Folder and format of the export.
-    model, images, masks : path, optional
-        The model, and the folders of images and masks, that the export reads.
-
-    Raises
-    ------
-    UsageError
-        If images, masks or COLMAP files are written to one of these.
-    """
+    """Raise ``UsageError`` if an export would replace the model, images or masks that it reads."""
     written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
     colmap = None if model is None else colmap_model_in(Path(model))
@@ -245,32 +232,12 @@ def _rounding_notes(model: SparseModel) -> list[str]:
 
 
 def recorded_images(model: SparseModel | RunResult | str | Path) -> Path | None:
-    """Return the folder of the images that a run was made from, None if it is not known.
-
-    Parameters
-    ----------
-    model : SparseModel, RunResult or path
-        The run or its output folder, or any other model.
-
-    Returns
-    -------
-    Path or None
-    """
+    """Return the folder of the images that a run was made from, None if it is not known."""
     return _recorded(model, "images_folder")
 
 
 def recorded_masks(model: SparseModel | RunResult | str | Path, to: str) -> tuple[Path | None, list[str]]:
-    """Return the folder of the masks of a run for formats with images, or a note that it is gone.
-
-    Parameters
-    ----------
-    model, to : SparseModel, RunResult or path, str
-        The run or its output folder, or any other model; the format.
-
-    Returns
-    -------
-    Path or None, list of str
-    """
+    """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
     folder = _recorded(model, "masks_folder") if to in _PINHOLE else None
     if folder is None or folder.is_dir():
         return folder, []

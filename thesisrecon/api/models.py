@@ -79,16 +79,9 @@ class AlignmentReport:
 
 
 def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
-    """Return the sparse model of a run or a file.
+    """Return the sparse model of a run, of an output folder or of a COLMAP model.
 
-    Parameters
-    ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model; a ``UsageError`` if it has no cameras.
-
-    Returns
-    -------
-    SparseModel
+    A run without cameras is a ``UsageError``.
     """
     if isinstance(model, SparseModel):
         return model

@@ -99,22 +99,9 @@ def prepare_rectified_pair(
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
     config: Config | None = None,
 ) -> InterpolatedPair:
-    """Prepare two rectified images for any number of views between them.
+    """Prepare two rectified images for any number of views between them: ``view(s)`` interpolates.
 
-    Parameters
-    ----------
-    left, right, disparity, config
-        As in :func:`interpolate_view`.
-
-    Returns
-    -------
-    InterpolatedPair
-        Its ``view(s)`` interpolates.
-
-    Raises
-    ------
-    ValueError, UsageError, StageFailure
-        If shapes differ, or a file does not exist or cannot be read.
+    The arguments are those of :func:`interpolate_view`.
     """
     levels = read_levels(left), read_levels(right)
     images = read_pixels(left), read_pixels(right)
@@ -167,28 +154,12 @@ def _reduced(image: U8 | F32) -> F32:
 def prepare_pair(
     image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0
 ) -> InterpolatedPair:
-    """Match and rectify two images of any pose for any number of views between them.
+    """Match and rectify two images of any pose for views between them: ``view(s)`` interpolates.
 
-    Sparse matching, F, rectification by homographies and dense matching in both directions.
-
-    Parameters
-    ----------
-    image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
-        Images of the same size.
-    config, seed : PipelineConfig or str or path, int
-        Configuration (None: the default) and random seed.
-
-    Returns
-    -------
-    InterpolatedPair
-        Its ``view(s)`` interpolates.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If the images are the same or differ in size; if they do not match, show no parallax, are rolled
-        against each other by more than 90 degrees, or the camera moved forwards (an epipole lies inside an
-        image: its epipolar lines cannot become rows).
+    Sparse matching, F, rectification by homographies and dense matching in both directions. A
+    ``StageFailure`` if the images do not match, show no parallax, are rolled against each other by more than
+    90 degrees, or the camera moved forwards (an epipole lies inside an image: its epipolar lines cannot
+    become rows).
     """
     config = as_config(config)
     first, second = (
@@ -212,13 +183,7 @@ def prepare_pair(
 
 
 def require_comparable_images(images: Sequence[Image]) -> None:
-    """Raise ``UsageError`` unless the images have the same size and different content.
-
-    Parameters
-    ----------
-    images : sequence of Image
-        The images.
-    """
+    """Raise ``UsageError`` unless the images have the same size and different content."""
     for first, second in combinations(images, 2):
         if first.size != second.size:
             sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
@@ -253,25 +218,7 @@ class MatchedImages:
 
 
 def match_images(image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0) -> MatchedImages:
-    """Match two images sparsely and densely.
-
-    Parameters
-    ----------
-    image1, image2 : str, Path, ndarray (H, W, 3) uint8 or Image
-        The images.
-    config, seed : PipelineConfig or str or path, int
-        Configuration (None: the default) and random seed.
-
-    Returns
-    -------
-    MatchedImages
-        Input of :func:`prepare_trilinear_views`.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If a file does not exist or cannot be read; if the images do not match or show no parallax.
-    """
+    """Match two images sparsely and densely, for :func:`prepare_trilinear_views`."""
     config = as_config(config)
     read = [read_image(source, max_size_px=config.images.max_size_px) for source in (image1, image2)]
     first, second = (found.images[0] for found in read)
@@ -286,26 +233,10 @@ def prepare_trilinear_views(
 ) -> TensorSynthesis:
     """Prepare two matched images for views of any camera by the trilinear tensor (section 1.3).
 
-    Parameters
-    ----------
-    found : MatchedImages
-        Result of :func:`match_images`.
-    K : array_like (3, 3) or (2, 3, 3), optional
-        Intrinsics of both images, in pixels of the given images. If None, the prior of ``config.intrinsics``;
-        without a focal length there, a typical one: the views are then correct up to a projective
-        transformation of space.
-    config : PipelineConfig, str or path, optional
-        The default configuration if None.
-
-    Returns
-    -------
-    TensorSynthesis
-        Its ``render(camera)`` computes a view.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        If K is invalid; if the matches contradict F, or no solution has the scene in front of both cameras.
+    ``render(camera)`` of the result computes a view. K (3, 3) or (2, 3, 3) are the intrinsics in pixels of
+    the given images. If None, the prior of ``config.intrinsics``; without a focal length there, a typical
+    one: the views are then correct up to a projective transformation of space. A ``StageFailure`` if the
+    matches contradict F, or no solution has the scene in front of both cameras.
     """
     config = as_config(config)
     K1, K2 = _intrinsics(found, K, config)

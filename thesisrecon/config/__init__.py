@@ -102,13 +102,7 @@ class Detector(Protocol):
     """Detect the features of one image (4.2.1)."""
 
     def detect(self, image: Image) -> Features:
-        """Detect the corners and, for some detectors, the seeds of an image.
-
-        Returns
-        -------
-        Features
-            Corners, strongest first, in pixels of the image; possibly none.
-        """
+        """Detect the corners, strongest first, in pixels of the image, and for some detectors the seeds."""
 
 
 class PairSelector(Protocol):
@@ -119,10 +113,7 @@ class PairSelector(Protocol):
     ) -> PairChoice:
         """Select pairs of images by their names and features; ``map_all`` is a parallel map.
 
-        Raises
-        ------
-        UsageError
-            If the features have no seeds but need them.
+        Features without the seeds that are needed are a ``UsageError``.
         """
 
 
@@ -130,13 +121,7 @@ class Matcher(Protocol):
     """Match the features of two images (4.2.2)."""
 
     def prepare(self, image: Image, features: Features) -> Any:
-        """Do the work that depends on one image.
-
-        Returns
-        -------
-        Any
-            The data of the image that ``match`` needs.
-        """
+        """Do the work that depends on one image, and return the data of the image that ``match`` needs."""
 
     def match(
         self,
@@ -147,13 +132,10 @@ class Matcher(Protocol):
         estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match the corners of two prepared images one-to-one; ``pair`` are the numbers of the views, and
-        ``estimate_fundamental`` is the robust estimator of F for guided matching.
+        """Match the corners of two prepared images one-to-one; there may be no matches.
 
-        Returns
-        -------
-        Matches
-            Matches, possibly none; ``UsageError`` if the features have no seeds but need them.
+        ``pair`` are the numbers of the views, ``estimate_fundamental`` is the robust estimator of F for
+        guided matching. Features without the seeds that are needed are a ``UsageError``.
         """
 
 
@@ -161,13 +143,9 @@ class FundamentalEstimator(Protocol):
     """Estimate F from matches with outliers (chapter 5)."""
 
     def estimate(self, xy1: F64, xy2: F64, rng: np.random.Generator) -> FundamentalFit:
-        """Estimate F of matched points ``xy1``, ``xy2`` (N, 2), px, with outliers.
+        """Estimate F of matched points ``xy1``, ``xy2`` (N, 2), px, with outliers; all numbers are finite.
 
-        Returns
-        -------
-        FundamentalFit
-            F, inliers, noise, covariance and competing models; always finite. ``StageFailure`` if there are
-            too few or collinear matches, or no F has 8 inliers.
+        A ``StageFailure`` if there are too few or collinear matches, or no F has 8 inliers.
         """
 
 
@@ -175,13 +153,7 @@ class Verifier(Protocol):
     """Decide whether a pair and its F are accepted, and which matches are inliers."""
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
-        """Verify all matches of a pair by the F estimated from them.
-
-        Returns
-        -------
-        TwoView
-            The pair with its verified matches, its configuration and the decision.
-        """
+        """Accept or reject a pair by all of its matches and the F estimated from them."""
 
 
 class TrackBuilder(Protocol):
@@ -190,12 +162,9 @@ class TrackBuilder(Protocol):
     def build(
         self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator
     ) -> Tracks:
-        """Join the accepted pairs of prepared images to tracks; ``map_all`` is a parallel map.
+        """Join the accepted pairs of prepared images to tracks with at most one corner per view.
 
-        Returns
-        -------
-        Tracks
-            Tracks of at least two views with at most one corner per view.
+        ``map_all`` is a parallel map.
         """
 
 
@@ -211,23 +180,10 @@ class ProjectiveReconstructor(Protocol):
         rng: np.random.Generator,
         attempt: int = 0,
     ) -> Reconstruction:
-        """Reconstruct cameras and points from tracks and verified pairs.
+        """Reconstruct cameras and points from a selection of the tracks and verified pairs.
 
-        Parameters
-        ----------
-        tracks, pairs : Tracks, sequence of TwoView
-            All tracks and the verified pairs; a selection of the tracks is used.
-        sizes : ndarray (V, 2) of int
-            Width and height of each image.
-        rng : numpy.random.Generator
-            Source of the resection samples.
-        attempt : int
-            Number of the attempt; each begins with another initial pair.
-
-        Returns
-        -------
-        Reconstruction
-            Projective reconstruction; ``StageFailure`` if no pair is accepted, shows parallax or is left.
+        ``sizes`` (V, 2) are width and height of the images; each ``attempt`` begins with another initial
+        pair. A ``StageFailure`` if no pair is accepted, shows parallax or is left.
         """
 
 
@@ -239,11 +195,8 @@ class SelfCalibrator(Protocol):
     ) -> SelfCalibration:
         """Upgrade a projective reconstruction of at least three cameras by the prior of every view.
 
-        Returns
-        -------
-        SelfCalibration
-            Upgrades and calibrations, best first, with the identifiability report. ``StageFailure`` if none
-            places the points in front of the cameras.
+        Returns upgrades and calibrations, best first, with the identifiability report. A ``StageFailure`` if
+        none places the points in front of the cameras.
         """
 
 
@@ -261,13 +214,8 @@ class MetricRefiner(Protocol):
     ) -> MetricResult:
         """Refine a projective reconstruction to the metric model; all candidate calibrations are tried.
 
-        The result does not depend on the number of ``threads``.
-
-        Returns
-        -------
-        MetricResult
-            Cameras, points, intrinsics with intervals, and the self-check; ``StageFailure`` if no candidate
-            gives a metric model.
+        Returns cameras, points, intrinsics with intervals, and the self-check, which do not depend on the
+        number of ``threads``. A ``StageFailure`` if no candidate gives a metric model.
         """
 
 
@@ -275,19 +223,10 @@ class StereoMatcher(Protocol):
     """Match two views; :func:`thesisrecon.reconstruct` does not need it."""
 
     def match_rectified(self, left: Any, right: Any, *, max_disparity_px: float) -> DisparityMap:
-        """Compute the disparities of a rectified pair.
+        """Compute the disparities of a rectified pair, x_right = x_left - d, NaN = unknown or occluded.
 
-        Parameters
-        ----------
-        left, right : array_like (H, W) or (H, W, 3)
-            Grey levels 0 .. 255, integer or floating point, NaN = no pixel; rows correspond.
-        max_disparity_px : float
-            Disparity of the nearest point.
-
-        Returns
-        -------
-        DisparityMap
-            x_right = x_left - d, NaN = unknown or occluded.
+        The images (H, W) or (H, W, 3) have grey levels 0 .. 255, integer or floating point, NaN = no pixel;
+        ``max_disparity_px`` is the disparity of the nearest point.
         """
 
     def match_two_views(
@@ -296,11 +235,6 @@ class StereoMatcher(Protocol):
         """Rectify two images by their F and at least 8 inliers, and match both directions.
 
         ``planar`` allows homographies only.
-
-        Returns
-        -------
-        RectifiedPair
-            Rectified images and disparities of both.
         """
 
 
@@ -319,39 +253,22 @@ class DepthEstimator(StereoMatcher, Protocol):
 
         The depths to search are ``depth_range`` (V, 2), nearest and farthest, else follow from the points of
         the reconstruction, else from the cameras.
-
-        Returns
-        -------
-        MultiViewScene
-            Input of the other methods.
         """
 
     def required_views(self, scene: MultiViewScene, view: int) -> frozenset[int]:
-        """Return the views that the depth map of a view and its confirmation need.
-
-        Returns
-        -------
-        frozenset of int
-            Numbers of the views, the view among them.
-        """
+        """Return the views, this one included, that its depth map and the confirmation of it need."""
 
     def depth_map(self, scene: MultiViewScene, view: int, *, pool: Executor | None = None) -> DepthMap:
         """Compute the depth map of one view from its neighbours; idle threads of ``pool`` may take part.
 
-        Returns
-        -------
-        DepthMap
-            NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
-            neighbours that agree.
+        NaN = unknown, everywhere if the view has no neighbours or all pairs fail; ``views`` counts the
+        neighbours that agree.
         """
 
     def confirm(self, scene: MultiViewScene, depth_maps: Mapping[int, DepthMap], view: int) -> DepthMap:
         """Complete a result of ``depth_map``, and keep the depths that the maps of other views confirm.
 
-        Returns
-        -------
-        DepthMap
-            ``views`` is the number of confirming views.
+        ``views`` is then the number of confirming views.
         """
 
 
@@ -363,10 +280,7 @@ class ModelBuilder(Protocol):
     ) -> TexturedMesh:
         """Build the textured surface of a scene.
 
-        Raises
-        ------
-        StageFailure
-            If the maps contain no depths or no view sees the surface.
+        A ``StageFailure`` if the maps contain no depths or no view sees the surface.
         """
 
     def color(
@@ -379,10 +293,7 @@ class ModelBuilder(Protocol):
     ) -> TexturedMesh:
         """Texture a surface from all views except ``without``, whose image is to be compared with the model.
 
-        Returns
-        -------
-        TexturedMesh
-            The textured surface; the depths of that view remain part of it.
+        The depths of that view remain part of the surface.
         """
 
 
@@ -494,17 +405,7 @@ PRESETS: Mapping[str, PipelineConfig] = {
 
 
 def preset(name: Any) -> PipelineConfig:
-    """Return a preset configuration.
-
-    Parameters
-    ----------
-    name : str
-        "default" or "thesis"; another one is a ``UsageError``.
-
-    Returns
-    -------
-    PipelineConfig
-    """
+    """Return the preset of a name; an unknown name is a ``UsageError``."""
     if not isinstance(name, str) or name not in PRESETS:
         raise UsageError(unknown_word("preset", name, PRESETS))
     return PRESETS[name]

@@ -136,17 +136,9 @@ def _numbered(keys: Sequence[tuple[float, ...]]) -> I64:
 def camera_numbers(
     original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
 ) -> I64:
-    """Number the cameras so that views with equal numbers agree in all intrinsics, known or shared.
+    """Number the cameras (V,) so that views with equal numbers agree in all intrinsics, known or shared.
 
-    Parameters
-    ----------
-    original_sizes, options, exif_focal_px
-        As for :func:`prior_from_options`; ``exif_focal_px`` None: no EXIF data.
-
-    Returns
-    -------
-    ndarray (V,) of int
-        0-based numbers in the order of the views.
+    ``exif_focal_px`` None: no EXIF data.
     """
     n = len(original_sizes)
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
@@ -162,17 +154,8 @@ def prior_from_options(
 ) -> IntrinsicsPrior:
     """Return the prior of V views in pixels at working size.
 
-    Parameters
-    ----------
-    options, original_sizes : IntrinsicsOptions, sequence of (width, height)
-        The user's settings, and the sizes of the original images.
-    exif_focal_px, scales : ndarray (V,)
-        Focal lengths from EXIF in original pixels (NaN if missing), and working over original size.
-
-    Returns
-    -------
-    IntrinsicsPrior
-        One row per view; ``UsageError`` if the given principal point lies far outside an image.
+    ``exif_focal_px`` (V,) are in original pixels, NaN if missing, ``scales`` (V,) working over original size.
+    A given principal point far outside an image is a ``UsageError``.
     """
     n = len(original_sizes)
     _check_sizes(options, original_sizes)
@@ -202,17 +185,7 @@ def prior_from_options(
 
 
 def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None = None) -> IntrinsicsPrior:
-    """Return the prior of the views of a reconstruction, in its own pixels and without EXIF.
-
-    Parameters
-    ----------
-    reconstruction, options : Reconstruction, IntrinsicsOptions
-        Its ``sizes`` are taken for the original sizes; options None: the defaults.
-
-    Returns
-    -------
-    IntrinsicsPrior
-    """
+    """Return the prior of the views of a reconstruction, in its own pixels and without EXIF."""
     sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
     missing, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
     return prior_from_options(options or IntrinsicsOptions(), sizes, missing, same)
