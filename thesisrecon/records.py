@@ -17,23 +17,16 @@ from thesisrecon.errors import Notice, counted
 class Image:
     """One image at working size.
 
-    Parameters
-    ----------
-    name, rgb, original_size : str, ndarray (H, W, 3) uint8, tuple of int
-        File name, pixels, and (width, height) of the file after EXIF rotation (from COLMAP: as stored).
-    mask : ndarray (H, W) of bool, optional
-        Pixels to use; None: all.
-
     Examples
     --------
     >>> Image("a.png", np.zeros((480, 640, 3), np.uint8), (1280, 960)).size
     (640, 480)
     """
 
-    name: str
-    rgb: NDArray[np.uint8]
-    original_size: tuple[int, int]
-    mask: B8 | None = None
+    name: str  #: file name
+    rgb: NDArray[np.uint8]  #: (H, W, 3)
+    original_size: tuple[int, int]  #: (width, height) after EXIF rotation (from COLMAP: as stored)
+    mask: B8 | None = None  #: (H, W) pixels to use; None: all
 
     @property
     def has_pixels(self) -> bool:
@@ -131,25 +124,14 @@ class DegeneracyReport:
 
 @dataclass(frozen=True)
 class FundamentalFit:
-    """A robust estimate of F.
+    """A robust estimate of F."""
 
-    Parameters
-    ----------
-    F, covariance : ndarray (3, 3), ndarray (9, 9)
-        Fundamental matrix of unit Frobenius norm, and the covariance of its entries (row-major).
-    inliers, sigma_px : ndarray (M,) of bool, float
-        Inliers, and the standard deviation of one image coordinate, estimated from them.
-    iterations : int
-        Number of samples.
-    competing_models : ndarray (K, 3, 3)
-        Other results of the search, best first; F is ambiguous if they explain as many matches.
-    """
-
-    F: F64
-    inliers: B8
-    sigma_px: float
-    covariance: F64
-    iterations: int = 0
+    F: F64  #: (3, 3) of unit Frobenius norm
+    inliers: B8  #: (M,)
+    sigma_px: float  #: standard deviation of one image coordinate, estimated from the inliers
+    covariance: F64  #: (9, 9) of the entries of F, row by row
+    iterations: int = 0  #: number of samples
+    #: (K, 3, 3) other results of the search, best first; F is ambiguous if they explain as many matches
     competing_models: F64 = field(default_factory=lambda: np.empty((0, 3, 3)))
 
 
@@ -158,40 +140,24 @@ class TwoView:
     """A pair of views with its epipolar geometry and its verified matches.
 
     A pair may be accepted with an undetermined F: its matches are valid all the same.
-
-    Parameters
-    ----------
-    i, j, F, sigma_px
-        View numbers, and the estimate as in :class:`FundamentalFit`.
-    index1, index2, xy1, xy2, affine : ndarray
-        Verified matches, as in :class:`Matches`.
-    candidates : int
-        Number of matches before verification.
-    homography_inlier_ratio : float
-        Fraction of the verified matches that one homography explains; near 1 for a plane or a pure rotation.
-    accepted, reason : bool, str
-        Whether the pair enters the tracks, else why not.
-    configuration : str
-        "general", "plane", "pure rotation" or "pure translation"; empty for too few matches.
-    degeneracy : DegeneracyReport, optional
-        Whether the matches determine F; None for too few matches.
     """
 
     i: int
     j: int
-    F: F64
-    sigma_px: float
-    index1: I64
+    F: F64  #: (3, 3) of unit Frobenius norm
+    sigma_px: float  #: standard deviation of one image coordinate
+    index1: I64  #: verified matches, as in :class:`Matches`
     index2: I64
     xy1: F64
     xy2: F64
     affine: F64
-    candidates: int
+    candidates: int  #: number of matches before verification
+    #: fraction of the verified matches that one homography explains; near 1 for a plane or a pure rotation
     homography_inlier_ratio: float
-    accepted: bool
-    reason: str = ""
-    configuration: str = ""
-    degeneracy: DegeneracyReport | None = None
+    accepted: bool  #: whether the pair enters the tracks
+    reason: str = ""  #: why it does not
+    configuration: str = ""  #: "general", "plane", "pure rotation" or "pure translation"; "" if too few
+    degeneracy: DegeneracyReport | None = None  #: None for too few matches
 
     @property
     def inliers(self) -> int:
@@ -206,56 +172,31 @@ class TwoView:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations of scene points, sorted by (point, view).
+    """Observations of scene points, sorted by (point, view); a point at most once per view."""
 
-    Parameters
-    ----------
-    view_index, point_index, xy : ndarray (K,) of int, ndarray (K, 2)
-        View, point and position (px) of each observation; a point at most once per view.
-    n_views, n_points : int
-        Number of views and points.
-    """
-
-    view_index: I64
-    point_index: I64
-    xy: F64
+    view_index: I64  #: (K,)
+    point_index: I64  #: (K,)
+    xy: F64  #: (K, 2) positions, px
     n_views: int
     n_points: int
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Cameras and points in one stratum ("projective", "affine" or "metric"), with their tracks.
-
-    Parameters
-    ----------
-    P : ndarray (V, 3, 4)
-        Camera matrices, zeros where not registered; K [R t] before distortion in the metric stratum.
-    X : ndarray (N, 4)
-        Homogeneous points, zeros where not valid; last coordinate 1 in the metric stratum.
-    registered, valid, inlier : ndarray (V,), (N,), (K,) of bool
-        Registered views, reconstructed points and inliers among the K observations in ``tracks``.
-    sizes, sigma_px : ndarray (V, 2) of int, float
-        Image sizes (width, height), and the noise of one image coordinate.
-    reasons : tuple of str
-        Per view why it is not registered; empty where it is.
-    K, distortion : ndarray (V, 3, 3), ndarray (V, 3), optional
-        Calibration matrices and radial coefficients k1, k2, k3 as in :class:`thesisrecon.Camera` (metric
-        stratum; None: no distortion).
-    """
+    """Cameras and points in one stratum ("projective", "affine" or "metric"), with their tracks."""
 
     stratum: Stratum
-    P: F64
-    X: F64
-    registered: B8
-    valid: B8
-    inlier: B8
+    P: F64  #: (V, 3, 4), zeros where not registered; K [R t] before distortion in the metric stratum
+    X: F64  #: (N, 4), zeros where not valid; last coordinate 1 in the metric stratum
+    registered: B8  #: (V,)
+    valid: B8  #: (N,) reconstructed points
+    inlier: B8  #: (K,) inliers among the observations in ``tracks``
     tracks: Tracks
-    sizes: I64
-    sigma_px: float
-    reasons: tuple[str, ...]
-    K: F64 | None = None
-    distortion: F64 | None = None
+    sizes: I64  #: (V, 2) width and height
+    sigma_px: float  #: noise of one image coordinate
+    reasons: tuple[str, ...]  #: per view why it is not registered; empty where it is
+    K: F64 | None = None  #: (V, 3, 3) calibration matrices in the metric stratum
+    distortion: F64 | None = None  #: (V, 3) radial k1, k2, k3 as in :class:`thesisrecon.Camera`; None: none
 
     @property
     def used(self) -> B8:
@@ -366,30 +307,16 @@ class IdentifiabilityReport:
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """Result of self-calibration (chapter 7).
+    """Result of self-calibration (chapter 7)."""
 
-    Parameters
-    ----------
-    metric_from_projective : ndarray (4, 4)
-        Upgrading transform of the best candidate.
-    K, K_std : ndarray (V, 3, 3)
-        Calibration matrices, zeros where not registered, and the standard deviations of their entries: 0 if
-        known, that of the prior if not estimated, NaN if unknown.
-    identifiable, reasons, identifiability : bool, tuple of str, IdentifiabilityReport
-        Whether the views determine the calibration, and the evidence (None: not tested). The reasons say why
-        not, or that bundle adjustment moves the focal length far from ``K``, which is then only an initial
-        value.
-    candidates : tuple of Upgrade
-        All candidates, best first.
-    """
-
-    metric_from_projective: F64
-    K: F64
-    K_std: F64
-    identifiable: bool
+    metric_from_projective: F64  #: (4, 4) upgrading transform of the best candidate
+    K: F64  #: (V, 3, 3) calibration matrices, zeros where not registered
+    K_std: F64  #: (V, 3, 3) standard deviations; 0: known, that of the prior: not estimated, NaN: unknown
+    identifiable: bool  #: whether the views determine the calibration
+    #: why they do not, or that bundle adjustment moves the focal length far from ``K``, then an initial value
     reasons: tuple[str, ...]
-    candidates: tuple[Upgrade, ...] = ()
-    identifiability: IdentifiabilityReport | None = None
+    candidates: tuple[Upgrade, ...] = ()  #: all candidates, best first
+    identifiability: IdentifiabilityReport | None = None  #: the evidence; None: not tested
 
     @property
     def Q(self) -> F64:
@@ -437,19 +364,11 @@ class MetricResult:
 
 @dataclass(frozen=True)
 class DisparityMap:
-    """Disparity of the left image of a rectified pair.
+    """Disparity of the left image of a rectified pair."""
 
-    Parameters
-    ----------
-    disparity, confidence : ndarray (H, W) float32
-        x_right = x_left - d, NaN where unknown or occluded; confidence in [0, 1], 0 where unknown.
-    sigma_px : float
-        Standard deviation of a confident disparity.
-    """
-
-    disparity: F32
-    confidence: F32
-    sigma_px: float
+    disparity: F32  #: (H, W) x_right = x_left - d, NaN where unknown or occluded
+    confidence: F32  #: (H, W) in [0, 1], 0 where unknown
+    sigma_px: float  #: standard deviation of a confident disparity
 
     def filled(self) -> F32:
         """Return the disparity (H, W) with holes filled by the farther neighbour of the row.
@@ -491,26 +410,14 @@ class PinholeView:
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """A triangle mesh with vertex colours, a texture or neither.
+    """A triangle mesh with vertex colours, a texture or neither."""
 
-    Parameters
-    ----------
-    vertices, colors : ndarray (N, 3), ndarray (N, 3) uint8
-        Points and their colours.
-    faces : ndarray (M, 3) int64
-        Vertex indices, counter-clockwise seen from outside.
-    uv, texture : ndarray (M, 3, 2), ndarray (H, W, 3) uint8, optional
-        Texture, and texture coordinates of the corners in texels, (0, 0) = centre of the top-left texel.
-    untextured : ndarray (M,) of bool, optional
-        Faces that no view sees.
-    """
-
-    vertices: F64
-    faces: I64
-    colors: NDArray[np.uint8] | None = None
-    uv: F64 | None = None
-    texture: NDArray[np.uint8] | None = None
-    untextured: B8 | None = None
+    vertices: F64  #: (N, 3)
+    faces: I64  #: (M, 3) vertex indices, counter-clockwise seen from outside
+    colors: NDArray[np.uint8] | None = None  #: (N, 3)
+    uv: F64 | None = None  #: (M, 3, 2) texels of the corners, (0, 0) = centre of the top-left texel
+    texture: NDArray[np.uint8] | None = None  #: (H, W, 3)
+    untextured: B8 | None = None  #: (M,) faces that no view sees
 
 
 @dataclass(frozen=True)
@@ -573,7 +480,7 @@ def require_mesh(caller: str, mesh: TexturedMesh) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """The similarity y = scale R x + t."""
+    """The similarity y = scale R x + t, with a positive scale."""
 
     scale: float
     R: F64

@@ -108,46 +108,29 @@ class RunResult:
 
     ``cameras``, ``points``, ``observations``, ``summary`` and all files are in pixels of the original images;
     the records of the stages are in pixels at working size.
-
-    Parameters
-    ----------
-    out, settings : Path, mapping
-        Output folder (None if the run had none), and the settings: stage -> field -> value.
-    images, groups : tuple of Image, ndarray (V,) of int
-        The V views at working size, and the camera number of each.
-    unread : mapping
-        File name -> reason of unreadable images.
-    features, pair_choice, pairs, tracks, projective, calibration, metric, mesh, held_out
-        Results of the stages; ``pairs`` are all matched ones, accepted or not.
-    views, depth_maps : sequence of PinholeView, sequence of DepthMap
-        Undistorted images and their depth maps; of many, some are undistorted, or read from ``out``, when
-        they are used.
-    reports, warnings, failure : tuple of StageReport, tuple of str, str
-        One report per stage, all warnings, and the failure that ended the run, empty otherwise.
-    summary : mapping
-        Content of ``summary.json``.
     """
 
-    out: Path | None
-    images: tuple[Image, ...]
-    unread: Mapping[str, str]
+    out: Path | None  #: output folder, None if the run had none
+    images: tuple[Image, ...]  #: the V views at working size
+    unread: Mapping[str, str]  #: file name -> reason of unreadable images
     features: tuple[Features, ...]
-    pairs: tuple[TwoView, ...]
-    groups: I64
-    settings: Mapping[str, Mapping[str, Any]]
+    pairs: tuple[TwoView, ...]  #: all matched pairs, accepted or not
+    groups: I64  #: (V,) camera number of each view
+    settings: Mapping[str, Mapping[str, Any]]  #: stage -> field -> value
     pair_choice: PairChoice | None = None
     tracks: Tracks | None = None
     projective: Reconstruction | None = None
     calibration: SelfCalibration | None = None
     metric: MetricResult | None = None
+    #: undistorted images and, below, their depth maps; of many, some are made or read when they are used
     views: Sequence[PinholeView] = ()
     depth_maps: Sequence[DepthMap] = ()
     mesh: TexturedMesh | None = None
     held_out: HeldOut | None = None
-    reports: tuple[StageReport, ...] = ()
-    warnings: tuple[str, ...] = ()
-    summary: Mapping[str, Any] = field(default_factory=dict)
-    failure: str = ""
+    reports: tuple[StageReport, ...] = ()  #: one per stage
+    warnings: tuple[str, ...] = ()  #: of all stages
+    summary: Mapping[str, Any] = field(default_factory=dict)  #: content of ``summary.json``
+    failure: str = ""  #: the failure that ended the run
 
     def __repr__(self) -> str:
         # That of a dataclass prints the pixels and features of all images.
@@ -259,33 +242,17 @@ class SparseView:
         return np.asarray(-self.R.T @ self.t)
 
 
-def _empty(*shape: int) -> F64:
-    return np.zeros(shape)
-
-
 @dataclass(frozen=True, eq=False)
 class SparseModel:
-    """Cameras of images, points and the observations of the points.
+    """Cameras of images, points and the observations of the points, in pixels of the original images."""
 
-    Parameters
-    ----------
-    views : sequence of SparseView
-        V images with a pose.
-    X, colors : ndarray (N, 3), ndarray (N, 3) uint8, optional
-        Points and their colours.
-    view_index, point_index, xy : ndarray (M,), ndarray (M,), ndarray (M, 2)
-        Observations of the points, in pixels of the original images.
-    as_stored : bool
-        Whether these are pixels of the files as stored, as in COLMAP, and not after EXIF rotation.
-    """
-
-    views: Sequence[SparseView]
-    X: F64 = field(default_factory=lambda: _empty(0, 3))
-    colors: U8 | None = None
-    view_index: I64 = field(default_factory=lambda: _empty(0).astype(np.int64))
-    point_index: I64 = field(default_factory=lambda: _empty(0).astype(np.int64))
-    xy: F64 = field(default_factory=lambda: _empty(0, 2))
-    as_stored: bool = False
+    views: Sequence[SparseView]  #: V images with a pose
+    X: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: U8 | None = None  #: (N, 3) of the points
+    view_index: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    point_index: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    xy: F64 = field(default_factory=lambda: np.zeros((0, 2)))
+    as_stored: bool = False  #: pixels are those of the files as stored, as in COLMAP, without EXIF rotation
 
     @property
     def names(self) -> list[str]:
@@ -309,65 +276,33 @@ THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class PointDistances:
-    """Distances between the points of two models, from each point to the nearest one of the other model.
+    """Distances between the points of two models, from each point to the nearest one of the other model."""
 
-    Parameters
-    ----------
-    a_to_b, b_to_a : float
-        Medians, in units of b.
-    thresholds : ndarray (T,)
-        Distances: 0.1, 0.3, 1, 3 and 10 % of the median distance of the points of b from their median.
-    a_within, b_within : ndarray (T,)
-        Fraction of the points of a, and of b, that are nearer to the other model than the thresholds.
-    """
-
-    a_to_b: float
+    a_to_b: float  #: medians, in units of b
     b_to_a: float
+    #: 0.1, 0.3, 1, 3 and 10 % of the median distance of the points of b from their median
     thresholds: F64
-    a_within: F64
+    a_within: F64  #: fraction of the points of a, and of b, that are nearer to the other model than these
     b_within: F64
 
 
 @dataclass(frozen=True, eq=False)
 class ModelComparison:
-    """Differences of model a from model b, which is the reference; one entry per common camera.
+    """Differences of model a from model b, which is the reference; one entry per common camera."""
 
-    Parameters
-    ----------
-    names, names_b : tuple of str
-        V common cameras by their names in a, and in b.
-    centre_error : ndarray (V,)
-        Distances of the centres after ``similarity``, in units of b; NaN without it.
-    rotation_error_deg : ndarray (V,)
-        Angles after the rotation of the world that fits the rotations best; NaN for a single camera.
-    focal_error_rel : ndarray (V,)
-        f / f_b - 1 with f the geometric mean of fx and fy; NaN if a model has no intrinsics.
-    principal_point_error_px : ndarray (V,)
-        Distances of the principal points, in pixels of b.
-    similarity : Similarity or None
-        Least-squares similarity of the centres (Umeyama) from a to b; None if they do not determine it.
-    points : PointDistances or None
-        Distances of the point clouds, if both models have points and there is a similarity.
-    only_a, only_b : tuple of str
-        Cameras that the other model does not have.
-    notes : tuple of str
-        Quantities that could not be compared, and the reasons.
-    a, b : SparseModel
-        The models; ``a`` in the world of b if there is a similarity.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  #: V common cameras by their names in a, and in b
     names_b: tuple[str, ...]
-    centre_error: F64
+    centre_error: F64  #: (V,) distances of the centres after ``similarity``, in units of b; NaN without it
+    #: (V,) angles after the rotation of the world that fits the rotations best; NaN for a single camera
     rotation_error_deg: F64
-    focal_error_rel: F64
-    principal_point_error_px: F64
-    similarity: Similarity | None
-    points: PointDistances | None
-    only_a: tuple[str, ...]
+    focal_error_rel: F64  #: (V,) f / f_b - 1, f the geometric mean of fx and fy; NaN without intrinsics
+    principal_point_error_px: F64  #: (V,) distances of the principal points, in pixels of b
+    similarity: Similarity | None  #: least squares of the centres (Umeyama), a to b; None if undetermined
+    points: PointDistances | None  #: if both models have points and there is a similarity
+    only_a: tuple[str, ...]  #: cameras that the other model does not have
     only_b: tuple[str, ...]
-    notes: tuple[str, ...]
-    a: SparseModel
+    notes: tuple[str, ...]  #: quantities that could not be compared, and the reasons
+    a: SparseModel  #: in the world of b if there is a similarity
     b: SparseModel
 
     @property

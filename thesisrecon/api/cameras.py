@@ -49,36 +49,19 @@ class BundleAdjustment:
 
     All covariances are those of the inner gauge (free network adjustment): among the solutions that differ by
     a similarity, the one that moves the cameras least. They contain the uncertainty of all other unknowns.
-
-    Parameters
-    ----------
-    cameras, X : tuple of Camera, ndarray (N, 3)
-        Cameras, with ``std`` of their intrinsics (0: not free), and points.
-    residual_px : ndarray (V, N, 2) or (K, 2)
-        Projection minus observation in the order of the observations; NaN where there is none.
-    sigma_px, cost : float
-        Standard deviation of one image coordinate, estimated from the residuals; and 1/2 sum rho with the
-        priors, in units of the noise that weighted the residuals (``sigma_px`` of :func:`bundle_adjust`).
-    pose_covariance : ndarray (V, 6, 6)
-        Covariance of the motion x -> exp(w) x + d in each camera frame, (rotation vector w in rad, d);
-        infinite for views without observations.
-    intrinsics_covariance : ndarray (V, 8, 8)
-        In the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free.
-    point_covariance : ndarray (N, 3, 3)
-        Infinite for points in fewer than two views.
-    sigmas_to_minimum : float
-        Distance of the cameras from the minimum in standard deviations, by the gradient: no camera parameter
-        is farther. Above 0.1 the adjustment has not converged, see ``converged``.
     """
 
-    cameras: tuple[Camera, ...]
-    X: F64
-    residual_px: F64
-    sigma_px: float
-    cost: float
+    cameras: tuple[Camera, ...]  #: with ``std`` of their intrinsics (0: not free)
+    X: F64  #: (N, 3)
+    residual_px: F64  #: (V, N, 2) or (K, 2) projection minus observation; NaN where there is none
+    sigma_px: float  #: standard deviation of one image coordinate, estimated from the residuals
+    cost: float  #: 1/2 sum rho with the priors, in units of the noise that weighted the residuals
+    #: (V, 6, 6) of the motion x -> exp(w) x + d in the camera frame, (w in rad, d); infinite if unseen
     pose_covariance: F64
+    #: (V, 8, 8) in the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free
     intrinsics_covariance: F64
-    point_covariance: F64
+    point_covariance: F64  #: (N, 3, 3), infinite for points in fewer than two views
+    #: distance of the cameras from the minimum in standard deviations, by the gradient: none is farther
     sigmas_to_minimum: float
 
     @property

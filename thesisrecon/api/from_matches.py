@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,6 +40,9 @@ from thesisrecon.runtime._run_folder import key_of
 class GivenOptions(RunOptions, total=False):
     """Options of the functions of this module: those of :func:`reconstruct` except ``pairs``."""
 
+    config: Config | None
+    seed: int
+    progress: Progress | None
     masks: str | Path | None
     preset: str | None
     max_size: int | None
@@ -55,9 +58,6 @@ def reconstruct_from_matches(
     *,
     names: Sequence[str] | None = None,
     images: str | Path | Sequence[Any] | None = None,
-    config: Config | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
     **options: Unpack[GivenOptions],
 ) -> RunResult:
     """Reconstruct metric cameras and points from matches of any program.
@@ -81,10 +81,10 @@ def reconstruct_from_matches(
     images : path, or sequence of V path, array or Image, optional
         The images, for colours, depth maps and the textured model: a folder with files of these names, or the
         images in the order of the keypoints.
-    config, seed, progress, **options
-        As for :func:`reconstruct`: ``preset``, ``max_size``, ``cameras``, ``set``, ``masks`` (matches in
-        masked pixels are dropped), ``until`` ("metric" without images), ``threads``, ``executor``,
-        ``overwrite``, ``shared``.
+    **options
+        As for :func:`reconstruct`: ``config``, ``seed``, ``progress``, ``preset``, ``max_size``, ``cameras``,
+        ``set``, ``masks`` (matches in masked pixels are dropped), ``until`` ("metric" without images),
+        ``threads``, ``executor``, ``overwrite``, ``shared``.
 
     Returns
     -------
@@ -116,7 +116,7 @@ def reconstruct_from_matches(
     """
     views = views_of(sizes, names, images)
     given = given_matches(keypoints, matches, views)
-    return _reconstruct("the given matches", given, views, out, config, seed, progress, options)
+    return _reconstruct("the given matches", given, views, out, options)
 
 
 def reconstruct_from_tracks(
@@ -126,9 +126,6 @@ def reconstruct_from_tracks(
     *,
     names: Sequence[str] | None = None,
     images: str | Path | Sequence[Any] | None = None,
-    config: Config | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
     **options: Unpack[GivenOptions],
 ) -> RunResult:
     """Reconstruct metric cameras and points from tracks of any program.
@@ -138,7 +135,7 @@ def reconstruct_from_tracks(
     tracks : Tracks or ndarray (V, N, 2)
         Observations in pixels of the images; in an array NaN where a point is not seen. They may contain
         outliers: pairs of images are verified by the points that they share.
-    sizes, out, names, images, config, seed, progress, **options
+    sizes, out, names, images, **options
         As for :func:`reconstruct_from_matches`.
 
     Returns
@@ -163,7 +160,7 @@ def reconstruct_from_tracks(
     """
     views = views_of(sizes, names, images)
     given = given_tracks(tracks, views)
-    return _reconstruct("the given tracks", given, views, out, config, seed, progress, options)
+    return _reconstruct("the given tracks", given, views, out, options)
 
 
 def reconstruct_from_colmap(
@@ -171,9 +168,6 @@ def reconstruct_from_colmap(
     out: str | Path | None = None,
     *,
     images: str | Path | Sequence[Any] | None = None,
-    config: Config | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
     **options: Unpack[GivenOptions],
 ) -> RunResult:
     """Reconstruct metric cameras and points from a COLMAP database or sparse model.
@@ -185,7 +179,7 @@ def reconstruct_from_colmap(
     path : path
         A database with keypoints and matches (the verified matches, or the raw ones if there are none), or a
         folder with a sparse model of any kind of camera, binary or text, whose tracks are used.
-    out, images, config, seed, progress, **options
+    out, images, **options
         As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images,
         which are used as stored, without EXIF rotation.
 
@@ -228,16 +222,7 @@ def reconstruct_from_colmap(
         database = read_database(path)
         views = views_of(database.sizes, database.names, images, as_stored=True)
         given = given_matches(database.keypoints, database.matches, views)
-    return _reconstruct(str(path), given, views, out, config, seed, progress, options)
-
-
-@contextmanager
-def _folder(out: str | Path | None) -> Iterator[str | Path]:
-    if out is not None:
-        yield out
-        return
-    with TemporaryDirectory() as folder:
-        yield folder
+    return _reconstruct(str(path), given, views, out, options)
 
 
 def _reconstruct(
@@ -245,19 +230,17 @@ def _reconstruct(
     given: Given,
     views: Views,
     out: str | Path | None,
-    config: Config | None,
-    seed: int,
-    progress: Progress | None,
     options: Mapping[str, Any],
 ) -> RunResult:
     options = dict(options)
     chosen = {name: options.pop(name, None) for name in ("preset", "max_size", "cameras")}
-    config = build_config(config, **chosen, settings=options.pop("set", ()))
+    config = build_config(options.pop("config", None), **chosen, settings=options.pop("set", ()))
     masks = options.pop("masks", None)
     if isinstance(config.tracks, AlignedTracks):
         # There are no prepared images to align the observations with.
         config = replace(config, tracks=PlainTracks())
-    with _folder(out) as folder:
+    seed, progress = options.pop("seed", 0), options.pop("progress", None)
+    with TemporaryDirectory() if out is None else nullcontext(out) as folder:
         until, run, overwrite = start_run(folder, config, seed, progress, options)
         run.as_stored = views.as_stored
         requested = options.get("until") is not None
