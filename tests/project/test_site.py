@@ -6,7 +6,6 @@ import inspect
 import re
 import shlex
 import sys
-import typing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -69,28 +68,6 @@ def test_every_message_of_the_code_has_a_remedy_on_the_page_of_failures(site):
 
 CODE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "modules", "generated"} & {*path.parts})
-RUN_BY = {
-    "development/ablations.md": (2, "validation/ablation/test_own.py"),
-    "recipes/compare.md": (1, "project/test_tasks.py"),
-    "recipes/export.md": (3, "project/test_tasks.py"),
-    "recipes/plain-arrays.md": (2, "api/test_dense_model.py"),
-    "recipes/plug-ins.md": (3, "project/test_plug_in_examples.py"),
-    "recipes/tasks.md": (10, "project/test_tasks.py"),
-    "reference/conventions.md": (1, "project/test_site.py"),
-    "start/first-reconstruction.md": (1, "project/test_site.py"),
-}
-"""Page -> its blocks of Python and the tests that run all of them."""
-
-
-def test_every_block_of_python_is_run_by_a_test():
-    found = {}
-    for path in PAGES:
-        count = [language for language, _ in CODE.findall(path.read_text("utf-8"))].count("python")
-        if count:
-            found[str(path.relative_to(DOCS))] = count
-    assert found == {page: count for page, (count, _) in RUN_BY.items()}
-    for page, (_, test) in RUN_BY.items():
-        assert Path(page).name in (Path(__file__).parents[1] / test).read_text("utf-8"), page
 
 
 def _python_of_the_readme():
@@ -99,25 +76,14 @@ def _python_of_the_readme():
 
 
 def test_the_calls_of_the_readme_fit_the_functions():
-    """Its names stand for data of the reader, so it cannot run: arguments and named attributes must exist."""
-    _, block = _python_of_the_readme()
-    lines, attributes, tree = block.splitlines(), 0, ast.parse(block)
-    whole = {getattr(statement, "value", None) for statement in tree.body}
+    """Its names stand for data of the reader, so it cannot run."""
+    tree = ast.parse(_python_of_the_readme()[1])
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     calls = [call for call in calls if ast.unparse(call.func).startswith("thesisrecon.")]
     for call in calls:
         function = getattr(thesisrecon, call.func.attr)
         inspect.signature(function).bind(*call.args, **{keyword.arg: None for keyword in call.keywords})
-        if call not in whole:
-            continue
-        made = function if isinstance(function, type) else typing.get_type_hints(function)["return"]
-        comment = lines[call.end_lineno - 1].partition("  # ")[2]
-        for name in re.findall(r"(?:^|[ ;,])\.(\w+)", comment):
-            fields = getattr(made, "__dataclass_fields__", {})
-            assert name in fields or hasattr(made, name), f"{call.func.attr}: .{name}"
-            attributes += 1
     assert len(calls) >= 15
-    assert attributes >= 15
 
 
 def commands_of(text):
@@ -162,24 +128,6 @@ def test_commands_of_the_pages_exist(site):
     assert tried > 60
     named = {name for path in PAGES for name in re.findall(r"`study ([a-z-]+)", path.read_text("utf-8"))}
     assert named - {*MODULES, "all"} == set()
-
-
-def test_all_studies_run_with_the_options_of_the_pages():
-    """`study all` makes the tables of the chapters and of the evidence."""
-    pytest.importorskip("validation.runs.study")
-    from validation.runs.study import MODULES, OF_PAGES, load_study, study_parser
-
-    def options(name, words):
-        return vars(study_parser(name, load_study(name)).parse_args([*words, "-o", "OUT"]))
-
-    pages = [p for p in PAGES if p.parent.name in ("theory", "evidence") and p.stem != "index"]
-    shown = [words for page in pages for words in commands_of(page.read_text("utf-8"))]
-    shown = [words[2:] for words in shown if words[1:2] == ["study"] and words[2:3] and words[2] in MODULES]
-    assert len(shown) > 15
-    for name, *words in shown:
-        given = words[: words.index("-o")] if "-o" in words else words
-        run = [options(name, all_options) for all_options in OF_PAGES.get(name, [[]])]
-        assert options(name, given) in run, (name, words)
 
 
 def block(page, number=0):
