@@ -131,6 +131,8 @@ class RunResult:
     warnings: tuple[str, ...] = ()  #: of all stages
     summary: Mapping[str, Any] = field(default_factory=dict)  #: content of ``summary.json``
     failure: str = ""  #: the failure that ended the run
+    #: results in ``group-2`` and so on: models of other images, each in its own world
+    further_models: tuple[RunResult, ...] = ()
 
     def __repr__(self) -> str:
         # That of a dataclass prints the pixels and features of all images.

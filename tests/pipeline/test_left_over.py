@@ -8,23 +8,28 @@ from thesisrecon import load, reconstruct_from_matches, reconstruct_from_tracks
 
 SCENE = given_scene()
 LINK = 80
-"""Points that only the last view of the first place and the first view of the second see."""
+"""Points that only the last view of the first place and one view of the second see."""
 
 
-def two_places():
-    """Pixels (10, N, 2), NaN where a point is not seen."""
+def two_places(common=0):
+    """Pixels (10, N, 2), NaN where a point is not seen; two views of either place see ``common`` more points.
+
+    Each view of the second place sees at most half of these.
+    """
     rng = np.random.default_rng(1)
     views, points = len(SCENE.keypoints), len(SCENE.X)
-    xy = np.full((2 * views, 2 * points + LINK, 2), np.nan)
+    X = np.concatenate([SCENE.X, SCENE.X, rng.uniform(-1, 1, (2 * LINK + common, 3))])
+    seen = np.zeros((2 * views, len(X)), dtype=bool)
     for place in (0, 1):
-        rows, columns = (slice(place * n, (place + 1) * n) for n in (views, points))
-        seen = np.stack(SCENE.keypoints)
-        xy[rows, columns] = seen + place * rng.normal(0, SCENE.noise_px, seen.shape)
-    X = rng.uniform(-1, 1, (LINK, 3))
-    for view in (views - 1, views):
-        pixels = SCENE.cameras[view % views].project(X)
-        xy[view, -LINK:] = pixels + rng.normal(0, SCENE.noise_px, pixels.shape)
-    return xy
+        seen[place * views : (place + 1) * views, place * points : (place + 1) * points] = True
+    link, more, shared = np.split(np.arange(2 * points, len(X)), [LINK, 2 * LINK])
+    seen[np.ix_([views - 1, views], link)] = True
+    if common:
+        seen[np.ix_([views - 1, views + 2], more)] = True
+        seen[views - 2 : views, shared] = True
+        seen[views : views + 2, shared[::2]] = seen[views + 2 : views + 4, shared[1::2]] = True
+    pixels = np.array([camera.project(X) for camera in SCENE.cameras * 2])
+    return np.where(seen[:, :, None], pixels + rng.normal(0, SCENE.noise_px, pixels.shape), np.nan)
 
 
 def from_tracks(xy, out):
@@ -59,5 +64,36 @@ def test_images_beyond_a_weak_link_become_a_model_with_the_same_camera(reconstru
     focal = SCENE.cameras[0].K[0, 0]
     first, second = (next(iter(found.cameras.values())) for found in (result, other))
     assert abs(second.K[0, 0] - focal) < 3 * second.std["focal_px"]
+    for (model,) in (result.further_models, load(tmp_path).further_models):
+        assert list(model.cameras) == list(other.cameras)
     # Its interval is that of all images.
     assert second.std["focal_px"] < 0.9 * first.std["focal_px"]
+
+
+@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches])
+def test_a_further_model_that_shares_points_is_joined(reconstruct, tmp_path):
+    result = reconstruct(two_places(common=8), tmp_path)
+    assert len(result.cameras) == len(load(tmp_path).cameras) == 10
+    assert result.summary["trusted"]
+    assert "groups" not in result.summary
+    assert result.further_models == ()
+    # Both places have the same cameras in the same world.
+    centres = np.array([camera.centre for camera in result.cameras.values()])
+    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    assert np.linalg.norm(centres[:5] - centres[5:], axis=1).max() < 0.02 * size
+
+
+def test_further_models_are_part_of_a_result_without_a_folder():
+    result = from_tracks(two_places(), None)
+    (other,) = result.further_models
+    assert len(result.cameras) == len(other.cameras) == 5
+    assert other.out is None
+    assert len(other.points) > 100
+
+
+def test_images_in_no_model_that_matches_connect_with_one_are_named(tmp_path):
+    # Two images of the second place are too few for a model.
+    result = from_tracks(two_places()[:7], tmp_path)
+    assert len(result.cameras) == 5
+    (text,) = (text for text in result.warnings if getattr(text, "code", "") == "linked-images")
+    assert text == "1 image in no model, although verified matches connect them with one: image-5"

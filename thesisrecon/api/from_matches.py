@@ -269,5 +269,10 @@ def _reconstruct(
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
             job = Job(run, inputs, given, until, requested)
             found = run_adopted(job, overwrite=overwrite, source=source)
-        # All depth maps are read: the folder is removed.
-        return found if out is not None else replace(found, out=None, depth_maps=found.depth_maps[:])
+        return found if out is not None else _without_folder(found)
+
+
+def _without_folder(found: RunResult) -> RunResult:
+    """The result with all depth maps in memory, as its folder is removed."""
+    further = tuple(_without_folder(model) for model in found.further_models)
+    return replace(found, out=None, depth_maps=found.depth_maps[:], further_models=further)

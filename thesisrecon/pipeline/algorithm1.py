@@ -9,6 +9,8 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
+import numpy as np
+
 from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
@@ -48,6 +50,8 @@ from thesisrecon.runtime._run_folder import RunDirectory
 
 ATTEMPTS = 3
 """Maximum number of initial pairs to try until the self-check passes."""
+MAX_NAMED = 10
+"""Images that one warning names."""
 Source = Mapping[str, str]
 """Name and digest of the matches or tracks that a run starts from."""
 
@@ -222,7 +226,7 @@ def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
 
 def _with_further_models(job: Job, result: RunResult) -> RunResult:
     """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
-    run, folder, places = job.run, job.run.directory.path, dict[int, str]()
+    run, folder, places, further = job.run, job.run.directory.path, dict[int, str](), list[RunResult]()
     known = known_cameras(job.prior, result.metric)
     pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *groups_left_over(job, result)])
     while pending:
@@ -231,20 +235,31 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
         pending.extend([views[k] for k in rest] for rest in groups_left_over(part, found))
         if (model := found.best_reconstruction) is not None:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
+            further.append(found)
     for number in count(len(run.groups) + 2):
         if not (folder / f"group-{number}" / RESULT_FILES[0]).exists():
             break
         RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
+    here = result.best_reconstruction
+    if here is not None and job.until != "projective":
+        _name_linked_images(job, result.pairs, {*np.flatnonzero(here.registered).tolist(), *places})
     if not run.groups:
         return result
-    here = result.best_reconstruction
     registered = 0 if here is None else int(here.registered.sum())
     none = len(job.names) - registered - len(places)
     elsewhere = ", ".join(f"{group['registered']} in {group['folder']}" for group in run.groups)
     elsewhere += f", {none} in none" if none else ""
     models = Notice("several-models", len(run.groups) + 1)
     run.warnings.append(Notice("sizes-of-models", models, counted(registered, "image"), elsewhere))
-    return _with_group_reasons(result, places)
+    return replace(_with_group_reasons(result, places), further_models=tuple(further))
+
+
+def _name_linked_images(job: Job, pairs: Sequence[TwoView], registered: set[int]) -> None:
+    """Warn of images in no model that accepted pairs connect with one."""
+    ends = {end for p in pairs if p.accepted and {p.i, p.j} & registered for end in (p.i, p.j)}
+    if linked := [job.names[i] for i in sorted(ends - registered)]:
+        names = ", ".join(linked[:MAX_NAMED]) + (", ..." if len(linked) > MAX_NAMED else "")
+        job.run.warnings.append(Notice("linked-images", counted(len(linked), "image"), names))
 
 
 def _run_group(

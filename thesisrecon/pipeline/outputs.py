@@ -5,7 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
@@ -415,6 +415,7 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         warnings=tuple(summary["warnings"]),
         summary=summary,
         failure=summary["failure"] or "",
+        further_models=tuple(_further_models(folder, summary)),
     )
     attempts = [
         replace(
@@ -426,6 +427,13 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         for item in stages["projective"]
     ]
     return with_image_names(best_result(attempts or [result]))
+
+
+def _further_models(folder: Path, summary: Mapping[str, Any]) -> Iterator[RunResult]:
+    for group in summary.get("groups", ()):
+        part, run = (read_json(folder / group["folder"] / name) for name in (SUMMARY, RUN_FILE))
+        if group["registered"] and isinstance(part, dict) and isinstance(run, dict):
+            yield load_run(folder / group["folder"], part, run)
 
 
 def _last_metric(records: Mapping[str, Any], item: str) -> Any:
