@@ -138,9 +138,11 @@ def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> l
     a, b = a - mean_a[:, None], b - mean_b[:, None]
     U, _, Vt = np.linalg.svd(np.einsum("nki,nkj->nij", a, b))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    R, scale = U @ Vt, np.linalg.norm(a, axis=(1, 2)) / np.linalg.norm(b, axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        R, scale = U @ Vt, np.linalg.norm(a, axis=(1, 2)) / np.linalg.norm(b, axis=(1, 2))
     t = mean_a - scale[:, None] * np.einsum("nij,nj->ni", R, mean_b)
-    return [Similarity(float(f), *pose) for f, *pose in zip(scale, R, t, strict=True)]
+    usable = np.flatnonzero(np.isfinite(scale) & (scale > 0.0))
+    return [Similarity(float(scale[k]), R[k], t[k]) for k in usable]
 
 
 def _refined(points: _Points, s: Similarity) -> Similarity:
