@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from thesisrecon.pipeline.image_pair import match_views
 
 from benchmarks.conftest import Bench
 from thesisrecon.config import preset
@@ -14,6 +13,7 @@ from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
+from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo._planar import PlanarRectification, hartley

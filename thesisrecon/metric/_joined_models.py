@@ -73,7 +73,7 @@ class _Points:
         return _Points(self.a[some], self.b[some], self.cov_a[some], self.cov_b[some], self.whole[some])
 
 
-def joinable(model: Reconstruction, groups: Sequence[Sequence[int]]) -> list[Sequence[int]]:
+def joinable(model: Reconstruction, groups: Sequence[list[int]]) -> list[list[int]]:
     """The groups of views that may share enough points with a model, or with another such group."""
     t, reached, left = model.tracks, model.registered.copy(), list(groups)
 
@@ -189,7 +189,7 @@ def _observed(model: Reconstruction, other: Reconstruction) -> B8:
     """Tracks (N,) that are points of a model, or points of the other one that the model observes once."""
     t = model.tracks
     count = np.bincount(t.point_index[model.registered[t.view_index]], minlength=t.n_points)
-    return model.valid | (other.valid & (count == 1))
+    return np.asarray(model.valid | (other.valid & (count == 1)))
 
 
 def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
@@ -209,8 +209,8 @@ def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
     k = np.flatnonzero((model.inlier | alone) & model.registered[t.view_index] & (place[t.point_index] >= 0))
     view, point = t.view_index[k], place[t.point_index[k]]
     P, K = model.P[view], model.K[view]
-    normalized = np.linalg.solve(K, homogenize(t.xy[k])[:, :, None])[:, :2, 0]
-    normalized = undistort(normalized, model.distortion[view])
+    pixels: F64 = np.asarray(np.linalg.solve(K, homogenize(t.xy[k])[:, :, None]), dtype=np.float64)
+    normalized = undistort(pixels[:, :2, 0], model.distortion[view])
     ray = np.linalg.solve(P[:, :, :3], K @ homogenize(normalized)[:, :, None])[:, :, 0]
     X = np.where(model.valid[numbers, None], model.X[numbers, :3], 0.0)
     lone = alone[k]
@@ -221,7 +221,7 @@ def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
     J = np.concatenate([J, ray[:, None] / (10.0 * depth)], axis=1)
     information = np.zeros((len(numbers), 3, 3))
     np.add.at(information, point, np.swapaxes(J, 1, 2) @ J)
-    return X, np.linalg.inv(information)
+    return X, np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
 def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree: I64) -> Reconstruction:
@@ -229,6 +229,8 @@ def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree:
     t, new, both = first.tracks, second.registered, np.isin(np.arange(first.tracks.n_points), agree)
     assert second.K is not None
     assert first.K is not None
+    assert second.distortion is not None
+    assert first.distortion is not None
     Rt = np.linalg.solve(second.K[new], second.P[new])
     R = Rt[:, :, :3] @ s.R.T
     P, K = first.P.copy(), first.K.copy()
