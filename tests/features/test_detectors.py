@@ -11,8 +11,8 @@ from thesisrecon.features.multiscale import (
     MultiScaleCorners,
     _low_frequencies,
     _normalize_patches,
+    simulate_view,
 )
-from thesisrecon.features.oblique import simulate_view
 from thesisrecon.records import Image
 
 HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, colour=True)

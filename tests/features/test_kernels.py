@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
-from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, map_coordinates, maximum_filter
+from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, maximum_filter
 
 from tests.synthetic import texture
-from thesisrecon.features import _kernels as kernels
+from thesisrecon.features import harris as kernels
+from thesisrecon.features import multiscale
 from thesisrecon.imaging.filters import gaussian_taps
 
 
@@ -65,27 +66,17 @@ def test_suppression_radii_equal_their_numpy_twin():
     assert np.allclose(kernels.squared_suppression_radii(xy, response, 0.9), twin, rtol=1e-5)
 
 
-def test_patches_equal_their_numpy_twin():
-    image = texture(80, 90, 5).astype(np.float32)
-    xy = np.array([[40.3, 35.7], [3.0, 4.0], [86.5, 77.0]])
-    angle = np.array([0.0, 0.7, -2.0], np.float32)
-    b, a = np.mgrid[0:8, 0:8] - 3.5
-    for n, patch in enumerate(kernels.sample_patches(image, xy, angle, 8, 4.0)):
-        c, s = 4.0 * np.cos(angle[n]), 4.0 * np.sin(angle[n])
-        u = np.clip(xy[n, 0] + c * a - s * b, 0, 88.999)
-        v = np.clip(xy[n, 1] + s * a + c * b, 0, 78.999)
-        twin = map_coordinates(image, [v, u], order=1)
-        assert np.abs(patch.reshape(8, 8) - twin).max() < 1e-2
-
-
-def test_affine_samples_equal_their_numpy_twin():
-    image = texture(60, 80, 8).astype(np.float32)
-    A, offset = np.array([[0.8, -0.4], [0.5, 0.9]]), np.array([10.0, -3.0])
-    row, column = np.mgrid[:50, :70]
-    u = np.clip(A[0, 0] * column + A[0, 1] * row + offset[0], 0, 78.999)
-    v = np.clip(A[1, 0] * column + A[1, 1] * row + offset[1], 0, 58.999)
-    found = kernels.sample_affinely(image, A, offset, (50, 70))
-    assert np.abs(found - map_coordinates(image, [v, u], order=1)).max() < 1e-2
+def test_patches_are_turned_and_clamped_at_the_border():
+    row, column = np.mgrid[:80, :90].astype(np.float32)
+    image, xy = 2.0 * column + row, np.array([[40.3, 35.7], [3.0, 4.0]])
+    b, a = np.mgrid[:8, :8] - 3.5
+    for angle in (0.0, 0.7):
+        c, s = 4.0 * np.cos(angle), 4.0 * np.sin(angle)
+        found = multiscale.sample_patches(image, xy, np.full(2, angle, np.float32), 8, 4.0).reshape(2, 8, 8)
+        for patch, (x, y) in zip(found, xy, strict=True):
+            u, v = np.clip(x + c * a - s * b, 0, 89), np.clip(y + s * a + c * b, 0, 79)
+            assert np.abs(patch - (2.0 * u + v)).max() < 1e-2
+    assert multiscale.sample_patches(image, xy[:0], np.zeros(0, np.float32), 8, 4.0).shape == (0, 64)
 
 
 def test_selected_corners_are_apart_and_none_is_dropped_without_reason():

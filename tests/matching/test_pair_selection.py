@@ -18,7 +18,6 @@ from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching import pair_selection
-from thesisrecon.matching._bag_of_words import word_weights
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.matching.pair_selection import (
     AllPairs,
@@ -33,6 +32,7 @@ from thesisrecon.matching.pair_selection import (
     _ranks,
     _subset_seeds,
     pairs_to_connect,
+    word_weights,
 )
 from thesisrecon.records import Features, TwoView
 
@@ -342,22 +342,15 @@ def test_mutual_best_is_its_numpy_twin(rows, columns, seed, equal):
     np.testing.assert_array_equal(second_best, wanted_second.astype(np.float32))
 
 
-def count_agreeing_numpy(xy1, xy2, scale, angle, limits):
-    z1, z2 = xy1 @ [1.0, 1.0j], xy2 @ [1.0, 1.0j]
-    turn = scale * np.exp(1j * angle)
-    miss = np.abs(z2[:, None] + turn[:, None] * (z1[None] - z1[:, None]) - z2[None])
-    near = miss <= limits[0]
-    near &= np.abs(np.log(scale[None] / scale[:, None])) <= limits[1]
-    near &= np.abs(np.angle(np.exp(1j * (angle[None] - angle[:, None])))) <= limits[2]
-    np.fill_diagonal(near, False)
-    return int(near.sum(axis=1).max())
-
-
-@given(st.integers(1, 14), st.integers(0, 2**31))
-def test_count_agreeing_is_its_numpy_twin(n, seed):
-    rng = np.random.default_rng(seed)
-    xy1, xy2 = rng.uniform(0.0, 30.0, (2, n, 2))
-    scale, angle = rng.uniform(0.5, 2.0, n), rng.uniform(-4.0, 4.0, n)
-    given_limits = np.array([12.0, 0.6, 0.9])
-    wanted = count_agreeing_numpy(xy1, xy2, scale, angle, given_limits)
-    assert _count_agreeing(xy1, xy2, scale, angle, given_limits) == wanted
+def test_matches_that_one_similarity_predicts_are_counted():
+    rng = np.random.default_rng(0)
+    xy1 = rng.uniform(0.0, 300.0, (9, 2))
+    scale, angle = np.full(9, 1.5), np.full(9, 0.4)
+    turn = 1.5 * np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+    xy2, limits = xy1 @ turn.T + 7.0, np.array([12.0, 0.6, 0.9])
+    assert _count_agreeing(xy1, xy2, scale, angle, limits) == 8
+    # Another place, scale or angle excludes a match each.
+    xy2[0] += 20.0
+    scale[1], angle[2] = 3.0, 1.5
+    assert _count_agreeing(xy1, xy2, scale, angle, limits) == 5
+    assert _count_agreeing(xy1[:1], xy2[:1], scale[:1], angle[:1], limits) == 0

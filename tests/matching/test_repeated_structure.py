@@ -1,6 +1,6 @@
 import numpy as np
 
-from thesisrecon.matching._repeated_structure import FEW_VIEWS, reject_repeated_structure
+from thesisrecon.matching.pair_selection import FEW_VIEWS, reject_repeated_structure
 from thesisrecon.records import TwoView
 
 NONE = np.zeros(0, np.int64)

@@ -8,8 +8,7 @@ import pytest
 from tests.metric.test_metric_refinement import centre_error, run
 from tests.metric.test_self_check import changed, setting, settled
 from tests.synthetic import make_scene
-from thesisrecon.metric._camera_model import (
-    MAX_REMAINING,
+from thesisrecon.metric._adjustment import (
     camera_differences,
     held_out_observations,
     remaining_cost,
@@ -17,6 +16,7 @@ from thesisrecon.metric._camera_model import (
     with_own_values,
 )
 from thesisrecon.metric._model import CENTRE, FOCAL
+from thesisrecon.metric.refinement import MAX_REMAINING
 
 
 @pytest.mark.parametrize("kind", ["crops", "zooms"])

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from thesisrecon import Camera, Tracks
 from thesisrecon.arrays import rows_of_views
 from thesisrecon.metric import _resection
-from thesisrecon.metric._confirmed_pose import MIN_MATCHES, MIN_POINTS, confirmed_pose
 from thesisrecon.metric._model import MetricEstimate
+from thesisrecon.metric._resection import FEWEST_POINTS, MIN_MATCHES, confirmed_pose
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 
 SIZE, NOISE_PX, FOCAL = (640, 480), 0.3, 700.0
@@ -58,7 +58,7 @@ def with_random_pixels(found, which, seed):
     return found
 
 
-@pytest.mark.parametrize("points", [MIN_POINTS, 8, 14])
+@pytest.mark.parametrize("points", [FEWEST_POINTS, 8, 14])
 def test_few_points_and_other_matches_determine_the_pose(points):
     R, t = pose_of(model(points))
     turned = np.degrees(np.linalg.norm(Rotation.from_matrix(R @ CAMERAS[3].R.T).as_rotvec()))
@@ -73,7 +73,7 @@ def test_wrong_matches_and_wrong_points_among_them_do_not_matter():
     assert np.linalg.norm(-R.T @ t - CAMERAS[3].centre) < 0.05
 
 
-@pytest.mark.parametrize(("points", "matches"), [(MIN_POINTS - 1, MATCHES), (8, MIN_MATCHES - 1)])
+@pytest.mark.parametrize(("points", "matches"), [(FEWEST_POINTS - 1, MATCHES), (8, MIN_MATCHES - 1)])
 def test_fewer_points_or_matches_are_not_enough(points, matches):
     assert pose_of(model(points, matches)) is None
 

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from tests.optimize.bundle_scenes import make_block, project_block
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.bundle import covariance as bundle_covariance
-from thesisrecon.optimize.bundle import reduced_solvers as kernels
 from thesisrecon.optimize.bundle.covariance import robust_sigma
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
@@ -118,19 +117,6 @@ def test_covariances_of_points_are_those_of_the_full_normal_equations(own):
         part = slice(len(covariance) - 75 + 3 * j, len(covariance) - 72 + 3 * j)
         expected = covariance[part, part]
         np.testing.assert_allclose(fit.point_covariance[j], expected, rtol=0, atol=1e-4 * expected.max())
-
-
-def test_entries_of_the_inverse_inside_the_band():
-    rng = np.random.default_rng(3)
-    L = np.tril(rng.normal(size=(20, 20))) * (np.abs(np.subtract.outer(range(20), range(20))) < 5)
-    L[np.diag_indices(20)] = rng.uniform(1.0, 2.0, 20)
-    inverse = np.linalg.inv(L @ L.T)
-    packed, out = np.zeros((20, 5)), np.zeros((20, 5))
-    for j in range(20):
-        packed[j, : min(5, 20 - j)] = L[j : j + 5, j]
-    kernels.invert_band(packed, out)
-    for j in range(20):
-        np.testing.assert_allclose(out[j, : min(5, 20 - j)], inverse[j : j + 5, j], rtol=1e-9, atol=1e-12)
 
 
 def test_noise_is_found_beside_outliers_and_points_that_fit_anything():

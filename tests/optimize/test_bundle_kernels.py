@@ -11,8 +11,7 @@ from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.small_matrices import floored_diagonal
 from thesisrecon.optimize import least_squares
 from thesisrecon.optimize.bundle import metric_kernels, scatter, schur
-from thesisrecon.optimize.bundle import projective_kernels as kernels
-from thesisrecon.optimize.bundle import reduced_solvers as solvers
+from thesisrecon.optimize.bundle import projective as kernels
 from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points, sum_leverages
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting, sort_observations
@@ -169,7 +168,7 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     layout = build_layout(o, np.arange(6) - 1, width=7, common=columns, border=9)
     assert layout.solver is None
     if solver == "banded":
-        layout = replace(layout, solver=solvers.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
+        layout = replace(layout, solver=schur.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
     J = layout.jacobians()
     model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     cost = metric_kernels.linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
@@ -229,24 +228,16 @@ def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
         dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
     dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
     full = np.triu(dense) + np.triu(dense, 1).T
-    system = solvers.ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
+    system = schur.ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
     more, pair = np.arange(11.0), np.full((4, 4), -1)
     pair[row, column] = np.arange(6)
-    solvers.add_diagonal(blocks, pair, corner, more)
+    schur.add_diagonal(system.sums, pair, more)
     full += np.diag(more)
     np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
-    place = np.array([1, 3, 0, 2])
-    band = np.zeros((8, 6))
-    solvers.fill_band(blocks, row, column, place, band)
-    order = (2 * np.argsort(place)[:, None] + np.arange(2)).ravel()
-    moved = full[np.ix_(order, order)]
-    for i in range(8):
-        for j in range(i, min(8, i + 6)):
-            assert band[i, j - i] == moved[j, i]
 
 
-@pytest.mark.parametrize("solve", [solvers.solve_dense, solvers.BandedCholesky(np.arange(3), 2).solve])
+@pytest.mark.parametrize("solve", [schur.solve_dense, schur.BandedCholesky(np.arange(3), 2).solve])
 @pytest.mark.parametrize("spoiled", ["views", "corner", "rhs"])
 @pytest.mark.parametrize("value", [-1.0, 0.0, np.nan])
 def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
@@ -254,7 +245,7 @@ def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
     blocks, border, corner = np.zeros((5, 2, 2)), np.full((3, 2, 1), 0.1), np.eye(1)
     blocks[row == column] = np.eye(2)
     sums = ReducedSums(blocks, border, corner, np.ones(7), *np.zeros((2, 7)))
-    system = solvers.ReducedSystem(row, column, sums)
+    system = schur.ReducedSystem(row, column, sums)
     full = np.triu(system.dense()) + np.triu(system.dense(), 1).T
     np.testing.assert_allclose(full @ solve(system), 1.0)
     what = {"views": blocks, "corner": corner, "rhs": sums.rhs}[spoiled]
@@ -266,7 +257,7 @@ def test_every_solver_detects_an_indefinite_system(solve, spoiled, value):
 def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     def chosen(n, pairs):
         i, j = (np.array(a) for a in zip(*sorted(pairs), strict=True))
-        return solvers.choose_solver(i, j, n, 6, 4)
+        return schur.choose_solver(i, j, n, 6, 4)
 
     near = {(i, j) for i in range(400) for j in range(i, min(i + 8, 400))}
     ring = near | {(j, i + 400) for i in range(-8, 0) for j in range(i + 8)}
@@ -274,7 +265,7 @@ def test_the_solver_is_chosen_by_the_pattern_of_the_blocks():
     wild = {tuple(sorted(rng.integers(0, 2000, 2))) for _ in range(20000)} | {(i, i) for i in range(2000)}
     every = {(i, j) for i in range(150) for j in range(i, 150)}
     assert chosen(400, near).reach == 7
-    assert isinstance(chosen(400, ring), solvers.BandedCholesky)
+    assert isinstance(chosen(400, ring), schur.BandedCholesky)
     assert chosen(2000, wild) is None
     assert chosen(150, every) is None
 

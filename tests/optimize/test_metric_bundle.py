@@ -9,7 +9,7 @@ from thesisrecon.optimize.bundle.intrinsic_unknowns import number_unknowns
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.optimize.bundle.reduced_solvers import BandedCholesky
+from thesisrecon.optimize.bundle.schur import BandedCholesky
 from thesisrecon.records import IntrinsicsPrior
 
 FOCAL = np.array([True, False, False, False, False, False])

@@ -16,7 +16,7 @@ from tests.pipeline.test_core_and_windows import street, with_repeated_windows
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
-from thesisrecon.matching._repeated_structure import reject_repeated_structure
+from thesisrecon.matching.pair_selection import reject_repeated_structure
 from thesisrecon.pipeline import large_sets
 from thesisrecon.pipeline.large_sets import (
     align_parts,

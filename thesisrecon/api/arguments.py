@@ -17,7 +17,7 @@ from thesisrecon.arrays import (
 )
 from thesisrecon.camera import Camera, compose_camera, decompose_camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.optimize.triangulation import triangulate_points
+from thesisrecon.optimize.bundle.partial import triangulate_points
 from thesisrecon.records import Reconstruction
 
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction

@@ -23,8 +23,8 @@ from thesisrecon.errors import unknown_word
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
+from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate_points
 from thesisrecon.optimize.robust_resection import Resection, resect_robust
-from thesisrecon.optimize.triangulation import Method, triangulate_points
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {
@@ -392,7 +392,7 @@ def resect(
     return resect_robust(X, xy, K, threshold_px, np.random.default_rng(seed))
 
 
-def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
+def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
     """Triangulate space points by one of the methods of section 6.3 (HZ 12).
 
     Parameters
@@ -422,8 +422,8 @@ def triangulate(P: F64, xy: F64, *, method: Method | None = None) -> F64:
     >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
     True
     """
-    if method is not None and method not in get_args(Method):
-        raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}")
+    if method is not None and method not in get_args(TriangulationMethod):
+        raise ValueError(f"method must be one of {', '.join(get_args(TriangulationMethod))}; got {method!r}")
     P, xy = _checked_views(P, xy)
     return triangulate_points(P, xy, method=method)
 

@@ -10,24 +10,192 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon._numba import FAST, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.features._kernels import (
-    corner_response,
-    enforce_spacing,
-    fit_maxima,
-    squared_suppression_radii,
-)
 from thesisrecon.imaging.filters import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
-# det / trace (grey levels squared) below which corners are quantisation and compression noise.
-NOISE_RESPONSE = 0.05
-# Candidates of a selection, as a multiple of the number selected.
-POOL_RATIO = 1.7
-# Maximum number of candidates in a cell of the image, relative to an even distribution.
-POOL_LIMIT = 1.5
-# Ratio of responses that counts as clearly stronger.
-ROBUSTNESS = 0.9
+
+@kernel(fastmath=FAST)
+def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
+    """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
+
+    M holds the products of the gradients of ``channels`` (C, H, W), summed over them and smoothed by
+    ``taps``; the gradient at x is sum_k derivative[k] I(x + k), k from the middle. ``trace_weight`` is 0 for
+    det M / trace M, else k of det M - k (trace M)^2. One sweep down the image keeps only the last 2 r + 1
+    rows of products, which stay in the cache.
+    """
+    count, height, width = channels.shape
+    reach, size = derivative.size // 2, taps.size
+    out = zeros((height, width), np.float32)
+    ring = zeros((size, 3, width), np.float32)
+    slope = empty((2, width), np.float32)
+    column = empty((3, width), np.float32)
+    moment = empty((3, width), np.float32)
+    border = size // 2 + reach
+    for y in range(reach, height - reach):
+        products = ring[y % size]
+        products[:] = np.float32(0.0)
+        for c in range(count):
+            _slopes(channels[c], derivative, y, slope)
+            _add_products(slope, reach, products)
+        if y < size + reach - 1:
+            continue
+        column[:] = np.float32(0.0)
+        for k in range(size):
+            earlier = ring[(y - size + 1 + k) % size]
+            weight = taps[k]
+            for m in range(3):
+                source, target = earlier[m], column[m]
+                for x in range(width):
+                    target[x] += weight * source[x]
+        moment[:] = np.float32(0.0)
+        for m in range(3):
+            target = moment[m, border:]
+            for k in range(size):
+                weight = taps[k]
+                # Slices that start at the first read avoid checks for negative indices in the loops.
+                source = column[m, k + reach :]
+                for x in range(width - 2 * border):
+                    target[x] += weight * source[x]
+        _measure(moment[:, border:], width - 2 * border, trace_weight, out[y - size // 2, border:])
+    return out
+
+
+@kernel(fastmath=FAST, forceinline=True)
+def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
+    """Row y of the derivatives of ``image`` along x and y, from column ``len(derivative) // 2`` on."""
+    reach, width = derivative.size // 2, image.shape[1]
+    out[:] = np.float32(0.0)
+    along, across = out[0, reach:], out[1, reach:]
+    for k in range(derivative.size):
+        weight = derivative[k]
+        if weight == 0.0:
+            continue
+        beside, below = image[y, k:], image[y + k - reach, reach:]
+        for x in range(width - 2 * reach):
+            along[x] += weight * beside[x]
+            across[x] += weight * below[x]
+
+
+@kernel(fastmath=FAST, forceinline=True)
+def _add_products(slope: F32, reach: int, out: F32) -> None:
+    gx, gy = slope[0, reach:], slope[1, reach:]
+    xx, xy, yy = out[0, reach:], out[1, reach:], out[2, reach:]
+    for x in range(slope.shape[1] - 2 * reach):
+        xx[x] += gx[x] * gx[x]
+        xy[x] += gx[x] * gy[x]
+        yy[x] += gy[x] * gy[x]
+
+
+@kernel(fastmath=FAST, forceinline=True)
+def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
+    a, b, c = moment[0], moment[1], moment[2]
+    if trace_weight == 0.0:
+        for x in range(count):
+            out[x] = (a[x] * c[x] - b[x] * b[x]) / (a[x] + c[x] + np.float32(1e-6))
+    else:
+        for x in range(count):
+            trace = a[x] + c[x]
+            out[x] = a[x] * c[x] - b[x] * b[x] - trace_weight * trace * trace
+
+
+@kernel
+def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
+    """Local maxima of R: positions (N, 2) refined by least-squares quadratic surfaces, and responses (N,)."""
+    height, width = response.shape
+    # Maxima do not touch: at most one in four pixels.
+    most = (height // 2 + 1) * (width // 2 + 1)
+    xy = empty((most, 2), np.float64)
+    value = empty(most, np.float32)
+    limit = np.float32(threshold)
+    n = 0
+    for y in range(1, height - 1):
+        row = response[y]
+        for x in range(1, width - 1):
+            v = row[x]
+            if v > limit and v > row[x - 1] and v >= row[x + 1] and _is_maximum(response, x, y):
+                dx, dy = _surface_maximum(response, x, y) if subpixel else (0.0, 0.0)
+                xy[n, 0], xy[n, 1] = x + dx, y + dy
+                value[n] = v
+                n += 1
+    return xy[:n].copy(), value[:n].copy()
+
+
+@kernel
+def _is_maximum(response: F32, x: int, y: int) -> bool:
+    # > on one side and >= on the other: a plateau of two pixels gives one corner.
+    v = response[y, x]
+    return bool(
+        v > response[y - 1, x - 1]
+        and v > response[y - 1, x]
+        and v > response[y - 1, x + 1]
+        and v > response[y, x - 1]
+        and v >= response[y, x + 1]
+        and v >= response[y + 1, x - 1]
+        and v >= response[y + 1, x]
+        and v >= response[y + 1, x + 1]
+    )
+
+
+@kernel
+def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
+    gx = gy = gxx = gyy = gxy = 0.0
+    for k in range(-1, 2):
+        left, centre, right = response[y + k, x - 1], response[y + k, x], response[y + k, x + 1]
+        above, middle, below = response[y - 1, x + k], response[y, x + k], response[y + 1, x + k]
+        gx += (right - left) / 6.0
+        gy += (below - above) / 6.0
+        gxx += (left - 2.0 * centre + right) / 3.0
+        gyy += (above - 2.0 * middle + below) / 3.0
+    gxy = (
+        response[y + 1, x + 1] + response[y - 1, x - 1] - response[y - 1, x + 1] - response[y + 1, x - 1]
+    ) / 4.0
+    determinant = gxx * gyy - gxy * gxy
+    if not (gxx < 0.0 and determinant > 1e-12 * gxx * gxx):
+        return 0.0, 0.0
+    dx = -(gyy * gx - gxy * gy) / determinant
+    dy = -(gxx * gy - gxy * gx) / determinant
+    if abs(dx) > 1.0 or abs(dy) > 1.0:
+        return 0.0, 0.0
+    return dx, dy
+
+
+@kernel(fastmath=FAST)
+def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
+    """Squared distances (N,) to the nearest corner whose response times robustness is larger."""
+    n = len(xy)
+    x, y = xy[:, 0].copy(), xy[:, 1].copy()
+    out = full(n, np.inf, np.float32)
+    stronger = 0
+    for i in range(n):
+        while stronger < i and robustness * response[stronger] > response[i]:
+            stronger += 1
+        best = np.float32(3.4e38)
+        for j in range(stronger):
+            dx, dy = x[j] - x[i], y[j] - y[i]
+            best = min(best, dx * dx + dy * dy)
+        if stronger > 0:
+            out[i] = best
+    return out
+
+
+@kernel
+def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
+    """Select indices in the sequence of ``order``, each at least ``distance`` from all selected before."""
+    kept = empty(len(order), np.int64)
+    n = 0
+    for i in order:
+        free = True
+        for k in range(n):
+            dx, dy = xy[i, 0] - xy[kept[k], 0], xy[i, 1] - xy[kept[k], 1]
+            if dx * dx + dy * dy < distance * distance:
+                free = False
+                break
+        if free:
+            kept[n] = i
+            n += 1
+    return kept[:n]
 
 
 @dataclass(frozen=True)
@@ -57,6 +225,8 @@ class CornerMeasure:
 
     # k of Harris and Stephens.
     harris_k = 0.04
+    # det / trace (grey levels squared) below which corners are quantisation and compression noise.
+    noise_response = 0.05
     # Gaussian before the derivative.
     derivative_sigma_px = 1.0
 
@@ -74,29 +244,23 @@ class CornerMeasure:
         """R (H, W), zero near the border."""
         derivative = np.array([-0.5, 0.0, 0.5], np.float32)
         channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
-        # Mean over the channels, so that R of a grey image does not depend on ``colour``; the taps are used
-        # twice.
-        taps = self._integration() / np.float32(np.sqrt(len(channels)))
+        # R of a grey image does not depend on ``colour``: the mean over the channels; taps are used twice.
+        taps = gaussian_taps(self.integration_sigma_px) / np.float32(np.sqrt(len(channels)))
         weight = self.harris_k if self.formula == "harris" else 0.0
         return corner_response(channels, derivative, taps, weight)
 
     def _find(self, channels: F32) -> tuple[F64, F32]:
         """Corners (N, 2) above the noise and their responses (N,), strongest first; none in tiny images."""
-        if min(channels.shape[1:]) < 2 * len(self._integration()):
+        if min(channels.shape[1:]) < 2 * len(gaussian_taps(self.integration_sigma_px)):
             return np.empty((0, 2)), np.empty(0, np.float32)
-        xy, value = fit_maxima(self._response(channels), self._noise_response(), self.subpixel)
+        limit = self.noise_response
+        if self.formula == "harris":
+            # R of an isotropic corner with this det / trace.
+            limit = (2.0 * limit) ** 2 * (1.0 - 4.0 * self.harris_k)
+        xy, value = fit_maxima(self._response(channels), limit, self.subpixel)
         # Equal responses keep the reading order.
         order = np.argsort(-value, kind="stable")
         return xy[order], value[order]
-
-    def _noise_response(self) -> float:
-        """R of an isotropic corner whose det / trace is ``NOISE_RESPONSE``."""
-        if self.formula == "noble":
-            return NOISE_RESPONSE
-        return (2.0 * NOISE_RESPONSE) ** 2 * (1.0 - 4.0 * self.harris_k)
-
-    def _integration(self) -> F32:
-        return gaussian_taps(self.integration_sigma_px)
 
 
 @dataclass(frozen=True)
@@ -144,47 +308,23 @@ class HarrisCorners:
 
 
 def select_spread(xy: F64, response: F32, count: int) -> I64:
-    """Select corners that cover the image (adaptive non-maximal suppression) [1]_.
+    """Indices (M,), strongest first, of ``count`` corners that cover the image (M. Brown et al., CVPR 2005).
 
-    Selects, among the 1.7 ``count`` strongest corners, those farthest from any clearly stronger one. A cell
-    of a sixth of the long side contributes at most ``POOL_LIMIT`` times as many of these candidates as in an
-    even distribution, so that dark parts of the image get corners as well.
-
-    Parameters
-    ----------
-    xy : ndarray (N, 2)
-        Corners, strongest first, px.
-    response : ndarray (N,)
-        Responses.
-    count : int
-        Number of corners to select.
-
-    Returns
-    -------
-    ndarray (M,) of int
-        Indices, strongest first.
-
-    References
-    ----------
-    .. [1] M. Brown, R. Szeliski and S. Winder, "Multi-image matching using multi-scale oriented patches",
-       CVPR 2005.
+    ``xy`` (N, 2) are strongest first. Adaptive non-maximal suppression: among the 1.7 ``count`` strongest
+    corners those farthest from any clearly stronger one. A cell of a sixth of the long side contributes at
+    most 1.5 times as many of these candidates as in an even distribution, so that dark parts get corners too.
     """
-    members = _shared_pool(xy, int(POOL_RATIO * count))
+    pool, members = int(1.7 * count), np.arange(len(xy), dtype=np.int64)
+    if len(xy) > pool:
+        span = float(np.ptp(xy, axis=0).max()) + 1.0
+        part = np.floor(6.0 * (xy - xy.min(axis=0)) / span).astype(np.int64)
+        cell = 6 * part[:, 1] + part[:, 0]
+        by_cell = np.argsort(cell, kind="stable")
+        cells, start, size = np.unique(cell[by_cell], return_index=True, return_counts=True)
+        rank = np.empty(len(xy), np.int64)
+        rank[by_cell] = np.arange(len(xy)) - np.repeat(start, size)
+        members = np.flatnonzero(rank < max(1, int(1.5 * pool / len(cells))))[:pool].astype(np.int64)
     if len(members) <= count:
         return members
-    radii = squared_suppression_radii(xy[members].astype(np.float32), response[members], ROBUSTNESS)
+    radii = squared_suppression_radii(xy[members].astype(np.float32), response[members], 0.9)
     return members[np.sort(np.argsort(-radii, kind="stable")[:count])]
-
-
-def _shared_pool(xy: F64, pool: int) -> I64:
-    """The first ``pool`` of the corners, with a limit for each cell of the image."""
-    if len(xy) <= pool:
-        return np.arange(len(xy), dtype=np.int64)
-    part = np.floor(6.0 * (xy - xy.min(axis=0)) / (float(np.ptp(xy, axis=0).max()) + 1.0)).astype(np.int64)
-    cell = 6 * part[:, 1] + part[:, 0]
-    by_cell = np.argsort(cell, kind="stable")
-    cells, start, size = np.unique(cell[by_cell], return_index=True, return_counts=True)
-    rank = np.empty(len(xy), np.int64)
-    rank[by_cell] = np.arange(len(xy)) - np.repeat(start, size)
-    allowed = np.flatnonzero(rank < max(1, int(POOL_LIMIT * pool / len(cells))))
-    return allowed[:pool].astype(np.int64)

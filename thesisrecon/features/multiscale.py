@@ -1,7 +1,12 @@
-"""Corners at two image sizes, and oriented multi-scale patches (seeds) to start the matching from."""
+"""Corners at two image sizes, and oriented multi-scale patches (seeds) to start the matching from.
+
+Patches of simulated oblique views match those of another camera far to the side (J.-M. Morel and G. Yu,
+"ASIFT: a new framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2, 2009).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import ClassVar
@@ -10,17 +15,62 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.features._kernels import sample_patches
 from thesisrecon.features.harris import CornerMeasure, select_spread
-from thesisrecon.features.oblique import ObliqueView, oblique_views
 from thesisrecon.imaging.filters import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 PATCH_SIDE = 8
 PATCH_VALUES = 32
 """Values of a patch: half of its cosine coefficients, those of low frequency, insensitive to small shifts."""
-# Density of the seeds of a simulated view relative to that of the image: many views show the same surface.
-OBLIQUE_DENSITY = 0.5
+
+
+def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
+    """Square patches (N, side^2) of an image, clamped, rotated by ``angle`` (N,) rad, sampled bilinearly."""
+    c, s = (spacing * f(angle)[:, None, None] for f in (np.cos, np.sin))
+    b, a = np.mgrid[:side, :side] - 0.5 * (side - 1)
+    x, y = xy.T[:, :, None, None]
+    places = [y + s * a + c * b, x + c * a - s * b]
+    return scipy.ndimage.map_coordinates(image, places, order=1, mode="nearest").reshape(len(xy), side**2)
+
+
+@dataclass(frozen=True)
+class ObliqueView:
+    """Pixels ``gray`` (h, w) of a simulated view; an image pixel x is at ``to_view`` x + ``offset``."""
+
+    tilt: float
+    direction: float
+    gray: F32
+    to_view: F64
+    offset: F64
+
+
+def oblique_views(gray: F32, tilts: Sequence[float], enlargement: float) -> Iterator[ObliqueView]:
+    """Compress an image (H, W) by each tilt, in directions over 180 degrees; tiny images have no views."""
+    # At least two patches wide; directions of tilt 1 are 72 degrees apart.
+    for tilt in tilts if min(gray.shape) >= 64 else ():
+        count = int(np.ceil(np.pi * tilt / np.radians(72.0)))
+        for k in range(count):
+            yield simulate_view(gray, tilt, np.pi * k / count, enlargement)
+
+
+def simulate_view(gray: F32, tilt: float, direction: float, enlargement: float = 1.0) -> ObliqueView:
+    """Compress an image by ``tilt`` along the ``direction`` (rad), which becomes the x axis of the view."""
+    c, s = np.cos(direction), np.sin(direction)
+    turn = enlargement * np.array([[c, s], [-s, c]])
+    half = 0.5 * (np.array(gray.shape[::-1]) - 1.0)
+    width, height = np.ceil(2.0 * np.abs(turn) @ half).astype(np.int64) + 1
+    middle = 0.5 * np.array([width - 1.0, height - 1.0])
+    back = np.asarray(np.linalg.inv(turn), np.float64)
+    rows_first, start = back[::-1, ::-1], (half - back @ middle)[::-1]
+    turned = scipy.ndimage.affine_transform(gray, rows_first, start, (height, width), order=1, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(turned, 0.8 * np.sqrt(tilt**2 - 1.0), axis=1)
+    x = np.arange(int(width / tilt)) * tilt
+    left = np.minimum(x.astype(np.int64), width - 2)
+    share = (x - left).astype(np.float32)
+    narrow = (1.0 - share) * smooth[:, left] + share * smooth[:, left + 1]
+    to_view = np.diag([1.0 / tilt, 1.0]) @ turn
+    offset = middle / [tilt, 1.0] - to_view @ half
+    return ObliqueView(tilt, direction, np.ascontiguousarray(narrow, np.float32), to_view, offset)
 
 
 @dataclass(frozen=True)
@@ -162,7 +212,8 @@ class MultiScaleCorners:
             margin = PATCH_SIDE * spacing * np.sqrt(np.linalg.det(to_image))
             inside = ((xy > margin) & (xy < np.array(size) - 1.0 - margin)).all(axis=1)
             corners, response, xy = corners[inside], response[inside], xy[inside]
-            count = int(OBLIQUE_DENSITY * self.seeds_per_level / view.tilt / np.sqrt(2.0) ** index)
+            # Half the density of the image: many views show the same surface.
+            count = int(0.5 * self.seeds_per_level / view.tilt / np.sqrt(2.0) ** index)
             kept = self._select(corners, response, count)
             blurred, corners, xy = smooth(gray, 2.0), corners[kept], xy[kept]
             upright = np.full(len(kept), -view.direction, np.float32)

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
@@ -22,7 +23,7 @@ from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 SIDE = 15
 SAMPLES = SIDE * SIDE
 PYRAMID_LEVELS = 4
-Found = TypeVar("Found", Features, Seeds)
+Found = TypeVar("Found", Features, Seeds, Matches)
 
 
 @kernel
@@ -134,6 +135,11 @@ def affine_determinant(a: F64) -> float:
     return determinant if determinant > 0.04 and determinant < 25.0 else 0.0
 
 
+def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
+    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2)."""
+    return np.asarray(scipy.spatial.cKDTree(xy).query(of, np.arange(1, count + 1))[1], dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class PreparedImage:
     """An image prepared for matching.
@@ -235,15 +241,8 @@ def join_matches(parts: Sequence[Matches]) -> Matches:
     return Matches(parts[0].i, parts[0].j, *arrays)
 
 
-def select_matches(matches: Matches, rows: I64 | B8) -> Matches:
-    m = matches
-    return Matches(
-        m.i, m.j, m.index1[rows], m.index2[rows], m.xy1[rows], m.xy2[rows], m.score[rows], m.affine[rows]
-    )
-
-
 def select_found(found: Found, rows: I64 | B8) -> Found:
-    """Some of the corners of features, or some of the seeds."""
+    """Some of the corners of features, of the seeds or of the matches."""
     columns = {field.name: getattr(found, field.name) for field in fields(found)}
     chosen: dict[str, Any] = {name: a[rows] for name, a in columns.items() if isinstance(a, np.ndarray)}
     return replace(found, **chosen)

@@ -11,14 +11,13 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._prepared import empty_matches, join_matches, select_matches
+from thesisrecon.matching._prepared import empty_matches, join_matches, nearest_neighbours, select_found
 from thesisrecon.matching.track_alignment import strongest_distinct
-from thesisrecon.optimize.nearest_neighbours import nearest_neighbours
 from thesisrecon.records import Features, Matches, Seeds
 
 BLOCK, LANES = 64, 64
 """Rows multiplied at a time, which stay in the cache for the scans, and columns compared at once."""
-NEIGHBOURS, TOLERANCE = 10, 0.3
+TOLERANCE = 0.3
 # Maximum distance of a corner from its seed or prediction.
 REACH_PX = 4.0
 SeedSet = tuple[Matches, Callable[[Matches], F64]]
@@ -183,7 +182,7 @@ def seed_matches(
         match_seeds(*way, pair, rotated=rotated, ratio=ratio) for rotated in orientations for way in ways
     ]
     matches = join_matches(found)
-    yield select_matches(matches, strongest_distinct(matches, REACH_PX)), map_support
+    yield select_found(matches, strongest_distinct(matches, REACH_PX)), map_support
 
 
 def _joined(seeds: Seeds, oblique: Seeds) -> Seeds:
@@ -223,7 +222,7 @@ def neighbour_support(matches: Matches) -> F64:
         return np.zeros(len(matches.xy1))
     u, v = matches.xy1 @ _common_similarity(matches).T, matches.xy2
     same = np.eye(2)[None]
-    return 0.5 * (_agreement(u, v, same, NEIGHBOURS) + _agreement(v, u, same, NEIGHBOURS))
+    return 0.5 * (_agreement(u, v, same, 10) + _agreement(v, u, same, 10))
 
 
 def map_support(matches: Matches) -> F64:
@@ -234,29 +233,20 @@ def map_support(matches: Matches) -> F64:
     if len(matches.xy1) < 2:
         return np.zeros(len(matches.xy1))
     xy1, xy2, back = matches.xy1, matches.xy2, np.asarray(np.linalg.inv(matches.affine), np.float64)
-    forth = _agreement(xy1, xy2, matches.affine, 2 * NEIGHBOURS)
-    return 0.5 * (forth + _agreement(xy2, xy1, back, 2 * NEIGHBOURS))
+    return 0.5 * (_agreement(xy1, xy2, matches.affine, 20) + _agreement(xy2, xy1, back, 20))
 
 
-@kernel
 def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
     """Number (M,) of the nearest neighbours that are where the ``maps`` (M, 2, 2) predict them, weighted.
 
     A single map (1, 2, 2) is used for all matches.
     """
-    support = zeros(len(here))
     near = nearest_neighbours(here, here, min(neighbours + 1, len(here)))
-    for n in range(len(here)):
-        a = maps[n if len(maps) > 1 else 0]
-        for m in near[n]:
-            if m == n:
-                continue
-            dx, dy = here[m, 0] - here[n, 0], here[m, 1] - here[n, 1]
-            x, y = a[0, 0] * dx + a[0, 1] * dy, a[1, 0] * dx + a[1, 1] * dy
-            apart = np.sqrt(x * x + y * y)
-            x, y = there[m, 0] - there[n, 0] - x, there[m, 1] - there[n, 1] - y
-            support[n] += np.exp(-0.5 * (x * x + y * y) / (TOLERANCE * apart + 1.0) ** 2)
-    return support
+    offset = (here[near] - here[:, None]) @ maps.swapaxes(1, 2)
+    off = there[near] - there[:, None] - offset
+    apart = TOLERANCE * np.linalg.norm(offset, axis=2) + 1.0
+    weight = np.exp(-0.5 * np.sum(off**2, axis=2) / apart**2)
+    return np.sum(np.where(near == np.arange(len(here))[:, None], 0.0, weight), axis=1)
 
 
 def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:

@@ -21,42 +21,21 @@ from thesisrecon.matching._prepared import (
     dot,
     empty_matches,
     join_matches,
+    nearest_neighbours,
     normalize_window,
     one_to_one,
     prepare_image,
     pyramid_level,
     sample_window,
-    select_matches,
+    select_found,
     window_raster,
 )
 from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
 from thesisrecon.matching.track_alignment import align_corners, align_matches, strongest_distinct
-from thesisrecon.optimize.nearest_neighbours import nearest_neighbours
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
-# Two corners of an image closer than this, in pixels of their scale, may be one scene point.
-APART = 3.0
-# Matches that linear methods need for F.
-MIN_FOR_F = 8
-# Minimum strength of match (at most 10) of a seed in the filtered trial, and verified seeds of a pair.
-MIN_SUPPORT, MIN_SEEDS = 2.0, 12
-# The same of seeds whose maps are affine.
-MIN_MAP_SUPPORT = 1.0
-# Number of agreeing supported seeds from which the second trial, with all seeds, is omitted: it helps weak
-# pairs only.
-DECIDING_SEEDS = 100
-# Maximum search radius around a prediction relative to the long side, and minimum correlation there.
-RADIUS_REL, MIN_CORRELATION = 0.025, 0.7
-# Standard deviations of an epipolar line that its band contains at least (HZ 11.11).
-BAND_SIGMAS = 3.0
-# Pairs with a wide baseline have few seeds: their maps are accurate to 20 %, their positions to a few pixels.
-OBLIQUE_NEIGHBOURS, SEED_AFFINE_STD, GROWN_AFFINE_STD, SEED_SHIFT = 3, 0.2, 0.1, 5.0
-# Fraction of the corners of image 1 above which matched corners are not matched again.
-EXPLAINED = 1.0 / 3.0
-# Rounds of least squares of a local map: the first unweighted, the others reweighted.
-ROUNDS = 3
-# Weight of the prior of a local map, relative to the neighbours' weights along one direction.
-PRIOR_SHARE = 0.05
+# Minimum verified seeds of a pair, and minimum correlation of a guided match.
+MIN_SEEDS, MIN_CORRELATION = 12, 0.7
 
 
 @kernel
@@ -104,7 +83,8 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
             rest[m, 0] = xy2[i, 0] - (a0[0, 0] * dx + a0[0, 1] * dy)
             rest[m, 1] = xy2[i, 1] - (a0[1, 0] * dx + a0[1, 1] * dy)
         scale2 = np.inf
-        for _ in range(ROUNDS):
+        # The first round is unweighted.
+        for _ in range(3):
             _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2), z)
             for m in range(k):
                 dx, dy = offset[m, 0], offset[m, 1]
@@ -138,7 +118,8 @@ def _solve_correction(
         xu, yu, u = xu + wx * e, yu + wy * e, u + w * e
         xv, yv, v = xv + wx * f, yv + wy * f, v + w * f
     # Without the means, the translation leaves a symmetric system of two unknowns, positive by the ridge.
-    ridge = PRIOR_SHARE * total * mean2
+    # The prior weighs 5 % of the neighbours along one direction.
+    ridge = 0.05 * total * mean2
     x, y = x / total, y / total
     xx, xy, yy = xx - total * x * x + ridge, xy - total * x * y, yy - total * y * y + ridge
     determinant = xx * yy - xy * xy
@@ -200,7 +181,8 @@ def _match_guided(
                     best, top = c, float(seen[t])
         if best >= 0:
             index[n], score[n] = best, top
-            second_best[n] = _best_elsewhere(xy2, best, APART * scale2[best], near[:found], seen)
+            # Closer corners, in pixels of their scale, may be one scene point.
+            second_best[n] = _best_elsewhere(xy2, best, 3.0 * scale2[best], near[:found], seen)
     return index, score, second_best
 
 
@@ -378,7 +360,7 @@ class SeedsAndGrowth:
         else:
             matches = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         if not self.align:
-            return select_matches(matches, strongest_distinct(matches))
+            return select_found(matches, strongest_distinct(matches))
         return align_matches(view1, view2, matches, affine_std=self.affine_std)
 
     def _verified_seeds(
@@ -392,7 +374,8 @@ class SeedsAndGrowth:
                 found = _verified(trial, estimate, rng)
                 if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
                     best, most = found, len(found[0].xy1)
-                if most >= max(DECIDING_SEEDS, 0.5 * len(trial.xy1)):
+                # A second trial, with all seeds, helps weak pairs only.
+                if most >= max(100, 0.5 * len(trial.xy1)):
                     break
             if most >= max(50, 0.5 * len(seeds.xy1)):
                 break
@@ -403,10 +386,11 @@ class SeedsAndGrowth:
         if self.support == "never":
             return (seeds,) if len(seeds.xy1) >= MIN_SEEDS else ()
         wide = support is map_support
-        supported = support(seeds) >= (MIN_MAP_SUPPORT if wide else MIN_SUPPORT)
+        # Of a strength of 10 at most; seeds whose maps are affine need less.
+        supported = support(seeds) >= (1.0 if wide else 2.0)
         if supported.sum() < MIN_SEEDS:
             return ()
-        chosen = select_matches(seeds, supported)
+        chosen = select_found(seeds, supported)
         # So few seeds of simulated views are right that a wrong F of all may have more inliers.
         return (chosen, seeds) if self.support == "auto" and not wide else (chosen,)
 
@@ -418,19 +402,20 @@ class SeedsAndGrowth:
         estimate: EstimateFundamental,
         rng: np.random.Generator,
     ) -> Matches:
-        """Match corners near few seeds: align the seeds and their maps, then the matches of a first pass."""
+        """Match corners near few seeds: align the seeds and their maps, then the matches of a first pass.
+
+        Pairs with a wide baseline have few seeds: their maps are accurate to 20 %, positions to a few px.
+        """
         known, fit = start
-        near = replace(self, neighbours=min(self.neighbours, OBLIQUE_NEIGHBOURS))
+        near = replace(self, neighbours=min(self.neighbours, 3))
         scale = np.full(len(known.xy1), view1.features.scale.max(), np.float32)
         places = (known.xy1, scale, known.xy2, known.affine)
-        xy2, affine, score = align_corners(
-            view1, view2, places, affine_std=SEED_AFFINE_STD, max_shift=SEED_SHIFT
-        )
+        xy2, affine, score = align_corners(view1, view2, places, affine_std=0.2, max_shift=5.0)
         aligned = np.flatnonzero(score >= MIN_CORRELATION)
-        if len(aligned) >= MIN_FOR_F:
-            known = select_matches(replace(known, xy2=xy2, affine=affine), aligned)
+        if len(aligned) >= 8:
+            known = select_found(replace(known, xy2=xy2, affine=affine), aligned)
         grown = near._grow_in_rounds(view1, view2, (known, fit), estimate, rng)
-        verified = _verified(align_matches(view1, view2, grown, affine_std=GROWN_AFFINE_STD), estimate, rng)
+        verified = _verified(align_matches(view1, view2, grown, affine_std=0.1), estimate, rng)
         return grown if verified is None else near._grow_in_rounds(view1, view2, verified, estimate, rng)
 
     def _grow_in_rounds(
@@ -453,14 +438,14 @@ class SeedsAndGrowth:
         grown = self._grow(view1, view2, everything, *start)
         if not self.rematch:
             return grown
-        if len(grown.xy1) < EXPLAINED * len(scale):
+        if len(grown.xy1) < len(scale) / 3.0:
             return self._grow(view1, view2, everything, *(_verified(grown, estimate, rng) or start))
         left = np.ones(len(scale), np.bool_)
         left[grown.index1] = False
         others = self._grow(view1, view2, np.flatnonzero(left), grown, start[1])
         both = join_matches([grown, others])
         rows = one_to_one(both.index2, both.score)
-        return select_matches(both, rows[np.argsort(both.index1[rows], kind="stable")])
+        return select_found(both, rows[np.argsort(both.index1[rows], kind="stable")])
 
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, fit: FundamentalFit
@@ -473,9 +458,9 @@ class SeedsAndGrowth:
         near = nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
-        radius = np.clip(3.0 * spread, 0.004 * long_side, RADIUS_REL * long_side)
+        radius = np.clip(3.0 * spread, 0.004 * long_side, 0.025 * long_side)
         std = epipolar_distance_std(fit.F, fit.covariance, xy1, position)
-        band = np.fmax(self.band_rel * long_side, BAND_SIGMAS * std)  # NaN: a method without covariance
+        band = np.fmax(self.band_rel * long_side, 3.0 * std)  # HZ 11.11; NaN: a method without covariance
         index, score, second_best = _match_guided(
             view1.pyramid,
             (xy1, scale1),
@@ -494,10 +479,10 @@ def _verified(
     matches: Matches, estimate: EstimateFundamental, rng: np.random.Generator
 ) -> tuple[Matches, FundamentalFit] | None:
     """The matches that agree with one F, and F; None if no F is found."""
-    if len(matches.xy1) < MIN_FOR_F:
+    if len(matches.xy1) < 8:
         return None
     try:
         fit = estimate(matches.xy1, matches.xy2, rng)
     except StageFailure:
         return None
-    return select_matches(matches, fit.inliers), fit
+    return select_found(matches, fit.inliers), fit

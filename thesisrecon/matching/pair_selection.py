@@ -1,42 +1,36 @@
 """Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap.
 
-Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity.
+Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity, with a vocabulary
+made from the images themselves. Verified pairs that match repeated structure are rejected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 import scipy
 
-from thesisrecon._numba import kernel
-from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import UsageError, require_at_least
-from thesisrecon.matching._bag_of_words import word_weights
 from thesisrecon.matching._prepared import MapAll
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
 
-# Minimum correlation of two patches of the same surface: half of the variance in common.
-MIN_CORRELATION = 0.5
-# Maximum ratio of the distances to the best and to the second best patch.
-RATIO = 0.8
-MAX_MATCHES = 150
-# Maximum deviation of a match from the prediction: position relative to the long side (wide because of
-# parallax and perspective), log scale and angle.
-RADIUS_REL, LOG_SCALE, ANGLE_RAD = 0.1, 0.8, 0.8
-# Evidence of the upright patches at which the rotated ones are not compared: one false alarm in a million.
-DECIDED = 6.0
-# Below this the tail of the binomial distribution underflows.
-MIN_LOG10 = -300.0
 # Seeds of each scale that represent an image, upright and rotated.
 PER_SCALE = 200
 ROWS_AT_ONCE = 4096
+FEW_VIEWS = 40
+"""Up to this number of views no pair is rejected: few pairs are redundant then."""
+STRONG = 0.1
+"""A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
+views."""
+MAX_STEPS = 5
+"""Maximum number of strong pairs on the shortest path between two views of the same place."""
 
 
 def _pair_array(pairs: Iterable[Iterable[int]]) -> I64:
@@ -114,18 +108,7 @@ class ListedPairs:
             seen.add(pair)
 
     def check(self, names: Sequence[str], left_out: Collection[str]) -> None:
-        """Check the list before anything is computed.
-
-        Parameters
-        ----------
-        names, left_out : collection of str
-            Names of the images, and of those that were not used.
-
-        Raises
-        ------
-        UsageError
-            If a listed name is unknown or no pair remains.
-        """
+        """Check the list before anything is computed: ``names`` of images, and those ``left_out``."""
         known = {*names, *left_out}
         unknown = sorted({name for pair in self.listed for name in pair} - known)
         if unknown:
@@ -274,29 +257,18 @@ def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sp
     return np.array(added, dtype=np.int64).reshape(-1, 2)
 
 
-@kernel
 def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
     """Largest number of other matches predicted by the similarity of one match.
 
     Match m has positions ``xy1[m]``, ``xy2[m]``, ``scale[m]`` (image 2 per image 1) and ``angle[m]`` rad.
     ``limits`` are the position error in px, the difference of log scales and the difference of angles.
     """
-    most, radius2 = 0, limits[0] * limits[0]
-    for h in range(len(xy1)):
-        c, s = scale[h] * np.cos(angle[h]), scale[h] * np.sin(angle[h])
-        count = 0
-        for m in range(len(xy1)):
-            x, y = xy1[m, 0] - xy1[h, 0], xy1[m, 1] - xy1[h, 1]
-            dx = xy2[h, 0] + c * x - s * y - xy2[m, 0]
-            dy = xy2[h, 1] + s * x + c * y - xy2[m, 1]
-            # Few matches are near, so that few need a logarithm and a cosine.
-            if m == h or not dx * dx + dy * dy <= radius2:
-                continue
-            turn = np.cos(angle[m] - angle[h])
-            if abs(np.log(scale[m] / scale[h])) <= limits[1] and turn >= np.cos(limits[2]):
-                count += 1
-        most = max(most, count)
-    return most
+    turn = scale * np.exp(1j * angle)
+    z1, z2 = (xy @ [1.0, 1j] for xy in (xy1, xy2))
+    near = np.abs(z2[:, None] + turn[:, None] * (z1 - z1[:, None]) - z2) <= limits[0]
+    near &= np.abs(np.log(scale / scale[:, None])) <= limits[1]
+    near &= np.cos(angle - angle[:, None]) >= np.cos(limits[2])
+    return int(near.sum(axis=1).max()) - 1
 
 
 @dataclass(frozen=True)
@@ -331,7 +303,8 @@ def _subsets(seeds: Seeds) -> tuple[_FeatureSubset, _FeatureSubset]:
 
 def _evidence(a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]) -> float:
     upright = _overlap_evidence(a[0], b[0])
-    return upright if upright >= DECIDED else max(upright, _overlap_evidence(a[1], b[1]))
+    # One false alarm in a million: the rotated patches are not compared.
+    return upright if upright >= 6.0 else max(upright, _overlap_evidence(a[1], b[1]))
 
 
 def _overlap_evidence(a: _FeatureSubset, b: _FeatureSubset) -> float:
@@ -344,17 +317,14 @@ def _overlap_evidence(a: _FeatureSubset, b: _FeatureSubset) -> float:
     one, two = _match_subsets(a, b)
     if len(one) < 2:
         return -float(np.log10(max(len(one), 1)))
-    radius = RADIUS_REL * float(b.size.max())
-    k = _count_agreeing(
-        a.xy[one],
-        b.xy[two],
-        b.scale[two] / a.scale[one],
-        b.angle[two] - a.angle[one],
-        np.array([radius, LOG_SCALE, ANGLE_RAD]),
-    )
+    # Position (wide because of parallax and perspective), log scale and angle, rad.
+    radius = 0.1 * float(b.size.max())
+    limits, scale = np.array([radius, 0.8, 0.8]), b.scale[two] / a.scale[one]
+    k = _count_agreeing(a.xy[one], b.xy[two], scale, b.angle[two] - a.angle[one], limits)
     chance = min(1.0, np.pi * radius**2 / float(np.prod(b.size)))
     tail = float(scipy.special.bdtrc(k - 1, len(one) - 1, chance)) if k > 0 else 1.0
-    return -(float(np.log10(len(one))) + max(float(np.log10(max(tail, 1e-320))), MIN_LOG10))
+    # The tail may underflow.
+    return -(float(np.log10(len(one))) + max(float(np.log10(max(tail, 1e-320))), -300.0))
 
 
 def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
@@ -365,10 +335,127 @@ def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
     index, value, second_best = mutual_best([correlation], b.xy.astype(np.float32), apart2)
     one = np.flatnonzero(index >= 0)
     value, second_best = value[one], second_best[one]
-    distinct = (value > MIN_CORRELATION) & ((1.0 - value) < RATIO**2 * (1.0 - second_best))
+    # The ratio of the distances, and half of the variance in common.
+    distinct = (value > 0.5) & ((1.0 - value) < 0.8**2 * (1.0 - second_best))
     one, value = one[distinct], value[distinct]
-    one = one[np.argsort(-value, kind="stable")[:MAX_MATCHES]]
+    one = one[np.argsort(-value, kind="stable")[:150]]
     return one, index[one]
+
+
+def word_weights(
+    patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator
+) -> scipy.sparse.csr_array:
+    """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
+
+    A word is weighted by how few images contain it, and square roots of the counts limit the effect of
+    repeated structure (J. Sivic and A. Zisserman, "Video Google", ICCV 2003). The vocabulary must be large:
+    if each image contains most words, all images are similar. The transpose is the inverted file: the images
+    of each word.
+    """
+    everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
+    if not len(everything):
+        return scipy.sparse.csr_array((len(patches), 1))
+    words = min(words, len(everything) // 8)
+    vocabulary = _vocabulary(everything, words, map_all=map_all, rng=rng)
+    found = map_all(lambda given: np.unique(_words_of(given, vocabulary), return_counts=True), patches)
+    image = np.repeat(np.arange(len(patches)), [len(word) for word, _ in found])
+    word, count = (np.concatenate([part[k] for part in found]) for k in (0, 1))
+    used = np.bincount(word)
+    weight = np.sqrt(count) * np.log(len(patches) / used[word])
+    weight /= np.sqrt(np.maximum(np.bincount(image, weight**2), 1e-24))[image]
+    return scipy.sparse.csr_array((weight, (image, word)), (len(patches), vocabulary[1][:, :, 0].size))
+
+
+_Vocabulary = tuple[F32, F32]
+"""Unit centres (B, D) of branches, and of the words (B, B, D) of each."""
+
+
+def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Generator) -> _Vocabulary:
+    """A tree of two levels with about ``words`` words (D. Nister and H. Stewenius, CVPR 2006)."""
+    branches = max(int(np.sqrt(words)), 1)
+    sample = patches[rng.permutation(len(patches))[: 8 * branches**2]]
+    top = _centres(sample, branches)
+    branch = np.argmax(sample @ top.T, axis=1)
+    leaves = np.repeat(top[:, None], branches, axis=1)
+    inside = [sample[branch == b] for b in range(branches)]
+    used = [b for b in range(branches) if len(inside[b])]
+    found = map_all(lambda b: _centres(inside[b], branches), used)
+    for b, centres in zip(used, found, strict=True):
+        leaves[b, : len(centres)] = centres
+    return top, leaves
+
+
+def _centres(sample: F32, count: int) -> F32:
+    """Centres (at most ``count``, D) of spherical k-means, initialised by the first rows."""
+    centres = sample[:count]
+    for _ in range(4):
+        nearest = np.argmax(sample @ centres.T, axis=1)
+        order = np.argsort(nearest, kind="stable")
+        found, start = np.unique(nearest[order], return_index=True)
+        sums = centres.copy()
+        sums[found] = np.add.reduceat(sample[order], start, axis=0)
+        centres = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), np.float32(1e-6))
+    return centres
+
+
+def _words_of(patches: F32, vocabulary: _Vocabulary) -> I64:
+    """Word (S,) of each patch: the best of its best branch."""
+    top, leaves = vocabulary
+    if not len(patches):
+        return np.empty(0, np.int64)
+    branch = np.argmax(patches @ top.T, axis=1)
+    order = np.argsort(branch, kind="stable")
+    found, start = np.unique(branch[order], return_index=True)
+    word = np.empty(len(patches), np.int64)
+    for b, rows in zip(found, np.split(order, start[1:]), strict=True):
+        word[rows] = b * len(top) + np.argmax(patches[rows] @ leaves[b].T, axis=1)
+    return word
+
+
+def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[TwoView]:
+    """Reject weak pairs whose views are connected only by long paths of strong pairs.
+
+    Views that overlap are connected by a short path of strong pairs through the views between them. Equal
+    windows of two houses give few matches between views that only a long path connects. Weak pairs between
+    groups that no strong pair connects stay, because nothing else relates these groups.
+    """
+    accepted = [pair for pair in pairs if pair.accepted]
+    if n_views <= FEW_VIEWS or not accepted:
+        return list(pairs)
+    i, j, count = np.array([(pair.i, pair.j, pair.inliers) for pair in accepted]).T
+    strong = strong_pairs(i, j, count, n_views)
+    ends = i[strong], j[strong]
+    graph = scipy.sparse.coo_array((np.ones(strong.sum()), ends), (n_views, n_views)).tocsr()
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    steps = _steps_within(graph + graph.T, np.unique(i[~strong]), MAX_STEPS)
+    weak = ~strong & (group[i] == group[j])
+    apart = set(zip(i[weak].tolist(), j[weak].tolist(), strict=True)) - set(map(tuple, steps.tolist()))
+    reason = (
+        "its {} matches are few compared with those of each image's best pair, and "
+        f"at least {MAX_STEPS + 1} strong pairs separate the images: probably repeated structure"
+    )
+    return [
+        replace(pair, accepted=False, reason=reason.format(pair.inliers))
+        if pair.accepted and (pair.i, pair.j) in apart
+        else pair
+        for pair in pairs
+    ]
+
+
+def strong_pairs(i: I64, j: I64, count: I64 | F64, n_views: int) -> B8:
+    """Whether pairs (i, j) have ``STRONG`` of the ``count`` of the best pair of one of their views."""
+    most = np.zeros(n_views, count.dtype)
+    np.maximum.at(most, np.concatenate([i, j]), np.tile(count, 2))
+    return np.asarray(count >= STRONG * np.minimum(most[i], most[j]))
+
+
+def _steps_within(graph: scipy.sparse.csr_array, start: np.ndarray, steps: int) -> np.ndarray:
+    """Pairs of views (M, 2), the first one from ``start``, that at most ``steps`` edges connect."""
+    reached = scipy.sparse.csr_array((np.ones(len(start)), (start, start)), (graph.shape[0], graph.shape[0]))
+    for _ in range(steps):
+        reached = reached + reached @ graph
+        reached.data[:] = 1.0
+    return np.column_stack(reached.nonzero())
 
 
 def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:

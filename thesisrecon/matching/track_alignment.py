@@ -23,32 +23,18 @@ from thesisrecon.matching._prepared import (
     normalize_window,
     pyramid_level,
     sample_window,
-    select_matches,
+    select_found,
     window_raster,
 )
 from thesisrecon.records import Matches
 
 WIDE = SIDE + 2
 HALF = SIDE // 2
-# Below this correlation the windows show different surfaces and the iteration does not converge.
-MIN_WINDOW_CORRELATION = 0.3
-# Minimum det / product of the diagonal of the normal matrix: structure in one direction gives no position.
-MIN_CONDITION = 1e-4
-# Squared step in pixels of the scale at which the iteration stops.
-SETTLED = 1e-4
-ITERATIONS = 12
-# Maximum distance of aligned matches from their corners, in pixels of the corner's scale.
-MAX_SHIFT = 3.0
 # Prior standard deviation of an affine coefficient, and minimum correlation of an aligned match.
 AFFINE_STD, MIN_CORRELATION = 0.02, 0.8
-# Two matches closer than this in (x1, y1, x2, y2) px are the same.
-APART_PX = 1.0
-# A window of half the width must fit better and stay near the result of the wider one.
-FINE_CORRELATION = 0.85
-FINE_SHIFT = 1.0
-# Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
-# with anything and passes a correlation threshold.
 MAX_STD = 0.12
+"""Maximum standard deviation of the position in pixels of the scale. Removes smooth shading, which correlates
+with anything and passes a correlation threshold."""
 
 
 @kernel
@@ -88,7 +74,8 @@ def _align_windows(
             continue
         normal = _normal_matrix(gradient)
         d = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
-        if d <= MIN_CONDITION * normal[0, 0] * normal[1, 1]:
+        # Structure in one direction gives no position.
+        if d <= 1e-4 * normal[0, 0] * normal[1, 1]:
             continue
         value = _iterate(
             (pixels2, levels2[k2], to2),
@@ -207,7 +194,8 @@ def _iterate(
         if normalize_window(window) == 0.0:
             return 0.0
         value = dot(window, fixed)
-        if value < MIN_WINDOW_CORRELATION:
+        # The windows show different surfaces, and the iteration does not converge.
+        if value < 0.3:
             return 0.0
         if turn == iterations:
             break
@@ -215,7 +203,7 @@ def _iterate(
         _compose(xy, a, delta, size)
         if (xy[0] - x) ** 2 + (xy[1] - y) ** 2 > reach**2:
             return 0.0
-        if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < SETTLED:
+        if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < 1e-4:
             # Another correlation would cost a window and not change the result.
             break
     return value
@@ -264,30 +252,28 @@ def align_corners(
     matches: tuple[F64, F32, F64, F64],
     *,
     affine_std: float,
-    max_shift: float = MAX_SHIFT,
+    max_shift: float = 3.0,
 ) -> tuple[F64, F64, F32]:
     """Align corners of image 1 with image 2 to sub-pixel positions.
 
     Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
     affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there (wide
-    convergence) and then at the finest scale (smaller noise), which is used if it fits. Arguments and results
-    are those of `_align_windows`.
+    convergence) and then at the finest scale (smaller noise), which is used if it fits better and stays near.
+    ``max_shift`` from the corner is in pixels of its scale. Arguments and results are those of
+    `_align_windows`.
     """
     xy1, scale1, _, _ = matches
     base = view1.pyramid[2]
-    limits = (ITERATIONS, affine_std, max_shift, MAX_STD)
+    limits = (12, affine_std, max_shift, MAX_STD)
     xy2, affine, score = _align_windows(view1.pyramid, view2.pyramid, matches, limits)
     coarse = np.flatnonzero((scale1 > 1.5 * base) & (score > 0.0))
     if not len(coarse):
         return xy2, affine, score
     finest = np.full(len(coarse), base, np.float32)
-    fine_xy2, _, fine_score = _align_windows(
-        view1.pyramid,
-        view2.pyramid,
-        (xy1[coarse], finest, xy2[coarse], affine[coarse]),
-        (ITERATIONS, affine_std, FINE_SHIFT, MAX_STD),
-    )
-    fits = fine_score >= FINE_CORRELATION
+    places = (xy1[coarse], finest, xy2[coarse], affine[coarse])
+    limits = (12, affine_std, 1.0, MAX_STD)
+    fine_xy2, _, fine_score = _align_windows(view1.pyramid, view2.pyramid, places, limits)
+    fits = fine_score >= 0.85
     xy2[coarse[fits]] = fine_xy2[fits]
     return xy2, affine, score
 
@@ -299,11 +285,11 @@ def align_matches(
     start = (matches.xy1, view1.features.scale[matches.index1], matches.xy2, matches.affine)
     xy2, affine, score = align_corners(view1, view2, start, affine_std=affine_std)
     moved = replace(matches, xy2=xy2, affine=affine, score=score)
-    good = select_matches(moved, np.flatnonzero(score >= MIN_CORRELATION))
-    return select_matches(good, strongest_distinct(good))
+    good = select_found(moved, np.flatnonzero(score >= MIN_CORRELATION))
+    return select_found(good, strongest_distinct(good))
 
 
-def strongest_distinct(matches: Matches, apart_px: float = APART_PX) -> I64:
+def strongest_distinct(matches: Matches, apart_px: float = 1.0) -> I64:
     """Rows, sorted, of the matches that do not repeat a stronger one."""
     rows = np.argsort(-matches.score, kind="stable")
     keep = np.ones(len(rows), np.bool_)

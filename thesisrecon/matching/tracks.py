@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon._numba import empty, full, kernel, zeros
+from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.matching._prepared import MapAll, PreparedImage
 from thesisrecon.matching.track_alignment import AFFINE_STD, MIN_CORRELATION, align_corners
@@ -20,8 +20,6 @@ from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0
 """Default distance up to which positions become one corner: their noise from pair to pair."""
-BATCH = 256
-"""Groups of observations that one thread aligns at a time."""
 Pair = TypeVar("Pair", Matches, TwoView)
 
 
@@ -75,64 +73,33 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     return root
 
 
-@kernel
 def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
     """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the middle observations.
 
     ``edges`` (E, 2) observations; ``middle`` (T,). Returns the position (K, 2) of the middle's point in the
     view of every observation and the map (K, 2, 2) to it; an unreachable observation keeps its own corner.
     """
-    count = len(xy)
-    position, maps = empty((count, 2)), zeros((count, 2, 2))
-    for k in range(count):
-        position[k, 0], position[k, 1] = xy[k, 0], xy[k, 1]
-        maps[k, 0, 0] = maps[k, 1, 1] = 1.0
-    start = zeros(count + 1, np.int64)
-    for e in range(len(edges)):
-        start[edges[e, 0] + 1] += 1
-        start[edges[e, 1] + 1] += 1
-    fill = empty(count, np.int64)
-    for k in range(count):
-        fill[k] = start[k]
-        start[k + 1] += start[k]
-    incident = empty(2 * len(edges), np.int64)
-    for e in range(len(edges)):
-        for side in range(2):
-            incident[fill[edges[e, side]]] = e
-            fill[edges[e, side]] += 1
-    reached = zeros(count, np.bool_)
-    queue = empty(count, np.int64)
-    head, tail = 0, 0
-    for t in range(len(middle)):
-        queue[tail] = middle[t]
-        reached[middle[t]] = True
-        tail += 1
-    while head < tail:
-        k = queue[head]
-        head += 1
-        for at in range(start[k], start[k + 1]):
-            e = incident[at]
-            forward = edges[e, 0] == k
-            other = edges[e, 1] if forward else edges[e, 0]
-            if reached[other]:
-                continue
-            a, b, c, d = affine[e, 0, 0], affine[e, 0, 1], affine[e, 1, 0], affine[e, 1, 1]
-            here, there = xy1[e], xy2[e]
-            if not forward:
-                determinant = a * d - b * c
-                if abs(determinant) < 1e-6:
-                    continue
-                a, b, c, d = d / determinant, -b / determinant, -c / determinant, a / determinant
-                here, there = there, here
-            dx, dy = position[k, 0] - here[0], position[k, 1] - here[1]
-            position[other, 0] = there[0] + (a * dx + b * dy)
-            position[other, 1] = there[1] + (c * dx + d * dy)
-            for side in range(2):
-                u, v = maps[k, 0, side], maps[k, 1, side]
-                maps[other, 0, side], maps[other, 1, side] = a * u + b * v, c * u + d * v
-            reached[other] = True
-            queue[tail] = other
-            tail += 1
+    position, maps = xy.copy(), np.tile(np.eye(2), (len(xy), 1, 1))
+    order, reached = np.full(len(xy), -1), len(middle)
+    order[middle] = np.arange(reached)
+    backward = np.abs(np.linalg.det(affine)) >= 1e-6
+    left = np.concatenate([np.arange(len(edges)), len(edges) + np.flatnonzero(backward)])
+    source, target = (np.concatenate([edges[:, a], edges[:, 1 - a]]) for a in (0, 1))
+    while len(left := left[order[target[left]] < 0]):
+        k = left[order[source[left]] >= 0]
+        if not len(k):
+            break
+        # Of each new observation, the edge from the one that was reached first.
+        k = k[np.lexsort((k % len(edges), order[source[k]]))]
+        k = k[np.sort(np.unique(target[k], return_index=True)[1])]
+        here, there, e, forward = source[k], target[k], k % len(edges), (k < len(edges))[:, None]
+        order[there] = reached + np.arange(len(k))
+        reached += len(k)
+        A = affine[e]
+        A[~forward[:, 0]] = np.linalg.inv(A[~forward[:, 0]])
+        away = position[here] - np.where(forward, xy1[e], xy2[e])
+        position[there] = np.where(forward, xy2[e], xy1[e]) + np.einsum("kab,kb->ka", A, away)
+        maps[there] = A @ maps[here]
     return position, maps
 
 
@@ -262,23 +229,14 @@ class AlignedTracks:
                 found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
                 xy[group], kept[group] = found, score >= MIN_CORRELATION
 
-        map_all(align, _batches(_groups(chains.view[middle], chains.view, len(prepared))))
+        groups = _groups(chains.view[middle], chains.view, len(prepared))
+        # Consecutive groups share views: a thread aligns 256 at a time.
+        map_all(align, iter(lambda: list(islice(groups, 256)), []))
         return _tracks(chains, xy, kept, len(prepared))
 
 
 def tracks_of_corners(corners: Sequence[F64], pairs: Sequence[TwoView]) -> Tracks:
-    """Return the tracks of accepted pairs that match corners, each observation at its corner.
-
-    Parameters
-    ----------
-    corners, pairs : sequence of ndarray (N, 2), sequence of TwoView
-        Corners of every image, and matched pairs; only accepted ones are used.
-
-    Returns
-    -------
-    Tracks
-        Observations that are not aligned.
-    """
+    """Return the tracks of accepted pairs that match corners, each observation at its corner."""
     chains = _link_matches(corners, _best_first(pairs))
     return _tracks(chains, chains.xy, np.ones(len(chains.xy), np.bool_), len(corners))
 
@@ -295,34 +253,9 @@ def corners_from_matches(
 
     Positions of one view that are equal or within ``merge_px`` of a common centre become one corner, at their
     mean. Centres are at least ``merge_px`` apart and are chosen first where many matches have their position,
-    so that chains of close positions do not merge.
-
-    Parameters
-    ----------
-    pairs : sequence of Matches or TwoView
-        Matched pairs; only their positions are used.
-    n_views, merge_px : int, float
-        Number of views, and the radius in px; 0 joins equal positions only.
-
-    Returns
-    -------
-    corners : list of ndarray (N_i, 2)
-        Corners of every view, possibly none; their order does not depend on the order of the pairs.
-    pairs : list of Matches or TwoView
-        The same pairs and positions with ``index1`` and ``index2``. A corner is at most once in a pair: only
-        its match with the least distances from the corners stays.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.matching._prepared import empty_matches
-    >>> from dataclasses import replace
-    >>> one = dict(index1=np.array([-1]), index2=np.array([-1]), score=np.ones(1), affine=np.eye(2)[None])
-    >>> first = replace(empty_matches((0, 1)), xy1=np.array([[5.0, 5.0]]), xy2=np.array([[9.0, 5.0]]), **one)
-    >>> second = replace(empty_matches((1, 2)), xy1=np.array([[9.5, 5.0]]), xy2=np.array([[3.0, 5.0]]), **one)
-    >>> corners, pairs = corners_from_matches([first, second], 3)
-    >>> corners[1].tolist(), pairs[0].index2.tolist(), pairs[1].index1.tolist()
-    ([[9.25, 5.0]], [0], [0])
+    so that chains of close positions do not merge. Returns the corners (N_i, 2) of every view, whose order
+    does not depend on the order of the pairs, and the pairs with ``index1`` and ``index2``. A corner is at
+    most once in a pair: only its match with the least distances from the corners stays.
     """
     ends = [end for p in pairs for end in ((p.i, p.xy1), (p.j, p.xy2))]
     corners, index = _number_positions(ends, n_views, merge_px)
@@ -399,12 +332,6 @@ def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64
     i, j = np.divmod(numbers, views)
     for k in cached_pair_order(i, j):
         yield int(i[k]), int(j[k]), groups[k]
-
-
-def _batches(groups: Iterator[tuple[int, int, I64]]) -> Iterator[list[tuple[int, int, I64]]]:
-    """Consecutive groups, which share views."""
-    while batch := list(islice(groups, BATCH)):
-        yield batch
 
 
 def _tracks(chains: _Chains, xy: F64, kept: B8, n_views: int) -> Tracks:

@@ -1,14 +1,30 @@
-"""Bundle adjustment of a metric estimate under its prior; noise and loss are estimated from the residuals."""
+"""Bundle adjustment of a metric estimate under its prior; noise and loss are estimated from the residuals.
+
+Also a richer camera model (intrinsics per image) where the images contradict shared intrinsics: optical
+stabilisation and crops move the principal point, focus and zoom change the focal length. It is kept if it
+predicts held-out observations far better.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import StageFailure, counted
-from thesisrecon.metric._model import CENTRE, FOCAL, K1, WIDTH, MetricEstimate, residual_norms
+from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.metric._model import (
+    CENTRE,
+    FOCAL,
+    K1,
+    WIDTH,
+    MetricEstimate,
+    camera_rows,
+    reproject_observations,
+    residual_norms,
+)
 from thesisrecon.optimize.bundle.metric import (
     MAX_ITERATIONS,
     BundleOptions,
@@ -22,23 +38,18 @@ from thesisrecon.optimize.bundle.scatter import (
     PoseUncertainty,
     block_scatter,
     linearise_fit,
+    point_blocks,
     pose_uncertainty,
 )
 from thesisrecon.optimize.noise import best_huber_width, noise_from_distances
 from thesisrecon.records import IntrinsicsPrior
 
 MIN_OBSERVATIONS = 40
-MAX_LOSS_SIGMAS = 20.0
-"""For a larger width of Huber's loss, in sigmas, least squares is used."""
-RAYLEIGH_90 = 2.1460
-"""90 % point of the Rayleigh distribution, the length of 2-D normal noise, in sigmas."""
 SETTLED, ROUND_SETTLED = 1e-4, 5e-3
 """Predicted gain of the cameras, half a squared distance in standard deviations, at which an adjustment ends;
 larger if the observations are chosen again after it."""
-MIN_VIEWS_PER_LENS = 3
-"""k2 and k3 are estimated only if this many views share them."""
-CENTRE_DOF = 3.0
-"""Degrees of freedom of the prior of principal points: heavy tails with finite variance."""
+MAX_CHANGE = 0.05
+"""Relative change of centres and focal lengths up to which the simpler camera model is accurate enough."""
 FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
 
 
@@ -87,10 +98,11 @@ class MetricAdjustment:
         has_lens = _shares_a_lens(model) & (std[:, K1] > 0.0)
         std[:, K1 + 1 :] = np.where(has_lens, self.lens_std, 0.0)[:, None]
         # Images may be crops: the principal point has a bivariate t distribution, whose weight over that of
-        # the normal one falls with the distance from the mean.
+        # the normal one falls with the distance from the mean; 3 degrees of freedom: a finite variance.
+        dof = 3.0
         off, known = model.cameras.intrinsics[:, CENTRE] - mean[:, CENTRE], std[:, CENTRE] > 0.0
         squared = np.sum(np.where(known, off, 0.0) ** 2, axis=1, keepdims=True)
-        std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (CENTRE_DOF + 2.0)), 0.0))
+        std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (dof + 2.0)), 0.0))
         unknown = ~np.isfinite(mean)
         mean[unknown] = model.cameras.intrinsics[unknown]
         kinds = self.hierarchical
@@ -136,7 +148,8 @@ class MetricAdjustment:
         model = replace(
             model,
             sigma_px=sigma,
-            loss_sigmas=min(width / sigma, MAX_LOSS_SIGMAS),
+            # For a larger width it is least squares.
+            loss_sigmas=min(width / sigma, 20.0),
             tail=tail_width(norms, sigma),
         )
         return model, result
@@ -161,11 +174,11 @@ class MetricAdjustment:
 
 
 def _shares_a_lens(model: MetricEstimate) -> B8:
-    """(G,) rows whose k2 and k3 at least ``MIN_VIEWS_PER_LENS`` registered views share."""
+    """(G,) rows whose k2 and k3 at least three registered views share; else they are not estimated."""
     assert model.cameras.shared is not None
     lens = np.unique(model.cameras.shared[:, K1 + 1], return_inverse=True)[1].reshape(-1)
     views = np.bincount(lens[model.cameras.group[model.registered]], minlength=int(lens.max()) + 1)
-    return np.asarray(views[lens] >= MIN_VIEWS_PER_LENS)
+    return np.asarray(views[lens] >= 3)
 
 
 def _inlier_observations(model: MetricEstimate) -> Observations:
@@ -182,7 +195,8 @@ def _inlier_observations(model: MetricEstimate) -> Observations:
 
 def tail_width(norms: F64, sigma: float) -> float:
     """Tail width, 1 to 3, of residual lengths px relative to normal noise, from their 90 % quantile."""
-    wide = float(np.quantile(norms, 0.9)) / RAYLEIGH_90
+    # Over that of the length of 2-D normal noise (Rayleigh).
+    wide = float(np.quantile(norms, 0.9)) / 2.1460
     return float(np.clip(wide / sigma, 1.0, 3.0))
 
 
@@ -194,3 +208,113 @@ def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
         return model
     wider = max(1.0, noise_from_distances(norms) / model.sigma_px)
     return replace(model, tail=wider, loss_sigmas=2.0 * wider)
+
+
+def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:
+    """Columns of intrinsics with one value per image, from the simplest richer camera model on.
+
+    Every model that frees all ``contradicted`` (8,) columns; known values stay known.
+    """
+    if not contradicted.any():
+        return
+    unknown, richer = np.flatnonzero((prior.std > 0.0).any(axis=0)), (CENTRE, (FOCAL,), (FOCAL, *CENTRE))
+    # Without known columns two models may be the same.
+    for columns in dict.fromkeys(tuple(c for c in columns if c in unknown) for columns in richer):
+        if np.isin(np.flatnonzero(contradicted), columns).all():
+            yield columns
+
+
+def with_own_values(
+    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...]
+) -> tuple[MetricEstimate, MetricAdjustment]:
+    """The model with one value per image in some columns of the intrinsics, without hierarchical prior."""
+    shared = adjustment.prior.shared.copy()
+    shared[:, columns] = np.arange(len(shared))[:, None]
+    prior = replace(adjustment.prior, shared=shared)
+    group, table = camera_rows(prior)
+    first = np.unique(group, return_index=True)[1]
+    intrinsics = model.cameras.intrinsics[model.cameras.group[first]]
+    cameras = replace(model.cameras, intrinsics=intrinsics, group=group, shared=table)
+    return replace(model, cameras=cameras), replace(adjustment, prior=prior, hierarchical=None, inflation=1.0)
+
+
+def held_out_observations(model: MetricEstimate) -> I64:
+    """Inliers of every fifth block of neighbouring points, other blocks in each view.
+
+    Correlated errors would carry over from the nearest neighbours; points keep two or more observations.
+    """
+    t = model.tracks
+    count = np.bincount(t.point_index[model.inlier], minlength=t.n_points)
+    block = point_blocks(model.X, count > 0)
+    held = model.inlier & ((block[t.point_index] + t.view_index) % 5 == 0)
+    left = count - np.bincount(t.point_index[held], minlength=t.n_points)
+    return np.flatnonzero(held & (left >= 2)[t.point_index])
+
+
+def remaining_cost(
+    simple: tuple[MetricEstimate, MetricAdjustment], rich: tuple[MetricEstimate, MetricAdjustment]
+) -> float:
+    """Cost of held-out observations, richer over simple model; 1 if there are fewer than 30."""
+    model = simple[0]
+    held = held_out_observations(replace(model, inlier=model.inlier & rich[0].inlier))
+    if len(held) < 30:
+        return 1.0
+    return float(_held_out_cost(*rich, held, model).mean() / _held_out_cost(*simple, held, model).mean())
+
+
+def _held_out_cost(
+    model: MetricEstimate, adjustment: MetricAdjustment, held: I64, unit: MetricEstimate
+) -> F64:
+    """Huber's loss of held-out observations, in the noise and the loss of the model ``unit``."""
+    inlier = model.inlier.copy()
+    inlier[held] = False
+    model = adjustment.run(replace(model, inlier=inlier))[0]
+    t = model.tracks
+    xy, _ = reproject_observations(model, t.view_index[held], t.point_index[held])
+    size = np.linalg.norm(np.nan_to_num(xy, nan=np.inf) - t.xy[held], axis=1) / unit.sigma_px
+    size, loss = np.minimum(size, 100.0), unit.loss_sigmas
+    return np.asarray(np.where(size < loss, 0.5 * size**2, loss * (size - 0.5 * loss)))
+
+
+def differences_of_images(model: MetricEstimate, columns: tuple[int, ...]) -> str:
+    """A sentence on the richer model and how much its values differ between images."""
+    views = np.flatnonzero(model.registered)
+    rows = model.cameras.intrinsics[model.cameras.group[views]]
+    longest = model.sizes[views].max(axis=1, keepdims=True)
+    centre = (rows[:, CENTRE] - (model.sizes[views] - 1) / 2) / longest
+    apart = f"principal points up to {np.ptp(centre, axis=0).max():.1%} of the long side apart"
+    if FOCAL not in columns:
+        return Notice("own-centre", apart)
+    focal = rows[:, FOCAL] / longest[:, 0]
+    return Notice("own-intrinsics", focal.max() / focal.min() - 1.0, apart)
+
+
+@dataclass(frozen=True)
+class CameraDifferences:
+    """Largest differences of the cameras between two camera models.
+
+    ``centre`` relative to the RMS radius of the camera path, ``focal`` relative, ``principal_point`` over the
+    focal length.
+    """
+
+    centre: float
+    focal: float
+    principal_point: float
+
+    @property
+    def harmless(self) -> bool:
+        """Whether centres and focal lengths hardly depend on the camera model."""
+        return max(self.centre, self.focal) < MAX_CHANGE
+
+
+def camera_differences(a: MetricEstimate, b: MetricEstimate) -> CameraDifferences:
+    """Differences between the cameras of two estimates after a similarity alignment of their centres."""
+    v = np.flatnonzero(a.registered & b.registered)
+    A, B = (m.cameras.centres[v] for m in (a, b))
+    move = estimate_similarity(B, A)
+    off = np.linalg.norm(A - move.apply(B), axis=1)
+    radius = np.sqrt(np.mean(np.sum((A - A.mean(axis=0)) ** 2, axis=1)))
+    f, g = (m.cameras.intrinsics[m.cameras.group[v], FOCAL] for m in (a, b))
+    c, d = (m.cameras.intrinsics[m.cameras.group[v]][:, CENTRE] for m in (a, b))
+    moved = float((np.abs(d - c) / f[:, None]).max())
+    return CameraDifferences(float(off.max() / radius), float(np.abs(np.log(g / f)).max()), moved)

@@ -1,5 +1,7 @@
 """The self-check of a metric result: numbers per view and for the whole, and a sentence for each failure.
 
+The identifiability is that of the cameras and points that the metric stage returns.
+
 Averages hide a wrong camera, so each view is also checked on its own. Sentences name images as ``#number``,
 which the pipeline replaces by the file name.
 """
@@ -14,36 +16,30 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice
+from thesisrecon.geometry.critical_motions import UpgradedCameras
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import (
+    FOCAL,
     MetricEstimate,
     inlier_mask,
     reproject_observations,
     residual_norms,
 )
+from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
 from thesisrecon.metric._uncertainty import USUAL_INFLATION
+from thesisrecon.optimize.bundle.identifiability import (
+    CalibrationProblem,
+    excess_equations,
+    identifiability_report,
+)
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
+from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.records import IntrinsicInterval, SelfCalibration
+from thesisrecon.records import IdentifiabilityReport, IntrinsicInterval, IntrinsicsPrior, SelfCalibration
 
-OWN = 2
-"""Intrinsics that each view estimates from its own points: focal and aspect."""
-MAX_OBSERVATIONS = 1500
 MIN_OBSERVATIONS = 30
-MIN_BASELINE_RATIO = 2e-3
-"""Baseline over distance to the scene below which two views have no usable parallax."""
-MIN_REDUNDANCY = 0.1
-"""Residuals that keep a smaller fraction of the variance of their coordinate are not used for the noise."""
-_FOCAL_RANGE = (0.2, 20.0)
-_MAX_FOCAL_STD = 0.15
-_MIN_MODEL_INLIER_RATIO = 0.6
-_MAX_SIGMA_REL = 0.0015
-# Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
-_MAX_PRINCIPAL_SHIFT = 0.15
-# In long sides: images that determine their principal point better than this may be crops.
-_MAX_PRINCIPAL_STD = 0.015
-# An object is stretched by the error of the aspect ratio.
-_MAX_ASPECT_STD = 0.05
 MIN_INLIER_RATIO = 0.5
 """Inlier ratio of a view, wrong matches included."""
 MIN_CONFIRMED_RATIO = 0.6
@@ -52,11 +48,6 @@ wrong ones stay below 0.5."""
 MIN_JOINED_SHARE = 0.5
 """Share of inliers among the tracks that join two parts of the images: right models reach 0.6, and parts
 joined by matches between similar places stay below 0.45."""
-WEAKEST_JOINS = 20
-MAX_BEHIND = 0.05
-MAX_NOISE_RATIO = 3.0
-MAX_OWN_FOCAL = 0.03
-MAX_OWN_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -121,7 +112,7 @@ def triangulable_observations(model: MetricEstimate) -> B8:
 
 
 def _from_two_places(model: MetricEstimate, near: B8) -> B8:
-    """(N,) whether the views of a point have a baseline above ``MIN_BASELINE_RATIO`` of the distance."""
+    """(N,) whether the views of a point have a baseline above 0.002 of the distance, a usable parallax."""
     t = model.tracks
     centres = model.cameras.centres
     view, point = t.view_index[near], t.point_index[near]
@@ -132,7 +123,7 @@ def _from_two_places(model: MetricEstimate, near: B8) -> B8:
     first, apart = np.zeros(t.n_points, dtype=np.int64), np.zeros(t.n_points)
     first[point[::-1]] = view[::-1]
     np.maximum.at(apart, point, np.linalg.norm(centres[view] - centres[first[point]], axis=1))
-    return np.asarray(apart > MIN_BASELINE_RATIO * float(distance))
+    return np.asarray(apart > 2e-3 * float(distance))
 
 
 def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
@@ -181,7 +172,7 @@ def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
     graph = scipy.sparse.csr_matrix((1.0 / weight, (agree.row, agree.col)), both.shape)
     tree = scipy.sparse.csgraph.minimum_spanning_tree(graph).tocoo()
     joins = []
-    for edge in np.argsort(-tree.data, kind="stable")[:WEAKEST_JOINS]:
+    for edge in np.argsort(-tree.data, kind="stable")[:20]:
         rest = np.arange(len(tree.data)) != edge
         parts = scipy.sparse.csr_matrix((tree.data[rest], (tree.row[rest], tree.col[rest])), tree.shape)
         label = scipy.sparse.csgraph.connected_components(parts, directed=False)[1]
@@ -213,7 +204,7 @@ def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     # The ridge keeps V of one-view points regular; their redundancy is 0 all the same.
     V += (1e-12 * np.trace(V, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
     left = 1.0 - np.einsum("kca,kab,kcb->kc", B, np.linalg.inv(V)[point], B)
-    usable = left > MIN_REDUNDANCY
+    usable = left > 0.1
     size = np.abs(seen - t.xy[k])[usable] / np.sqrt(left[usable])
     whose = np.repeat(view[:, None], 2, axis=1)[usable]
     noise = np.full(t.n_views, np.nan)
@@ -227,13 +218,13 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
     """Own log focal offset of a view and its standard deviation; NaN with few observations."""
     if not model.registered[view] or len(index) < MIN_OBSERVATIONS:
         return np.nan, np.nan
-    index = index[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]
+    index = index[:: int(np.ceil(len(index) / 1500))]
     t, cameras = model.tracks, model.cameras
     X, xy = model.X[t.point_index[index]], t.xy[index]
     seen, _ = reproject_observations(model, t.view_index[index], t.point_index[index])
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
-    free = np.arange(len(intrinsics)) < OWN
+    free = np.arange(len(intrinsics)) < 2  # focal and aspect
     fit = refine_pose(
         cameras.R[view], cameras.t[view], intrinsics, X, xy, free=free, loss_px=2.0 * noise, iterations=10
     )
@@ -273,7 +264,8 @@ def self_check(
         "explained_share": float(agree[near].mean()) if near.any() else 0.0,
         "sigma_rel": float(noise_from_distances(noise) / np.median(longest)) if len(noise) else np.inf,
         "principal_shift_max_long_sides": float(shift.max()),
-        "principal_shift_undetermined": float(shift[uncertain > _MAX_PRINCIPAL_STD].max(initial=0.0)),
+        # Images that determine their principal point better than this may be crops.
+        "principal_shift_undetermined": float(shift[uncertain > 0.015].max(initial=0.0)),
         "aspect_std_max": max(intervals[v]["aspect"].std for v in views),
         "focal_change_since_calibration": float(change.max()) if both.any() else 0.0,
         "sigmas_to_minimum": model.sigmas_to_minimum,
@@ -291,15 +283,10 @@ def self_check(
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
     join = weakest_join(model, near)
     check["joined_share_weakest"] = np.nan if join is None else join.share
-    failed_views, limitations = _failed_views(each, model)
-    return check, [*failed_views, *_failed_join(join), *_failed_model(check)], limitations
-
-
-def _failed_join(join: Join | None) -> list[str]:
-    """A sentence if most tracks between two parts of the images contradict their join."""
-    if join is None or join.share >= MIN_JOINED_SHARE:
-        return []
-    return [Notice("doubtful-join", _named(join.views), join.inliers, join.tracks)]
+    failed, limitations = _failed_views(each, model)
+    if join is not None and join.share < MIN_JOINED_SHARE:
+        failed.append(Notice("doubtful-join", _named(join.views), join.inliers, join.tracks))
+    return check, [*failed, *_failed_model(check)], limitations
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:
@@ -319,13 +306,13 @@ def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str
         failed.append(Notice("view-unconfirmed", _named(wrong), _range(views.confirmed[wrong])))
     if len(wrong := take(~(views.inlier_ratio >= MIN_INLIER_RATIO))):
         failed.append(Notice("view-inliers", _named(wrong), _range(views.inlier_ratio[wrong])))
-    if len(wrong := take(views.behind > MAX_BEHIND)):
+    if len(wrong := take(views.behind > 0.05)):
         failed.append(Notice("points-behind", _named(wrong), _range(views.behind[wrong])))
-    for view in take((np.abs(views.focal_off) > MAX_OWN_FOCAL) & (views.focal_off_sigmas > MAX_OWN_SIGMAS)):
+    for view in take((np.abs(views.focal_off) > 0.03) & (views.focal_off_sigmas > 5.0)):
         off = float(np.expm1(views.focal_off[view]))
         failed.append(Notice("own-focal", view, abs(off), "longer" if off > 0.0 else "shorter"))
     limitations: list[str] = []
-    if len(noisy := take(views.noise_ratio > MAX_NOISE_RATIO)):
+    if len(noisy := take(views.noise_ratio > 3.0)):
         # Blur and motion cause noise as well; a wrong camera loses matches or needs another focal length.
         ratio = views.noise_ratio[noisy].max()
         limitations.append(Notice("noisy-view", _named(noisy), ratio))
@@ -353,11 +340,57 @@ def _failed_model(check: Mapping[str, float]) -> list[str]:
     far = check["sigmas_to_minimum"]
     passed = {
         Notice("not-converged", far): not far > MAX_SIGMAS_TO_MINIMUM,
-        Notice("implausible-focal", low, high): _FOCAL_RANGE[0] < low and high < _FOCAL_RANGE[1],
-        Notice("focal-std", std): std < _MAX_FOCAL_STD,
-        Notice("low-model-inliers", share): share > _MIN_MODEL_INLIER_RATIO,
-        Notice("large-noise", noise): noise < _MAX_SIGMA_REL,
-        Notice("centre-shift", shift): shift < _MAX_PRINCIPAL_SHIFT,
-        Notice("aspect-std", aspect_std): aspect_std < _MAX_ASPECT_STD,
+        Notice("implausible-focal", low, high): low > 0.2 and high < 20.0,
+        Notice("focal-std", std): std < 0.15,
+        Notice("low-model-inliers", share): share > 0.6,
+        Notice("large-noise", noise): noise < 0.0015,
+        # Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
+        Notice("centre-shift", shift): shift < 0.15,
+        # An object is stretched by the error of the aspect ratio.
+        Notice("aspect-std", aspect_std): aspect_std < 0.05,
     }
     return [sentence for sentence, ok in passed.items() if not ok]
+
+
+def returned_cameras(model: MetricEstimate) -> UpgradedCameras:
+    """Return the registered cameras and valid points, from which the motion is measured."""
+    v, cameras = np.flatnonzero(model.registered), model.cameras
+    focal = cameras.intrinsics[cameras.group[v], FOCAL] / model.sizes[v].max(axis=1)
+    return UpgradedCameras(focal, cameras.R[v], cameras.centres[v], model.X[model.valid])
+
+
+def check_returned(
+    model: MetricEstimate,
+    adjustment: MetricAdjustment,
+    metric: UpgradedCameras,
+    intervals: Sequence[Mapping[str, IntrinsicInterval]],
+) -> IdentifiabilityReport:
+    """Check whether the images and the prior determine a model as it is, without adjusting it again.
+
+    The motion is that of all ``metric`` cameras, and the focal lengths are known as the ``intervals`` say.
+    Covariances are those of some of the views and observations.
+    """
+    part = runs_of_views(model)
+    seen = subsample_inliers(part)
+    count = np.bincount(seen.view_index, minlength=len(model.registered))
+    # The poses of views with fewer of the observations may be undetermined.
+    views = np.flatnonzero(count >= min(10, int(np.sort(count)[-3])))
+    used = np.flatnonzero(np.isin(seen.view_index, views))
+    used = used[(np.bincount(seen.point_index[used]) >= 2)[seen.point_index[used]]]
+    c, rows, prior = model.cameras, model.cameras.group[views], adjustment.row_prior(model)
+    assert c.shared is not None
+    own = np.arange(len(views), dtype=np.int64)
+    problem = CalibrationProblem(
+        MetricCameras(c.R[views], c.t[views], c.intrinsics[rows], own, c.shared[rows]),
+        model.X,
+        Observations(np.searchsorted(views, seen.view_index[used]), seen.point_index[used], seen.xy[used]),
+        IntrinsicsPrior.unshared(prior.mean[rows], prior.std[rows]),
+        max(model.sigma_px, 1e-3),
+        len(used) / max(int(model.inlier.sum()), 1),
+        model.sizes[views].max(axis=1).astype(np.float64),
+        views,
+    )
+    focals = [intervals[v]["focal_px"] for v in views.tolist()]
+    std = np.array([focal.std / focal.value for focal in focals])
+    excess = excess_equations(adjustment.prior, model.registered)
+    return identifiability_report(problem, excess, metric=metric, focal_std=std)

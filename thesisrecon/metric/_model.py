@@ -24,13 +24,6 @@ MIN_ANGLE = float(np.radians(0.05))
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
 the views; of more than ``MANY_VIEWS`` each view gets the numbers below. A view has ``CELLS`` along a side."""
-LONG_PER_VIEW, PRECISE_PER_VIEW = 1000, 500
-"""Observations per view of large sets: of the longest tracks while views are added, then of the most precise
-points."""
-MAX_CENTRE_SIGMAS = 3.0
-"""Principal points further from their mean, in standard deviations of the prior, are tried at the mean."""
-PRIOR_RESIDUALS = 6
-"""Weight of the prior in the noise of a point, as a number of residuals."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +76,7 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
     if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
-    return restrict_points(
-        model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
-    )
+    return restrict_points(model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), 1000))
 
 
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
@@ -104,9 +95,10 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     total = np.bincount(point, squared, minlength=t.n_points)
     count = np.bincount(point, minlength=t.n_points)
     # Posterior mean of the variance; the inverse gamma prior is that of all points and limits short tracks.
-    noise = (total + PRIOR_RESIDUALS * variance) / np.maximum(2 * count - 3 + PRIOR_RESIDUALS, 1)
+    # It weighs as much as six residuals.
+    noise = (total + 6 * variance) / np.maximum(2 * count - 3 + 6, 1)
     order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
-    points = _select_spread_points(model, order, PRECISE_PER_VIEW)
+    points = _select_spread_points(model, order, 500)
     return restrict_points(model, points), points
 
 
@@ -201,7 +193,7 @@ def with_tracks(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
 
 
 def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> MetricEstimate:
-    """The model with principal points far from their mean moved back to it.
+    """The model with principal points more than 3 standard deviations from their mean moved back to it.
 
     The prior has two minima if the images hardly determine a principal point; that near the mean is tried.
     """
@@ -209,7 +201,7 @@ def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> Metr
     mean, std = prior.mean[first][:, CENTRE], prior.std[first][:, CENTRE]
     intrinsics = model.cameras.intrinsics.copy()
     off = np.abs(intrinsics[:, CENTRE] - mean)
-    far = np.any(off > MAX_CENTRE_SIGMAS * std, axis=1, keepdims=True)
+    far = np.any(off > 3.0 * std, axis=1, keepdims=True)
     if not far.any():
         return model
     intrinsics[:, CENTRE] = np.where(far, mean, intrinsics[:, CENTRE])
@@ -275,18 +267,18 @@ def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
 
 
 def upgraded_model(
-    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior, max_rotation_residual: float
+    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> MetricEstimate | None:
     """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras remain.
 
-    Cameras C = K^-1 P H further than ``max_rotation_residual`` from a scaled rotation (Frobenius norm of
-    3 C C' / tr(C C') - I) are left out.
+    Cameras C = K^-1 P H further than 0.3 from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
+    left out and resected again.
     """
     views = np.flatnonzero(reconstruction.registered)
     H = upgrade.metric_from_projective
     rotations, translations, S = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
     off = np.sqrt(np.sum((3.0 * S**2 / np.sum(S**2, axis=1, keepdims=True) - 1.0) ** 2, axis=1))
-    good = off < max_rotation_residual
+    good = off < 0.3
     if good.sum() < 3:
         return None
     n = len(reconstruction.P)

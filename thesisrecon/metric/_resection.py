@@ -1,15 +1,20 @@
-"""Registration of the cameras that the projective stage left out, by P3P, RANSAC and refinement."""
+"""Registration of the cameras that the projective stage left out, by P3P, RANSAC and refinement.
+
+The pose of a camera that sees few points of the model is confirmed by its other matches.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice, counted
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.resection import pose_from_three_points
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
-from thesisrecon.metric._confirmed_pose import confirmed_pose
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -26,21 +31,13 @@ from thesisrecon.metric._model import (
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.robust_resection import resect_calibrated
 
-ZOOMS = (1.0, 0.8, 1.25, 0.64, 1.56)
-"""Factors tried on the focal length of a camera that shares it with no registered view."""
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
 """k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
 MIN_POINTS = 15
 """Points of the model that a missing camera must see, unless other matches confirm its pose."""
-MIN_SHARE = 0.2
-"""In large sets, views with a smaller fraction of their points in the model are registered last: they may
-show another place with repeated structure."""
-MAX_ROUNDS = 6
-MIN_GAIN = 0.003
-"""Increase of the inlier ratio below which the rounds end."""
+FEWEST_POINTS, MIN_MATCHES, AGREEING = 5, 15, 0.5
+"""Points, and other matches, that must agree with a confirmed pose, and the smallest share of either."""
 MIN_INLIER_RATIO = 0.5
-GLOBAL_GROWTH, ITERATIONS = 1.2, 12
-"""For more than ``MANY_VIEWS`` views, everything is adjusted when the number of cameras has grown by this."""
 
 
 def _pose_and_focal(
@@ -89,19 +86,20 @@ def _grow(
         before = model.registered
         model, rejected = _register_missing(model, rng, allowed, rows)
         joined = model.registered & ~before
-        grown = model.registered.sum() > GLOBAL_GROWTH * adjusted.sum()
+        # Of many views everything is adjusted when the number of cameras has grown by a fifth.
+        grown = model.registered.sum() > 1.2 * adjusted.sum()
         if joined.any() and not grown and adjusted.sum() > MANY_VIEWS:
             model = _adjust_window(model, adjustment, joined)
             continue
         if joined.any():
             model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
-        iterations = ITERATIONS if model.registered.sum() > MANY_VIEWS else 6
+        iterations = 12 if model.registered.sum() > MANY_VIEWS else 6
         model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=iterations)[0]
         # A wide gate in the first round readmits observations that a wrong model had excluded.
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS if rounds else EARLY_SIGMAS)
         now = float(model.inlier.mean())
         rounds, gain, share, adjusted = rounds + 1, now - share, now, model.registered
-        if not joined.any() and rounds > 1 and (gain < MIN_GAIN or rounds >= MAX_ROUNDS):
+        if not joined.any() and rounds > 1 and (gain < 0.003 or rounds >= 6):
             return model, rejected
 
 
@@ -133,7 +131,9 @@ def _register_missing(
     t = model.tracks
     counts = np.bincount(t.view_index[model.valid[t.point_index]], minlength=t.n_views)
     missing = allowed & ~model.registered
-    reached = missing & (counts >= MIN_SHARE * np.array([len(k) for k in rows]))
+    # In large sets, views with few of their points in the model may show another place with repeated
+    # structure: they are registered last.
+    reached = missing & (counts >= 0.2 * np.array([len(k) for k in rows]))
     rejected: dict[int, str] = {}
     few = missing & (counts < MIN_POINTS)
     parts = (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,)
@@ -157,7 +157,7 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
     assert cameras.shared is not None
     focals = cameras.shared[:, 0]
     alone = not model.registered[focals[cameras.group] == focals[row]].any()
-    zooms = ZOOMS if alone else (1.0,)
+    zooms = (1.0, 0.8, 1.25, 0.64, 1.56) if alone else (1.0,)
     gate, enough = 2.0 * EARLY_SIGMAS * model.gate_px, len(k) >= MIN_POINTS
     found = _pose_and_focal(model, k, row, gate, zooms, rng) if enough else None
     support = 0 if found is None else int(found[3].sum())
@@ -197,3 +197,107 @@ def _register_again(
         model = replace(model, registered=model.registered & ~wrong)
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """Rays (., 3) of the camera: of points ``X`` and of matches to other cameras.
+
+    ``theirs`` are the rays of the matches in the world, ``R`` and ``centres`` the poses of the other cameras.
+    """
+
+    X: F64
+    of_points: F64
+    of_matches: F64
+    theirs: F64
+    R: F64
+    centres: F64
+
+    def residuals(self, R: F64, t: F64) -> tuple[F64, F64]:
+        """Lengths (M,) of the reprojection residuals, inf behind the camera, and Sampson distances (N,)."""
+        Y, epipole = self.X @ R.T + t, self.centres @ R.T + t
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = np.linalg.norm(Y[:, :2] / Y[:, 2:] - self.of_points[:, :2], axis=1)
+        lines = np.cross(epipole, self.theirs @ R.T)
+        back = np.einsum("nij,nj->ni", self.R, np.cross(self.of_matches, epipole) @ R)
+        squared = (lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+        distance = (self.of_matches * lines).sum(axis=1) / np.sqrt(squared + 1e-300)
+        return np.where(Y[:, 2] > 0.0, off, np.inf), distance
+
+    def in_front(self, R: F64, t: F64) -> B8:
+        """Matches (N,) with a point in front of both cameras."""
+        epipole, theirs = self.centres @ R.T + t, self.theirs @ R.T
+        normal = np.cross(self.of_matches, theirs)
+        depths = [np.cross(epipole, ray) for ray in (theirs, self.of_matches)]
+        return np.asarray(np.all([(normal * depth).sum(axis=1) > 0.0 for depth in depths], axis=0))
+
+    def cost(self, pose: tuple[F64, F64], gate: float) -> float:
+        """Truncated quadratic cost of a pose."""
+        return float(np.minimum((np.concatenate(self.residuals(*pose)) / gate) ** 2, 1.0).sum())
+
+    def start(self, gate: float, rng: np.random.Generator) -> tuple[F64, F64] | None:
+        """The pose of three points with the least cost."""
+        chosen = rng.random((300, len(self.X))).argpartition(2, axis=1)[:, :3]
+        unit = self.of_points / np.linalg.norm(self.of_points, axis=1, keepdims=True)
+        R, t, _ = pose_from_three_points(self.X[chosen], unit[chosen])
+        return min(zip(R, t, strict=True), key=lambda pose: self.cost(pose, gate), default=None)
+
+    def refined(self, pose: tuple[F64, F64], noise: float, gate: float) -> tuple[F64, F64]:
+        """The pose near ``pose`` with the least robust cost."""
+        R, t = pose
+        length = max(float(np.median(np.linalg.norm(self.X @ R.T + t, axis=1))), 1e-300)
+
+        def moved(step: F64) -> tuple[F64, F64]:
+            turn = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
+            return turn @ R, t + length * step[3:]
+
+        def residuals(step: F64) -> F64:
+            return np.minimum(np.concatenate(self.residuals(*moved(step))), 1.0) / noise
+
+        found = scipy.optimize.least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=2.0, max_nfev=30)
+        return min((pose, moved(found.x)), key=lambda one: self.cost(one, gate))
+
+
+def confirmed_pose(
+    model: MetricEstimate, view: int, rows: I64, rng: np.random.Generator
+) -> tuple[F64, F64] | None:
+    """R and t of a camera that sees few points of the model, None if points or other matches contradict it.
+
+    Matches to registered images that are no points of the model determine the pose by epipolar geometry,
+    except for the length of the translation, which few points determine: a row of images continues beyond a
+    weak link. ``rows`` are its observations.
+    """
+    evidence = _evidence(model, rows)
+    if len(evidence.X) < FEWEST_POINTS or len(evidence.theirs) < MIN_MATCHES:
+        return None
+    focal = model.cameras.intrinsics[model.cameras.group[view], 0]
+    noise = model.gate_px / focal
+    gate = EARLY_SIGMAS * noise
+    pose = evidence.start(2.0 * gate, rng)
+    if pose is None:
+        return None
+    pose = evidence.refined(pose, noise, gate)
+    points, matches = (np.abs(residual) < LATE_SIGMAS * noise for residual in evidence.residuals(*pose))
+    # The matches of a wrong pose intersect behind a camera, or anywhere.
+    matches &= evidence.in_front(*pose)
+    return pose if _agree(points, FEWEST_POINTS) and _agree(matches, MIN_MATCHES) else None
+
+
+def _agree(agreeing: B8, fewest: int) -> bool:
+    return int(agreeing.sum()) >= max(fewest, AGREEING * len(agreeing))
+
+
+def _evidence(model: MetricEstimate, rows: I64) -> _Evidence:
+    """The points of the model that a view of observations ``rows`` sees, and its other matches."""
+    t, cameras = model.tracks, model.cameras
+    known, own = model.valid[t.point_index[rows]], np.full(t.n_points, -1)
+    k, own[t.point_index[rows[~known]]] = rows[known], rows[~known]
+    other = np.flatnonzero(model.registered[t.view_index] & (own[t.point_index] >= 0))
+    rays = (
+        homogenize(normalized_observations(cameras, t.view_index[i], t.xy[i]))
+        for i in (k, own[t.point_index[other]], other)
+    )
+    of_points, of_matches, theirs = rays
+    R, centres = cameras.R[t.view_index[other]], cameras.centres[t.view_index[other]]
+    theirs = np.einsum("nji,nj->ni", R, theirs)
+    return _Evidence(model.X[t.point_index[k]], of_points, of_matches, theirs, R, centres)

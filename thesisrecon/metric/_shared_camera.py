@@ -16,7 +16,6 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import MetricAdjustment
-from thesisrecon.metric._camera_model import MAX_CHANGE
 from thesisrecon.metric._model import (
     ASPECT,
     CENTRE,
@@ -33,39 +32,18 @@ from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.scatter import BlockScatter, linearise_fit
 from thesisrecon.records import IntrinsicsPrior
 
-CENTRE_STD = 0.1
-"""Prior of free principal points in long sides; images may be crops."""
-MAX_OBSERVATIONS = 15000
 MAX_VIEWS, RUN = 200, 20
-"""Maximum number of views tested, and length of the runs of neighbours that are chosen from more views:
-15,000 observations are too few for all."""
+"""Number of views tested, and length of the runs of neighbours that are chosen from more views: the
+observations of :func:`subsample_inliers` are too few for all."""
 OWN_STD = 0.01
 """Deviations of single images that a camera model may leave out: principal points in long sides
 (stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
-SCALES = 50
-"""Number of standard deviations of own values over which the mean is taken."""
-FEW_VIEWS = 6
-"""Up to this number of views the intervals contain the effect of such deviations, as for critical motions."""
-FALSE_ALARM_RATE = 1e-3
-MAX_VIDEO_STEP = 0.1
-"""Median displacement of points between consecutive images of a video, in long sides: a readout is a part of
-this time, and meaningless between photographs."""
 READOUT_STEP, SMALL = 0.02, 1e-3
 """Steps of numerical derivatives, in times between consecutive images."""
-STD_FLOOR = 2e-3
-"""Floor of the relative standard deviation of an own focal."""
-MIN_FOCAL_DIFFERENCE = 0.01
-"""Relative; smaller differences are harmless."""
-MIN_CENTRE_DIFFERENCE = 0.015
-"""In long sides; smaller differences are harmless."""
-MAX_OWN_FOCAL_STD = 0.03
-"""Relative; with less certain own focals the sharing cannot be tested."""
+MIN_FOCAL_DIFFERENCE, MIN_CENTRE_DIFFERENCE = 0.01, 0.015
+"""Smaller differences of focals (relative) and principal points (in long sides) are harmless."""
 ZOOM_STD = 0.03
 """Assumed relative scatter of focals that cannot be tested."""
-MAX_SIGMAS = 3.0
-MAX_CENTRE_SIGMAS = 5.0
-MAX_OVERDISPERSION = 8.0
-"""Variance ratio of blocks over points: 1.5 to 5 for correct models of real images, 11 to 28 if deformed."""
 
 
 def runs_of_views(model: MetricEstimate) -> MetricEstimate:
@@ -81,10 +59,10 @@ def runs_of_views(model: MetricEstimate) -> MetricEstimate:
 
 
 def subsample_inliers(model: MetricEstimate) -> Observations:
-    """Inliers of every n-th point, at most about ``MAX_OBSERVATIONS``."""
+    """Inliers of every n-th point, at most about 15,000."""
     t, index = model.tracks, np.flatnonzero(model.inlier)
     chosen = np.zeros(t.n_points, dtype=bool)
-    chosen[np.unique(t.point_index[index])[:: int(np.ceil(len(index) / MAX_OBSERVATIONS))]] = True
+    chosen[np.unique(t.point_index[index])[:: int(np.ceil(len(index) / 15000))]] = True
     index = index[chosen[t.point_index[index]]]
     return Observations(t.view_index[index], t.point_index[index], t.xy[index])
 
@@ -116,12 +94,11 @@ def _per_view(
     for column in columns:
         shared[:, column], free[column] = own, True
         if np.isfinite(own_std):
-            mean[:, column], std[:, column] = (
-                cameras.intrinsics[rows, column],
-                own_std * units.get(column, 1.0),
-            )
+            mean[:, column] = cameras.intrinsics[rows, column]
+            std[:, column] = own_std * units.get(column, 1.0)
         else:
-            std[:, column] = CENTRE_STD * longest if column in CENTRE else np.inf
+            # Images may be crops.
+            std[:, column] = 0.1 * longest if column in CENTRE else np.inf
     known = IntrinsicsPrior.unshared(mean, std)
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
@@ -155,16 +132,16 @@ def focal_std_of_deviations(
     """Relative standard deviation of the focal lengths by deviations of the images from the camera model.
 
     Images may have own aspect ratios and skews, as unordered images with a rolling shutter do; with up to
-    ``FEW_VIEWS`` images or after a ``critical`` motion own principal points too. These are then as large as
+    six images or after a ``critical`` motion own principal points too. These are then as large as
     possible if the images have ``contradicted`` one camera. The images of a video may show a rolling shutter.
     """
     assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
-    few = len(focal) <= FEW_VIEWS
+    few = len(focal) <= 6
     if not few and len(np.unique(focal)) == len(focal):
         return 0.0
     model, weak = runs_of_views(model), few or critical
-    scales = np.ones(1) if weak and contradicted else (np.arange(SCALES) + 0.5) / SCALES
+    scales = np.ones(1) if weak and contradicted else (np.arange(50) + 0.5) / 50
     kinds = ((ASPECT, SKEW), CENTRE) if weak else ((ASPECT, SKEW),)
     variance = sum(_variance_by_own_values(model, adjustment, columns, scales) for columns in kinds)
     return float(np.hypot(np.sqrt(variance), _change_by_rolling_shutter(model, adjustment)))
@@ -190,7 +167,7 @@ def _variance_by_own_values(
         return 0.0
     unit = np.diag(terms.information(fit.values.size))[own] ** -0.5
     C = fit.solve(np.eye(fit.information.shape[0])[:, fit.first + own]) / unit
-    gradient = fit.system.J.T @ fit.system.residual
+    gradient = fit.J.T @ fit.residual
     gradient[fit.first :] += terms.gradient(fit.start)
     information = np.linalg.inv(C[fit.first + own] / unit[:, None])
     eigenvalues, V = np.linalg.eigh(0.5 * (information + information.T))
@@ -213,7 +190,8 @@ def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustme
     t, index = model.tracks, np.flatnonzero(model.inlier)
     view = t.view_index[index]
     shift = _displacement_to_next(model, index)
-    if np.median(np.linalg.norm(shift, axis=1) / model.sizes[view].max(axis=1)) > MAX_VIDEO_STEP:
+    # The readout is a part of the time between the images of a video, and meaningless between photographs.
+    if np.median(np.linalg.norm(shift, axis=1) / model.sizes[view].max(axis=1)) > 0.1:
         return 0.0
     shift *= (t.xy[index, 1] / model.sizes[view, 1] - 0.5)[:, None]
 
@@ -252,13 +230,6 @@ def _displacement_to_next(model: MetricEstimate, index: I64) -> F64:
     moved = replace(model, cameras=replace(c, R=R, t=translation))
     seen = (t.view_index[index], t.point_index[index])
     return (reproject_observations(moved, *seen)[0] - reproject_observations(model, *seen)[0]) / SMALL
-
-
-def focal_decided_by_model(change: float) -> list[str]:
-    """A sentence if a focal length depends too much on deviations from the camera model."""
-    if change <= MAX_CHANGE:
-        return []
-    return [Notice("focal-by-camera-model", change)]
 
 
 @dataclass(frozen=True)
@@ -315,9 +286,12 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
         misfit = max(decrease, 1.0) if not apart else 1.0
         found += [_focals_differ(views, alone, s) for s in apart]
         contradicted[FOCAL] = bool(apart)
-        for s in [s for s in focals if s not in apart and _focal_std(alone, s).max() > MAX_OWN_FOCAL_STD]:
-            focal_std[views[s.places]] = _std_of_a_kind(model, adjustment, s)
-            warnings.append(_untestable(float(_focal_std(alone, s).max())))
+        for s in [s for s in focals if s not in apart]:
+            # With less certain own focals the sharing cannot be tested.
+            if (std := float(_focal_std(alone, s.places).max())) > 0.03:
+                focal_std[views[s.places]] = _std_of_a_kind(model, adjustment, s)
+                known = f"only to {std:.0%} (1 sigma)" if std < 1.0 else "not at all"
+                warnings.append(Notice("untestable-shared-focal", known, ZOOM_STD))
         before = alone
         bent = [set(s.places.tolist()) for s in apart]
         centres = [s for s in centres if not any(b & set(s.places.tolist()) for b in bent)]
@@ -349,15 +323,14 @@ def _sets(model: MetricEstimate, adjustment: MetricAdjustment, views: I64, colum
 def _beyond_chance(decrease: float, freedom: int) -> float:
     """``decrease`` in cost by more unknowns, chi-square per degree of freedom; 0 if it may be chance."""
     saved = 2.0 * decrease / USUAL_INFLATION**2
-    return saved / freedom if saved > scipy.special.chdtri(freedom, FALSE_ALARM_RATE) else 0.0
+    return saved / freedom if saved > scipy.special.chdtri(freedom, 1e-3) else 0.0
 
 
-def _focal_std(alone: MetricBundleResult, s: _SharedGroup) -> F64:
-    """Inflated relative standard deviations of own focals; inf where undetermined."""
-    variance = alone.intrinsics_covariance[s.places, FOCAL, FOCAL]
-    focal = alone.cameras.intrinsics[s.places, FOCAL]
-    std = np.hypot(USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / focal, STD_FLOOR)
-    return np.where(np.isfinite(std) & (variance > 0.0), std, np.inf)
+def _focal_std(fit: MetricBundleResult, rows: I64) -> F64:
+    """Inflated relative standard deviations of the focals of ``rows``, from 0.002 on; inf: undetermined."""
+    variance = fit.intrinsics_covariance[rows, FOCAL, FOCAL]
+    std = USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / fit.cameras.intrinsics[rows, FOCAL]
+    return np.where(np.isfinite(std) & (variance > 0.0), np.hypot(std, 2e-3), np.inf)
 
 
 def _focals_apart(alone: MetricBundleResult, s: _SharedGroup) -> bool:
@@ -371,7 +344,7 @@ def _std_of_a_kind(model: MetricEstimate, adjustment: MetricAdjustment, s: _Shar
     scattered = _adjust_per_view(model, adjustment, (FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
     rows = model.cameras.group[np.flatnonzero(model.registered)[s.places]]
     off = np.log(scattered.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
-    return float(np.hypot(_focal_std(scattered, s), off).max())
+    return float(np.hypot(_focal_std(scattered, s.places), off).max())
 
 
 def _centres_off(
@@ -385,36 +358,21 @@ def _centres_off(
 
 
 def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> tuple[str, str]:
-    focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s)
+    focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s.places)
     low, high = int(focal.argmin()), int(focal.argmax())
+    ratio, ends = focal[high] / focal[low] - 1.0, views[s.places[[high, low]]]
     return (
-        Notice(
-            "shared-focal-contradicted",
-            views[s.places[high]],
-            focal[high] / focal[low] - 1.0,
-            views[s.places[low]],
-            max(std[low], std[high]),
-        ),
+        Notice("shared-focal-contradicted", ends[0], ratio, ends[1], max(std[low], std[high])),
         "Use one camera per image (cameras = per-image), or leave the zoomed images out",
     )
 
 
 def _centres_differ(s: _SharedGroup, off: F64) -> tuple[str, str]:
+    advice = "se one camera per image (cameras = per-image) if the images were cropped individually"
     if s.known:
-        return (
-            Notice("given-centre-contradicted", len(s.places), np.abs(off).max()),
-            "Leave it out, or use one camera per image (cameras = per-image) if the images were cropped "
-            "individually",
-        )
-    return (
-        Notice("shared-centre-contradicted", len(s.places), np.ptp(off, axis=0).max()),
-        "Use one camera per image (cameras = per-image) if the images were cropped individually",
-    )
-
-
-def _untestable(std: float) -> str:
-    alone = f"only to {std:.0%} (1 sigma)" if np.isfinite(std) and std < 1.0 else "not at all"
-    return Notice("untestable-shared-focal", alone, ZOOM_STD)
+        fact = Notice("given-centre-contradicted", len(s.places), np.abs(off).max())
+        return fact, f"Leave it out, or u{advice}"
+    return Notice("shared-centre-contradicted", len(s.places), np.ptp(off, axis=0).max()), f"U{advice}"
 
 
 def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustment) -> list[str]:
@@ -429,34 +387,32 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustmen
         view = int(given[number[given] == k][0])
         mean, deviation = float(prior.mean[view, 0]), float(prior.std[view, 0])
         off = float(np.log(focal[view] / mean))
-        if abs(off) > MIN_FOCAL_DIFFERENCE and abs(off) > MAX_SIGMAS * float(np.hypot(std[view], deviation)):
+        if abs(off) > MIN_FOCAL_DIFFERENCE and abs(off) > 3.0 * float(np.hypot(std[view], deviation)):
             whose = "" if len(np.unique(number[given])) == 1 else f" of image #{view}"
-            failed_checks.append(
-                Notice(
-                    "given-focal-contradicted",
-                    whose,
-                    abs(np.expm1(off)),
-                    "longer" if off > 0 else "shorter",
-                    std[view],
-                    "" if deviation == 0.0 else ", or set a larger focal_std_rel",
-                )
-            )
+            direction = "longer" if off > 0 else "shorter"
+            advice = "" if deviation == 0.0 else ", or set a larger focal_std_rel"
+            found = (whose, abs(np.expm1(off)), direction, std[view], advice)
+            failed_checks.append(Notice("given-focal-contradicted", *found))
     return failed_checks
 
 
 def inconsistent_principal_point(
     model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter
 ) -> list[str]:
-    """Detect a deformed model: a moved principal point and blocks that disagree (those of crops agree)."""
+    """Detect a deformed model: a moved principal point and blocks that disagree (those of crops agree).
+
+    The variance ratio of blocks over points is 1.5 to 5 for correct models of real images, 11 to 28 if
+    deformed.
+    """
     views = np.flatnonzero(model.registered)
-    if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > MAX_OVERDISPERSION:
+    if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > 8.0:
         return []
     std = adjustment.prior.std[views][:, CENTRE]
     values = model.cameras.intrinsics[model.cameras.group[views]][:, CENTRE]
     off = np.abs(values - adjustment.prior.mean[views][:, CENTRE])
     sigmas = np.where(std > 0.0, off / np.where(std > 0.0, std, 1.0), 0.0).max(axis=1)
     worst = int(sigmas.argmax())
-    if not sigmas[worst] > MAX_CENTRE_SIGMAS:
+    if not sigmas[worst] > 5.0:
         return []
     share = float(off[worst].max() / model.sizes[views[worst]].max())
     return [Notice("deformed-by-centre", views[worst], share, sigmas[worst], scatter.overdispersion)]
@@ -472,16 +428,12 @@ def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F
     shared[known, FOCAL] = shared[:, FOCAL].max() + 1 + alike
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
-    options = adjustment.options(model)
+    options = replace(adjustment.options(model), covariance=True, noise_floor_px=model.sigma_px)
+    free_prior = IntrinsicsPrior.unshared(prior.mean, std)
     result = refine_metric_bundle(
-        replace(cameras, shared=shared),
-        model.X,
-        subsample_inliers(model),
-        free=free,
-        prior=IntrinsicsPrior.unshared(prior.mean, std),
-        options=replace(options, covariance=True, noise_floor_px=model.sigma_px),
-    )
-    focal = result.cameras.intrinsics[:, FOCAL]
-    variance = np.maximum(result.intrinsics_covariance[:, FOCAL, FOCAL], 0.0)
-    deviation = np.hypot(USUAL_INFLATION * np.sqrt(variance) / focal, STD_FLOOR)
-    return focal[cameras.group], deviation[cameras.group], shared[cameras.group, FOCAL]
+        replace(cameras, shared=shared), model.X, subsample_inliers(model), free=free, prior=free_prior,
+        options=options,
+    )  # fmt: skip
+    group = cameras.group
+    deviation = _focal_std(result, np.arange(len(std)))[group]
+    return result.cameras.intrinsics[group, FOCAL], deviation, shared[group, FOCAL]

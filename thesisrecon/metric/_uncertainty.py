@@ -32,19 +32,6 @@ MODEL_FLOOR_REL = 1e-3
 to one or two parts in a thousand."""
 MIN_BLOCKS = 4
 """Fewer blocks give no inflation."""
-OVERDISPERSION_RANGE = (1.3, 1.8)
-"""Overdispersion that pure noise does not reach, and that at which the model is certainly inexact."""
-TAIL_RANGE = (1.2, 1.6)
-"""The same for the width of the tail of the residuals: 1 for normal noise, 2 to 3 for real images."""
-COLUMNS = (FOCAL, *CENTRE, K1)
-"""Intrinsics with a hierarchical prior."""
-MIN_MEMBERS = 3
-OUTLIER_SIGMAS = 4.0
-SAME_ZOOM = 0.01
-"""Cameras whose focals scatter by less (relative) share k2 and k3."""
-MIN_SPREAD = 1e-6
-MIN_SPREAD_SIGMAS = 0.3
-"""Lower bound of tau in units of the noise: a few values can agree by chance."""
 UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
 CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a richer camera model"
 _COLUMNS = {
@@ -58,7 +45,9 @@ def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
     """Evidence for an inexact camera or noise model: 0 for normal noise, 1 if certain or not measurable."""
     if scatter.blocks < MIN_BLOCKS or not np.isfinite(scatter.overdispersion):
         return 1.0
-    measured = [(scatter.overdispersion, OVERDISPERSION_RANGE), (tail, TAIL_RANGE)]
+    # Values that pure noise does not reach, and those at which the model is certainly inexact; the tail of
+    # the residuals is 1 wide for normal noise, 2 to 3 for real images.
+    measured = [(scatter.overdispersion, (1.3, 1.8)), (tail, (1.2, 1.6))]
     return max(float(np.clip((value - low) / (high - low), 0.0, 1.0)) for value, (low, high) in measured)
 
 
@@ -101,12 +90,12 @@ def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> Hierarc
     kinds = own.kind.copy()
     spread = np.full((len(kinds), WIDTH), np.inf)
     outside = np.zeros(len(kinds), dtype=bool)
-    for column in COLUMNS:
+    for column in (FOCAL, *CENTRE, K1):
         for kind in np.unique(kinds[kinds >= 0]):
             index = np.flatnonzero(kinds == kind)
             index = index[np.unique(shared[index, column], return_index=True)[1]]
             value, std = own.value[index, column], own.std[index, column]
-            if len(index) < MIN_MEMBERS or not (std > 0.0).all():
+            if len(index) < 3 or not (std > 0.0).all():
                 continue
             total = np.hypot(std, own.floor[index, column])
             far = find_outliers(value, total)
@@ -118,17 +107,17 @@ def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> Hierarc
 
 
 def find_outliers(value: F64, std: F64) -> B8:
-    """Values more than ``OUTLIER_SIGMAS`` of their noise and the scatter of all (MAD) from the median."""
+    """Values more than four of their noise and the scatter of all (MAD) from the median."""
     off = np.abs(value - np.median(value))
     scatter = MAD_FACTOR * float(np.median(off))
-    return np.asarray(off > OUTLIER_SIGMAS * np.hypot(scatter, std))
+    return np.asarray(off > 4.0 * np.hypot(scatter, std))
 
 
 def estimate_spread(value: F64, std: F64, total: F64) -> float:
     """Estimate the standard deviation tau of true values behind noisy ones by REML (Harville 1977).
 
-    ``std`` is their noise, ``total`` noise and model error together. tau is at least ``MIN_SPREAD_SIGMAS``
-    times the median noise; inf for fewer than two values.
+    ``std`` is their noise, ``total`` noise and model error together. tau is at least 0.3 times the median
+    noise, since a few values can agree by chance; inf for fewer than two values.
     """
     if len(value) < 2:
         return np.inf
@@ -140,7 +129,7 @@ def estimate_spread(value: F64, std: F64, total: F64) -> float:
     squares = np.sum(weight * (value - mean[:, None]) ** 2, axis=1)
     likelihood = -0.5 * (np.log(variance).sum(axis=1) + np.log(weight.sum(axis=1)) + squares)
     tau = float(taus[int(likelihood.argmax())])
-    return max(float(np.hypot(tau, MIN_SPREAD_SIGMAS * np.median(std))), MIN_SPREAD)
+    return max(float(np.hypot(tau, 0.3 * np.median(std))), 1e-6)
 
 
 def apply_hierarchical_prior(
@@ -151,7 +140,7 @@ def apply_hierarchical_prior(
     shared = model.cameras.shared.copy()
     for kind in np.unique(hierarchical.kind[hierarchical.kind >= 0]):
         rows = np.flatnonzero(hierarchical.kind == kind)
-        if hierarchical.spread[rows[0], FOCAL] < SAME_ZOOM:
+        if hierarchical.spread[rows[0], FOCAL] < 0.01:
             shared[rows, K1 + 1 :] = shared[rows[0], K1 + 1 :]
     model = replace(model, cameras=replace(model.cameras, shared=shared))
     return model, replace(adjustment, hierarchical=hierarchical)

@@ -15,21 +15,18 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
+    MAX_CHANGE,
     MIN_OBSERVATIONS,
     SETTLED,
     MetricAdjustment,
-    with_initial_gate,
-)
-from thesisrecon.metric._camera_model import (
-    MAX_REMAINING,
     camera_differences,
     differences_of_images,
     remaining_cost,
     richer_models,
+    with_initial_gate,
     with_own_values,
 )
-from thesisrecon.metric._checks import self_check
-from thesisrecon.metric._identifiability import check_returned, returned_cameras
+from thesisrecon.metric._checks import check_returned, returned_cameras, self_check
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
     K1,
@@ -51,7 +48,6 @@ from thesisrecon.metric._shared_camera import (
     SharedCameraTest,
     check_shared_cameras,
     contradicted_focal_priors,
-    focal_decided_by_model,
     focal_std_of_deviations,
     inconsistent_principal_point,
 )
@@ -78,23 +74,8 @@ from thesisrecon.records import (
     Upgrade,
 )
 
-MIN_CHANGE = 0.002
-"""Fraction of observations that become inliers or outliers in a round, below which the rounds end."""
-START_ROUNDS = 3
-MAX_ROUNDS = 4
-"""Final rounds of triangulation and adjustment."""
-NOISE_ROUNDS = 2
-"""Further adjustments after which noise and inliers are estimated again; they change less each time."""
-PRECISE_ROUNDS, SAME_POINTS = 5, 0.98
-"""Maximum number of selections of points in large sets, and fraction of equal points at which they end."""
-LENS_STD = 0.02
-"""Prior standard deviation about 0 of k2 and k3 of a camera with several images."""
-NOISE_FLOOR_PX = 0.02
-"""Lower bound of the estimated noise."""
-MAX_ROTATION_RESIDUAL = 0.3
-"""Upgraded cameras further from a scaled rotation (norm of 3 C C' / tr(C C') - I) are resected again."""
-UNDETERMINED_REL = 0.1
-"""Focal lengths that their own matches determine worse than this (95 %, relative) are reported."""
+MAX_REMAINING = 0.25
+"""Largest cost of held-out observations of a richer camera model that is adopted, over the simple one's."""
 NOT_EXPLAINED = (
     "One value per image hardly predicts held-out observations better, so the shared values stay; their "
     "intervals contain the difference"
@@ -119,7 +100,7 @@ class MetricRefinement:
         threads: int = 1,
     ) -> MetricResult:
         """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = MetricAdjustment(prior, LENS_STD, NOISE_FLOOR_PX, threads=threads)
+        adjustment = MetricAdjustment(prior, lens_std=0.02, noise_floor_px=0.02, threads=threads)
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:
@@ -158,9 +139,10 @@ def _assess(
     failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
     failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
     failed_checks += inconsistent_principal_point(model, adjustment, scatter)
-    failed_checks += focal_decided_by_model(deviations)
+    if deviations > MAX_CHANGE:
+        failed_checks.append(Notice("focal-by-camera-model", deviations))
     views = np.flatnonzero(model.registered).tolist()
-    warnings = shrinkage.warnings(views, UNDETERMINED_REL / 1.96) + sharing.warnings
+    warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
     poses = pose_std(final[0], adjustment.poses(final[0]), scatter, intervals)
     return MetricResult(
         _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
@@ -181,14 +163,14 @@ def _start(
     reconstruction: Reconstruction, upgrade: Upgrade, adjustment: MetricAdjustment
 ) -> MetricEstimate | None:
     """Upgrade the core cameras and adjust them on projective inliers while the gate narrows."""
-    model = upgraded_model(reconstruction, upgrade, adjustment.prior, MAX_ROTATION_RESIDUAL)
+    model = upgraded_model(reconstruction, upgrade, adjustment.prior)
     if model is None:
         return None
     model = with_enough_points(model)
     # Without distortion the noise is overestimated: keep the gate at least as wide as before.
     gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
     model = with_initial_gate(model)
-    for _ in range(START_ROUNDS):
+    for _ in range(3):
         if model.valid.sum() < 20:
             return None
         model = select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
@@ -248,13 +230,14 @@ def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> Met
 
     The noise and the inliers of the result are those of its last adjustment, so that it is their minimum.
     """
-    for _ in range(MAX_ROUNDS):
+    for _ in range(4):
         before = model.inlier
         model = adjustment.run(model)[0]
         model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
-        if np.count_nonzero(before != model.inlier) < MIN_CHANGE * len(before):
+        if np.count_nonzero(before != model.inlier) < 0.002 * len(before):
             break
-    for _ in range(NOISE_ROUNDS):
+    # Noise and inliers change less each time.
+    for _ in range(2):
         model = adjustment.run(_selected(model))[0]
     return adjustment.run(_selected(model), settled=SETTLED, keep_noise=True)[0]
 
@@ -266,10 +249,10 @@ def _adjust_to_precise_points(
     if model.tracks.n_points == tracks.n_points:
         return model
     before = np.empty(0, dtype=np.int64)
-    for _ in range(PRECISE_ROUNDS):
+    for _ in range(5):
         model, points = with_precise_points(model, tracks)
         model = adjustment.run(model)[0]
-        if len(np.intersect1d(points, before)) >= SAME_POINTS * len(points):
+        if len(np.intersect1d(points, before)) >= 0.98 * len(points):
             break
         before = points
     return model

@@ -13,7 +13,7 @@ from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import StageFailure
-from thesisrecon.matching._prepared import Found, select_found, select_matches
+from thesisrecon.matching._prepared import Found, select_found
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
 
@@ -96,7 +96,7 @@ def match_views(
         return _rejected_pair(pair, 0, str(failure))
     for mask, side in zip(masks, ("xy1", "xy2"), strict=True):
         if mask is not None:
-            matches = select_matches(matches, values_at(mask, getattr(matches, side)))
+            matches = select_found(matches, values_at(mask, getattr(matches, side)))
     return verify_matches(config, matches, rng)
 
 

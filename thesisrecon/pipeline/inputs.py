@@ -17,7 +17,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
-from thesisrecon.matching._prepared import select_matches
+from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
 from thesisrecon.pipeline.image_pair import values_at, verify_matches
@@ -322,7 +322,7 @@ def outside_masks(given: Given, images: Sequence[Image]) -> Given:
         np.ones(len(xy), bool) if image.mask is None else values_at(image.mask, xy)
         for image, xy in zip(images, given.corners, strict=True)
     ]
-    matches = [select_matches(m, clear[m.i][m.index1] & clear[m.j][m.index2]) for m in given.matches]
+    matches = [select_found(m, clear[m.i][m.index1] & clear[m.j][m.index2]) for m in given.matches]
     t = given.tracks
     if t is None:
         return replace(given, matches=matches)

@@ -26,7 +26,7 @@ from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.matching._repeated_structure import reject_repeated_structure, strong_pairs
+from thesisrecon.matching.pair_selection import reject_repeated_structure, strong_pairs
 from thesisrecon.pipeline.job import Job
 from thesisrecon.records import (
     IntrinsicsPrior,

@@ -15,9 +15,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.imaging.on_demand import RecentlyUsed
 from thesisrecon.matching._prepared import strongest_corners, strongest_share
-from thesisrecon.matching._repeated_structure import reject_repeated_structure
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect
+from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.observations import cached_pair_order
 from thesisrecon.pipeline.image_pair import detect_features, match_views, oblique_pairs, prepare_oblique

@@ -16,10 +16,9 @@ from thesisrecon.geometry.conditioning import centred_frame, pixel_from_unit, wh
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.optimize.bundle.partial import refine_points
+from thesisrecon.optimize.bundle.partial import refine_points, triangulate_points
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.noise import noise_from_distances
-from thesisrecon.optimize.triangulation import triangulate_points
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.

@@ -25,7 +25,7 @@ from thesisrecon.geometry.two_view import (
     quasi_euclidean_planes,
     require_parallax_of_matches,
 )
-from thesisrecon.optimize.triangulation import triangulate_points
+from thesisrecon.optimize.bundle.partial import triangulate_points
 
 Size = tuple[int, int]
 """Width and height in pixels."""

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.bundle.elimination import BlockIndex
 from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF
 from thesisrecon.optimize.bundle.observations import Jacobians
-from thesisrecon.optimize.bundle.reduced_solvers import ReducedSystem, order_views
+from thesisrecon.optimize.bundle.schur import ReducedSystem, order_views
 from thesisrecon.optimize.least_squares import invert_information
 from thesisrecon.optimize.noise import MAD_FACTOR
 
 SIMILARITY_DOF = 7
-# Largest number of unknowns for dense inversion.
 MAX_DENSE = 1200
-# For more unknowns, a banded factor is less work if its band spans at most 1 / BAND of the views.
-BAND = 5
-# Pairs of observations at a time.
-PAIRS = 16384
-# Trimming point and variance of a standard normal variable trimmed there.
-TRIM, TRIMMED_VARIANCE = 2.5, 0.91126
-# Least fraction of its variance that a residual must keep to be used for the noise.
-MIN_KEPT = 0.1
+"""Largest number of unknowns for dense inversion."""
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
@@ -35,15 +30,16 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     if not len(residual):
         return 0.0
     kept = 1.0 - leverage - max(dof, 0) / residual.size
-    informative = kept > MIN_KEPT
+    informative = kept > 0.1
     if not informative.any():
         return 0.0
     size = np.abs(residual[informative]) / np.sqrt(kept[informative])
     sigma = MAD_FACTOR * float(np.median(size))
     for _ in range(5):
-        within = size[size <= TRIM * sigma]
+        within = size[size <= 2.5 * sigma]
         if len(within):
-            sigma = float(np.sqrt(np.mean(within**2) / TRIMMED_VARIANCE))
+            # The variance of a standard normal variable within 2.5 sigma.
+            sigma = float(np.sqrt(np.mean(within**2) / 0.91126))
     return sigma
 
 
@@ -54,12 +50,27 @@ def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
     border. It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved
     the cameras least. ``R`` and ``t`` are those of the b views with observations.
     """
-    b, C, e = reduced.sums.border.shape
+    (b, C, e), D = reduced.sums.border.shape, len(reduced.sums.rhs)
     if not b:
         return np.zeros((0, C + e, C + e))
-    if b * C + e <= MAX_DENSE or BAND * order_views(reduced.row, reduced.column, b).reach > b:
-        return _dense_blocks(reduced, R, t, row, column)
-    return _band_blocks(reduced, R, t, row, column)
+    index = np.concatenate(
+        [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
+    )
+    # For more unknowns, a sparse factor is less work if the views have an order with a narrow band.
+    if D <= MAX_DENSE or 5 * order_views(reduced.row, reduced.column, b).reach > b:
+        S = reduced.dense()
+        covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, gauge_basis(D, C, R, t))
+        return np.asarray(covariance[index[row][:, :, None], index[column][:, None, :]])
+    S = reduced.sparse()
+    if not np.isfinite(S.data).all():
+        return np.full((len(row), C + e, C + e), np.inf)
+    solve = sparse_inverse(S, C, R, t)
+    blocks = np.empty((len(row), C + e, C + e))
+    blocks[:, :, C:] = solve(unit_columns(D, b * C + np.arange(e)))[index[row]]
+    for view in range(b):
+        here = np.flatnonzero(column == view)
+        blocks[here, :, :C] = solve(unit_columns(D, index[view, :C]))[index[row[here]]]
+    return blocks
 
 
 def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:
@@ -97,8 +108,8 @@ def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64
     block = index.block[index.view_index]
     # All pairs k <= m of observations of a point: m = k, k + 1, ... of a step at a time.
     for step in range(int(count.max(initial=0))):
-        for first in range(0, len(T) - step, PAIRS):
-            k = np.arange(first, min(first + PAIRS, len(T) - step))
+        for first in range(0, len(T) - step, 16384):
+            k = np.arange(first, min(first + 16384, len(T) - step))
             k = k[point[k] == point[k + step]]
             m = k + step
             pair = index.pair[block[k], block[m]]
@@ -112,17 +123,6 @@ def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64
     return out
 
 
-def _dense_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
-    """Return the blocks of :func:`camera_blocks` by dense inversion."""
-    b, C, e = reduced.sums.border.shape
-    S = reduced.dense()
-    covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, _gauge_basis(reduced, R, t))
-    index = np.concatenate(
-        [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
-    )
-    return np.asarray(covariance[index[row][:, :, None], index[column][:, None, :]])
-
-
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
     """Invert an information matrix, singular along orthonormal N (D, 7): (S + w N N')^-1 - N N' / w."""
     weight = float(np.median(np.diag(information)))
@@ -130,56 +130,44 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
 
 
-def _band_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
-    """The blocks of :func:`camera_blocks` from a banded factor, by Baarda's S-transformation."""
-    b, C, e = reduced.sums.border.shape
-    _fix_gauge(reduced, R, t)
-    factored = order_views(reduced.row, reduced.column, b).factor(reduced)
-    N = _gauge_basis(reduced, R, t)
-    moved = None if factored is None else factored.solve(N)
-    if factored is None or moved is None:
-        return np.full((len(row), C + e, C + e), np.inf)
+def sparse_inverse(S: scipy.sparse.csc_matrix, width: int, R: F64, t: F64) -> Callable[[F64], F64]:
+    """Return B -> C B for the inverse C of sparse information S (D, D) in the inner gauge, which is dense.
 
-    def rows(matrix: F64) -> F64:
-        own = matrix[: b * C].reshape(b, C, -1)
-        return np.concatenate([own, np.broadcast_to(matrix[b * C :], (b, e, own.shape[2]))], axis=1)
-
-    n, m, middle = rows(N), rows(moved), N.T @ moved
-    blocks = factored.inverse_blocks(row, column)
-    blocks -= m[row] @ np.swapaxes(n[column], 1, 2)
-    blocks -= np.swapaxes(m[column] @ np.swapaxes(n[row], 1, 2), 1, 2)
-    blocks += n[row] @ middle @ np.swapaxes(n[column], 1, 2)
-    return blocks
-
-
-def _fix_gauge(reduced: ReducedSystem, R: F64, t: F64) -> None:
-    """Add weight to seven coordinates: one pose, and the distance to the farthest camera."""
-    sums, C = reduced.sums, reduced.sums.border.shape[1]
-    diagonal = (reduced.row == reduced.column).nonzero()[0]
-    weight = float(np.median(sums.blocks[diagonal][:, np.arange(C), np.arange(C)]))
-    _, moved, line = fixed_coordinates(R, t)
-    sums.blocks[diagonal[0], np.arange(POSE_DOF), np.arange(POSE_DOF)] += weight
-    sums.blocks[diagonal[moved.start // POSE_DOF], 3:6, 3:6] += weight * line
-
-
-def fixed_coordinates(R: F64, t: F64) -> tuple[slice, slice, F64]:
-    """Return the columns of the first pose, and of the translation of the farthest, with its direction.
-
-    Seven coordinates without a gauge freedom: a pose, and the distance to another camera, whose direction is
-    given as the outer product (3, 3) of a unit vector.
+    The pose of view v has the first six of ``width`` columns from ``width`` v on. Seven coordinates without a
+    gauge freedom are fixed, a pose and the distance to the farthest camera, and Baarda's S-transformation
+    leads from there to the inner gauge.
     """
-    centres = -np.einsum("vba,vb->va", R, t)
+    N, centres = gauge_basis(S.shape[0], width, R, t), -np.einsum("vba,vb->va", R, t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
     line = R[far] @ (centres[far] - centres[0])
-    direction = np.outer(line, line) / max(float(line @ line), 1e-300)
-    return slice(0, POSE_DOF), slice(POSE_DOF * far + 3, POSE_DOF * far + 6), direction
+    moved = slice(width * far + 3, width * far + 6)
+    fixed = scipy.sparse.lil_matrix(S.shape)
+    fixed[:POSE_DOF, :POSE_DOF] = np.eye(POSE_DOF)
+    fixed[moved, moved] = np.outer(line, line) / max(float(line @ line), 1e-300)
+    factor = scipy.sparse.linalg.splu(
+        scipy.sparse.csc_matrix(S + float(np.median(S.diagonal())) * fixed),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+
+    def without(B: F64) -> F64:
+        return np.asarray(B - N @ (N.T @ B))
+
+    return lambda B: without(factor.solve(without(B)))
 
 
-def _gauge_basis(reduced: ReducedSystem, R: F64, t: F64) -> F64:
-    """Return the orthonormal motion (D, 7) of all columns under similarities of the world."""
-    N = np.zeros((len(reduced.sums.rhs), SIMILARITY_DOF))
-    columns = reduced.sums.border.shape[1] * np.arange(len(t))[:, None] + np.arange(POSE_DOF)
-    N[columns.ravel()] = gauge_directions(R, t)
+def unit_columns(size: int, index: I64) -> F64:
+    """Return the columns ``index`` of the identity, which would itself be dense."""
+    columns = np.zeros((size, len(index)))
+    columns[index, np.arange(len(index))] = 1.0
+    return columns
+
+
+def gauge_basis(size: int, width: int, R: F64, t: F64) -> F64:
+    """Return the orthonormal motion (D, 7) of all ``size`` columns under similarities of the world."""
+    N = np.zeros((size, SIMILARITY_DOF))
+    N[(width * np.arange(len(t))[:, None] + np.arange(POSE_DOF)).ravel()] = gauge_directions(R, t)
     return N
 
 

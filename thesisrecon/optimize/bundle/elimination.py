@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import invert_cholesky_3x3, multiply_transposed_3x3
 from thesisrecon.optimize.bundle.observations import Jacobians
 
@@ -422,18 +422,6 @@ def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
                 t0, t1 = M[0, 0] * b0, M[1, 0] * b0 + M[1, 1] * b1
                 t2 = M[2, 0] * b0 + M[2, 1] * b1 + M[2, 2] * b2
                 leverage[k, i] = t0 * t0 + t1 * t1 + t2 * t2 if held else 1.0
-
-
-@kernel
-def mark_pairs(start: I64, view: I64, block: I64, seen: B8) -> None:
-    """Mark the pairs of blocks whose views observe a common point."""
-    for j in range(len(start) - 1):
-        for k in range(start[j], start[j + 1]):
-            v = block[view[k]]
-            if v >= 0:
-                for m in range(k, start[j + 1]):
-                    if block[view[m]] >= 0:
-                        seen[v, block[view[m]]] = True
 
 
 @kernel

@@ -35,22 +35,10 @@ MAX_FOCAL_STD = 0.15
 # Image noise can be mistaken for a small rotation, which makes the covariance too small: a rotation counts if
 # it exceeds its standard deviation by this factor.
 MIN_ROTATION_SIGNIFICANCE = 4.0
-# Noise of metric over projective cameras: a larger ratio means a wrong prior. A principal point or distortion
-# that only the projective cameras can absorb gives a smaller one.
-MAX_NOISE_RATIO = 3.0
 # In long sides. Unmodelled lens errors (resampling, focus breathing) move images by about 1e-4, equally in
 # all parts of the scene, so that no covariance contains them. A rotation that moves the image by s determines
 # f by its second-order part s (x / f)^2, about s / 10: for f to 15 %, 2 (s / 10) 0.15 must exceed 1e-4.
 MIN_INFINITY_SHIFT = 0.003
-
-# Lower bound of the noise of corner positions; few residuals may be smaller by chance.
-_NOISE_FLOOR_PX = 0.05
-# The same in long sides, for ratios of noise.
-_NOISE_FLOOR_REL = 3e-5
-# Predicted gain of the cameras at which it ends; 0.1 standard deviations do not change a covariance.
-_SETTLED = 5e-3
-_NEEDED_EQUATIONS = 8
-_FREE_STD = 1e3
 _FOUND: Mapping[str, str] = {
     PLANE: (
         "the scene is planar: the points lie in one plane to {scene_planarity_ratio:.1%} of its width, which "
@@ -104,8 +92,6 @@ _ADVICE: Mapping[str, str] = {
     PLANAR: _HEIGHTS,
     PARALLEL_AXES: "tilt the camera up and down too, or roll it by 90 degrees",
 }
-_RESOLVED_BY_FOCAL = (_ROTATE, _ADVICE[OPTICAL_AXIS])
-_RESOLVED_BY_ASPECT = (TURNTABLE, PLANAR, PARALLEL_AXES)
 
 
 def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
@@ -114,7 +100,7 @@ def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
     for column in range(5):
         open_ = registered & ~np.isfinite(prior.std[:, column])
         unknown += len(np.unique(prior.shared[open_, column]))
-    return 5 * int(registered.sum()) - unknown - _NEEDED_EQUATIONS
+    return 5 * int(registered.sum()) - unknown - 8
 
 
 @dataclass(frozen=True)
@@ -136,15 +122,16 @@ class CalibrationProblem:
         free = np.isin(np.arange(self.cameras.intrinsics.shape[1]), (0, 1, 3, 4))
         return refine_metric_bundle(
             self.cameras, self.X, self.observations, free=free, prior=self.prior,
+            # 0.1 standard deviations do not change a covariance; few residuals may be small by chance.
             options=BundleOptions(
                 sigma_px=self.sigma_px, loss_px=2.0 * self.sigma_px, max_iterations=iterations,
-                settled=_SETTLED, covariance=True, noise_floor_px=_NOISE_FLOOR_PX,
+                settled=5e-3, covariance=True, noise_floor_px=0.05,
             ),
         )  # fmt: skip
 
     def with_free_intrinsics(self, fit: MetricBundleResult) -> CalibrationProblem:
         """The problem at the solution ``fit`` with a free aspect and principal point per focal."""
-        std = np.full_like(self.prior.std, _FREE_STD)
+        std = np.full_like(self.prior.std, 1e3)
         std[:, 3:5] *= self.longest.max()
         shared = np.array(fit.cameras.shared)
         shared[:, 1:5] = shared[:, :1]
@@ -181,7 +168,7 @@ def identifiability_report(
     variance = np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
     centre = np.sqrt(variance) / problem.longest
     root_share = float(np.sqrt(problem.share))
-    projective_px = max(problem.projective_px, _NOISE_FLOOR_REL * float(np.median(problem.longest)))
+    projective_px = max(problem.projective_px, 3e-5 * float(np.median(problem.longest)))
     evidence |= {
         "focal_long_sides": float(np.median(metric.focal)),
         "focal_std_rel": float(std.max()),
@@ -255,7 +242,7 @@ def excess_noise(evidence: Mapping[str, float]) -> str:
 def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
     """Return clauses on how the focal length is determined in spite of the critical motion."""
     std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
-    if motion in _RESOLVED_BY_ASPECT and free_std > 2.0 * std:
+    if motion in (TURNTABLE, PLANAR, PARALLEL_AXES) and free_std > 2.0 * std:
         return [Notice("resolved-by-square-pixels", _percent(std), _percent(free_std), _ADVICE[motion])]
     if motion in (PLANE, ROTATION):
         return [Notice("resolved-by-prior", _percent(std), _ADVICE[motion])]
@@ -265,7 +252,7 @@ def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
 def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:
     """Return clauses with the reason why the focal length is not determined, and advice."""
     advice = _ADVICE.get(motion, _ROTATE) if is_critical else _ROTATE
-    if advice in _RESOLVED_BY_FOCAL and focal_std > 0.0:
+    if advice in (_ROTATE, _ADVICE[OPTICAL_AXIS]) and focal_std > 0.0:
         given = " more exactly" if focal_std < float("inf") else ""
         advice += f", or give the focal length{given}"
     if "focal_std_rel" not in evidence:
@@ -289,7 +276,11 @@ def _has_rotated(evidence: Mapping[str, float]) -> bool:
 
 
 def _has_excess_noise(evidence: Mapping[str, float]) -> bool:
-    return evidence.get("noise_ratio_to_projective", 0.0) >= MAX_NOISE_RATIO
+    """Whether the noise of metric over projective cameras means a wrong prior.
+
+    A principal point or distortion that only the projective cameras can absorb gives a smaller ratio.
+    """
+    return evidence.get("noise_ratio_to_projective", 0.0) >= 3.0
 
 
 def _percent(share: float) -> str:

@@ -48,10 +48,6 @@ from thesisrecon.optimize.bundle.schur import (
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
 from thesisrecon.records import IntrinsicsPrior
 
-# Below a relative gain of NEWTON_GAIN the second derivative of the loss is used; at least MIN_CURVATURE of
-# the curvature along a residual is kept. Reweighting is safe far from the minimum, Newton's method faster
-# near it.
-_MIN_CURVATURE, _NEWTON_GAIN = 0.3, 1e-3
 MAX_ITERATIONS = 300
 """Bound of the linear solves of one adjustment: a long valley of the cost takes fifty to a hundred."""
 MAX_SIGMAS_TO_MINIMUM = 0.1
@@ -229,13 +225,17 @@ def refine_metric_bundle(
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
-    """Return the minimum: by reweighting, then by steps close to Newton's."""
+    """Return the minimum: by reweighting, which is safe far from it, then by steps close to Newton's.
+
+    Below a relative gain of 0.001 the second derivative of the loss is used; at least 0.3 of the curvature
+    along a residual is kept.
+    """
     most, settled = options.max_iterations, options.settled
     found = run_levenberg_marquardt(
-        problem, state, max_iterations=most, tolerance=_NEWTON_GAIN, min_camera_gain=settled
+        problem, state, max_iterations=most, tolerance=1e-3, min_camera_gain=settled
     )
     if found.iterations < most:
-        near = replace(problem, weighting=problem.weighting._replace(min_curvature=_MIN_CURVATURE))
+        near = replace(problem, weighting=problem.weighting._replace(min_curvature=0.3))
         found = run_levenberg_marquardt(
             near, found.state, max_iterations=most - found.iterations, min_camera_gain=settled,
             initial_damping=found.damping,
@@ -259,13 +259,9 @@ def _metric_problem(
     values, start, table = number_unknowns(cameras, used, free, prior)
     columns = assign_columns(values, group, np.flatnonzero(free), moves)
     layout = build_layout(
-        o,
-        columns.block,
-        width=POSE_DOF + len(columns.own),
-        common=columns.border,
-        border=columns.n_border,
+        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
         threads=options.threads,
-    )
+    )  # fmt: skip
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
     return _MetricProblem(layout, columns, moves, values, weighting, layout.jacobians()), start, table
 

@@ -1,9 +1,12 @@
-"""Structure-only and motion-only bundle adjustment: points, one projective camera or one calibrated pose."""
+"""Structure-only and motion-only bundle adjustment: points, one projective camera or one calibrated pose.
+
+Also triangulation by any method of section 6.3, among them the least reprojection error.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,7 +19,9 @@ from thesisrecon.geometry.conditioning import (
     pixel_conditioning,
     whitening_transform,
 )
+from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.small_matrices import away_from_zero, invert_positive_3x3, loss_value, loss_weight
+from thesisrecon.geometry.triangulation import PASSES, sort_by_point, triangulate_linear, triangulate_midpoint
 from thesisrecon.optimize.bundle.metric_kernels import (
     MetricModel,
     linearize_metric,
@@ -31,7 +36,7 @@ from thesisrecon.optimize.bundle.observations import (
     Weighting,
     sort_observations,
 )
-from thesisrecon.optimize.bundle.projective_kernels import (
+from thesisrecon.optimize.bundle.projective import (
     UnitState,
     linearize_projective,
     projective_cost,
@@ -40,10 +45,7 @@ from thesisrecon.optimize.bundle.projective_kernels import (
 )
 from thesisrecon.optimize.least_squares import DenseSystem, invert_information, run_levenberg_marquardt
 
-# Iterations of minimize_reprojection; the median point takes four or five.
-_MAX_ITERATIONS = 200
-# Gain relative to the cost that is below its rounding.
-_ROUNDING = 1e-15
+TriangulationMethod = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
 
 class _PointOptions(NamedTuple):
@@ -161,7 +163,7 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
             else:
                 damping *= 10.0
                 # At the minimum rounding decides whether a step is accepted; shorter steps gain nothing.
-                if damping > 1e12 or promised <= _ROUNDING * cost:
+                if damping > 1e12 or promised <= 1e-15 * cost:
                     break
 
 
@@ -211,8 +213,26 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     # Cameras with one centre leave a direction of space undetermined.
     if len(S) < 4 or not np.abs(np.diag(S)).min() > 1e-13 * np.abs(S).max():
         S = np.eye(4)
-    options = _PointOptions(np.inf, _MAX_ITERATIONS, 1e-14, 2, False)
+    # The median point takes four or five iterations.
+    options = _PointOptions(np.inf, 200, 1e-14, 2, False)
     return _refine_in_frame(P, X, o, used, SpaceFrame(N, S), options)
+
+
+def triangulate_points(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
+    """Triangulate points by a method of section 6.3; see :func:`thesisrecon.triangulate`."""
+    method = method or ("polynomial" if len(P) == 2 else "optimal")
+    if method == "polynomial":
+        return triangulate_polynomial(P, xy)
+    listed = sort_by_point(xy)
+    if method == "midpoint":
+        return triangulate_midpoint(P, listed)
+    if method != "optimal":
+        return triangulate_linear(P, listed, PASSES if method == "iterated" else 0)
+    start, view, pixels = listed
+    point = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    X = minimize_reprojection(P, triangulate_linear(P, listed, 0), view, point, pixels)
+    sizes = np.linalg.norm(X, axis=1, keepdims=True)
+    return np.asarray(X / np.where(sizes > 0.0, sizes, 1.0))
 
 
 def _usable_points(P: F64, X: F64, observations: Observations) -> tuple[SortedObservations, B8]:

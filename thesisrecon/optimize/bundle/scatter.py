@@ -15,15 +15,17 @@ import scipy
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.optimize.bundle.covariance import fixed_coordinates, gauge_directions, invert_in_inner_gauge
+from thesisrecon.optimize.bundle.covariance import (
+    gauge_basis,
+    invert_in_inner_gauge,
+    sparse_inverse,
+    unit_columns,
+)
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
 from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
 from thesisrecon.records import IntrinsicsPrior
 
-# Number of pose unknowns tested besides all intrinsics.
-_MAX_POSES = 30
-_MAX_BLOCKS, _MIN_BLOCK_POINTS = 32, 12
 # Errors are correlated over large parts of the scene: their scatter is that of few large blocks.
 _LARGE_BLOCKS = 4
 # Number of unknowns above which matrices are sparse, if fewer than this fraction of the pairs of views share
@@ -74,7 +76,8 @@ def point_blocks(X: F64, used: B8) -> I64:
     """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
     block = np.where(used, 0, -1)
     count = 1
-    while 2 * count <= _MAX_BLOCKS and np.count_nonzero(used) >= 2 * count * _MIN_BLOCK_POINTS:
+    # At most 32 blocks, each of 12 points or more.
+    while 2 * count <= 32 and np.count_nonzero(used) >= 2 * count * 12:
         for b in range(count):
             rows = np.flatnonzero(block == b)
             spread = np.subtract(*np.percentile(X[rows], [90, 10], axis=0))
@@ -83,22 +86,6 @@ def point_blocks(X: F64, used: B8) -> I64:
             block[order[len(order) // 2 :]] = count + b
         count *= 2
     return np.asarray(block, dtype=np.int64)
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """Weighted residuals (2K,), their Jacobian J (2K, D), and the part of it ``taken`` by the points.
-
-    ``E`` (2K, 3N) are orthonormal columns that span the displacements by points, ``centre_columns`` (K, 2, 2)
-    the derivatives by the principal point.
-    """
-
-    residual: F64
-    J: scipy.sparse.csr_matrix
-    taken: scipy.sparse.csr_matrix
-    E: scipy.sparse.csr_matrix
-    point: I64
-    centre_columns: F64
 
 
 def block_scatter(fit: LinearisedFit) -> BlockScatter:
@@ -110,19 +97,19 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     The information uses the weights of Huber's loss instead of its second derivatives, which
     `_loss_correction` corrects.
     """
-    system, solve, values, first, start = fit.system, fit.solve, fit.values, fit.first, fit.start
-    S = fit.information
-    poses = np.arange(0, first, max(first // _MAX_POSES, 1))
+    S, solve, values, first = fit.information, fit.solve, fit.values, fit.first
+    # All intrinsics are tested, and about 30 of the pose unknowns.
+    poses = np.arange(0, first, max(first // 30, 1))
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
-    rows = solve(_unit_columns(S.shape[0], tested)).T
+    rows = solve(unit_columns(S.shape[0], tested)).T
     block = point_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
-    curvature = _loss_correction(system.residual.reshape(-1, 2), fit.loss_sigmas)
-    ratio, large = (curvature * _block_ratio(system, rows, solve, b) for b in (block, block % _LARGE_BLOCKS))
-    alone = curvature * _point_ratio(system, rows)
+    curvature = _loss_correction(fit.residual.reshape(-1, 2), fit.loss_sigmas)
+    ratio, large = (curvature * _block_ratio(fit, rows, b) for b in (block, block % _LARGE_BLOCKS))
+    alone = curvature * _point_ratio(fit, rows)
     valid = np.isfinite(ratio) & (alone > 0.0)
     estimated, number = values.number >= 0, values.number
     covariance = rows[len(poses) :, first:]
-    variance, pull = np.diag(covariance), covariance @ values.terms.gradient(start)
+    variance, pull = np.diag(covariance), covariance @ values.terms.gradient(fit.start)
     place_of = np.where(estimated, len(poses) + number, 0)
     return BlockScatter(
         np.append(variance, 0.0)[np.where(estimated, number, -1)],
@@ -173,21 +160,20 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
     turn[:, :3, :3], turn[:, 3:, 3:] = np.eye(3), -np.swapaxes(R, 1, 2) / fit.scale
     S = scipy.sparse.csr_matrix(fit.information)
     poses = S[:first, :first]
-    known = _covariance(
-        poses if scipy.sparse.issparse(fit.information) else poses.toarray(), fit.frame, fit.views
-    )
+    poses = poses if scipy.sparse.issparse(fit.information) else poses.toarray()
+    known = _covariance(poses, fit.frame, fit.views)
     response = -known(S[:first, first:].toarray()).reshape(n, POSE_DOF, -1)
     variance = np.zeros((n, POSE_DOF))
     for v in range(n):
         rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
-        own = known(_unit_columns(first, rows))[rows]
+        own = known(unit_columns(first, rows))[rows]
         variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
-    moved = fit.solve(np.asarray(fit.system.J.T @ _faults(fit)))[:first]
+    moved = fit.solve(np.asarray(fit.J.T @ _faults(fit)))[:first]
     return PoseUncertainty(
         fit.views,
         np.maximum(variance, 0.0),
         turn @ response,
-        fit.solve(_unit_columns(D, np.arange(first, D)))[first:],
+        fit.solve(unit_columns(D, np.arange(first, D)))[first:],
         fit.values.number,
         turn @ moved.reshape(n, POSE_DOF, -1),
     )
@@ -195,7 +181,7 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
 
 def _faults(fit: LinearisedFit) -> F64:
     """Weighted displacements (2K, 4) of the observations by the faults that the points do not absorb."""
-    o, columns = fit.observations, fit.system.centre_columns
+    o, columns = fit.observations, fit.centre_columns
     rows = fit.frame.intrinsics[fit.frame.group[o.view_index]]
     x, y = ((o.xy - rows[:, 3:5]) / rows[:, :1]).T
     square, none = x * x + y * y, np.zeros_like(x)
@@ -204,20 +190,27 @@ def _faults(fit: LinearisedFit) -> F64:
     )
     # The columns of the principal point weight displacements by px.
     weighted = np.einsum("krc,fck->krf", columns * rows[:, :1, None], fields).reshape(-1, 4)
-    return np.asarray(weighted - fit.system.E @ (fit.system.E.T @ weighted))
+    return np.asarray(weighted - fit.E @ (fit.E.T @ weighted))
 
 
 @dataclass(frozen=True)
 class LinearisedFit:
     """A linearised adjustment in a centred frame of size 1; the first ``first`` unknowns are the poses.
 
-    ``X`` are the points before, and ``loss_sigmas`` is the width of Huber's loss.
+    ``X`` are the points before, ``loss_sigmas`` is the width of Huber's loss. Weighted residuals (2K,) have
+    the Jacobian J (2K, D), of which the points take the part ``taken``; ``E`` (2K, 3N) are orthonormal
+    columns that span the displacements by points, ``centre_columns`` (K, 2, 2) the derivatives by the
+    principal point.
     """
 
     X: F64
     observations: Observations
     loss_sigmas: float
-    system: _Linearised
+    residual: F64
+    J: scipy.sparse.csr_matrix
+    taken: scipy.sparse.csr_matrix
+    E: scipy.sparse.csr_matrix
+    centre_columns: F64
     information: F64 | scipy.sparse.csc_matrix
     solve: _Solve
     values: IntrinsicUnknowns
@@ -237,35 +230,45 @@ def linearise_fit(
     noise: tuple[float, float],
 ) -> LinearisedFit:
     """Linearise an adjustment at its minimum; ``noise`` is the standard deviation and the loss width."""
-    group = cameras.group
+    group, (sigma, loss), width = cameras.group, noise, cameras.intrinsics.shape[1]
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
     used = np.bincount(group[observed], minlength=len(cameras.intrinsics)) > 0
     values, start, _ = number_unknowns(cameras, used, free, prior)
     views, first = np.flatnonzero(observed), POSE_DOF * int(observed.sum())
-    # Centred and scaled to size 1.
     origin, scale = scene_frame(X[np.unique(o.point_index)])
     frame = replace(cameras, t=scale * (cameras.t + cameras.R @ origin))
-    place = np.where(observed, np.cumsum(observed) - 1, -1)
-    system = _linearise(frame, scale * (X - origin), o, (values, place), noise)
-    S = _information(system, values.terms.information(values.size), o, len(views))
-    solve = _covariance(S, frame, views)
+    model = MetricModel(frame.R, frame.t, frame.intrinsics, group, scale * (X - origin))
+    weighted, none = Jacobians.empty(len(o.xy), POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
+    linearize_metric(model, o, Weighting(sigma, loss / sigma), np.arange(width), none, weighted)
+    number = values.number[group[o.view_index]]
+    poses = POSE_DOF * (np.cumsum(observed) - 1)[o.view_index][:, None] + np.arange(POSE_DOF)
+    column = np.concatenate([poses, np.where(number >= 0, first + number, 0)], axis=1)
+    centre_columns = weighted.A[:, :, POSE_DOF + 3 : POSE_DOF + 5].copy()
+    weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
+    J = _sparse(weighted.A, column, first + values.size)
+    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
+    E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
+    taken = scipy.sparse.csr_matrix(E.T @ J)
+    residual -= E @ (E.T @ residual)
+    S = _information(J, taken, values.terms.information(values.size), o, len(views))
     return LinearisedFit(
-        X, o, noise[1] / noise[0], system, S, solve, values, start, frame, scale, views, first
-    )
+        X, o, loss / sigma, residual, J, taken, E, centre_columns, S, _covariance(S, frame, views),
+        values, start, frame, scale, views, first,
+    )  # fmt: skip
 
 
 def _information(
-    system: _Linearised, prior: F64, o: Observations, n_views: int
+    J: scipy.sparse.csr_matrix, taken: scipy.sparse.csr_matrix, prior: F64, o: Observations, n_views: int
 ) -> F64 | scipy.sparse.csc_matrix:
     """Return the information (D, D) of the cameras, sparse if most views have no common point."""
-    D, size = system.J.shape[1], len(prior)
+    D, size = J.shape[1], len(prior)
     seen = scipy.sparse.csr_matrix((np.ones(len(o.xy)), (o.view_index, o.point_index)))
     if D <= _MANY or (seen @ seen.T).nnz > _SPARSE * n_views**2:
-        S = _gram_matrix(system.J) - _gram_matrix(system.taken)
+        S = _gram_matrix(J) - _gram_matrix(taken)
         S[D - size :, D - size :] += prior
         return S
     both = scipy.sparse.block_diag([scipy.sparse.csc_matrix((D - size, D - size)), prior])
-    return scipy.sparse.csc_matrix(system.J.T @ system.J - system.taken.T @ system.taken + both)
+    return scipy.sparse.csc_matrix(J.T @ J - taken.T @ taken + both)
 
 
 def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
@@ -284,32 +287,6 @@ def add_gram(start: I32, column: I32, value: F64, G: F64) -> None:
             for m in range(start[i], start[i + 1]):
                 if column[m] <= column[k]:
                     row[column[m]] += factor * value[m]
-
-
-def _linearise(
-    cameras: MetricCameras,
-    X: F64,
-    o: Observations,
-    columns: tuple[IntrinsicUnknowns, I64],
-    noise: tuple[float, float],
-) -> _Linearised:
-    (values, place), (sigma, loss), width = columns, noise, cameras.intrinsics.shape[1]
-    model = MetricModel(cameras.R, cameras.t, cameras.intrinsics, cameras.group, X)
-    weighting = Weighting(sigma, loss / sigma)
-    weighted, none = Jacobians.empty(len(o.xy), POSE_DOF + width, 0), np.zeros(0, dtype=np.int64)
-    linearize_metric(model, o, weighting, np.arange(width), none, weighted)
-    first = POSE_DOF * (int(place.max()) + 1)
-    number = values.number[cameras.group[o.view_index]]
-    poses = POSE_DOF * place[o.view_index][:, None] + np.arange(POSE_DOF)
-    column = np.concatenate([poses, np.where(number >= 0, first + number, 0)], axis=1)
-    centre_columns = weighted.A[:, :, POSE_DOF + 3 : POSE_DOF + 5].copy()
-    weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
-    J = _sparse(weighted.A, column, first + values.size)
-    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
-    E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
-    taken = scipy.sparse.csr_matrix(E.T @ J)
-    residual -= E @ (E.T @ residual)
-    return _Linearised(residual, J, taken, E, np.repeat(o.point_index, 2), centre_columns)
 
 
 def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
@@ -333,36 +310,10 @@ def _orthonormal(B: F64, point: I64, n: int) -> F64:
 def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views: I64) -> _Solve:
     """Return the inverse of S without the gauge freedoms."""
     R, t = cameras.R[views], cameras.t[views]
-    poses = gauge_directions(R, t)
-    N = np.zeros((S.shape[0], poses.shape[1]))
-    N[: len(poses)] = poses
-    if isinstance(S, np.ndarray):
-        C = invert_in_inner_gauge(S, N)
-        return lambda B: C @ B
-    fixed, (first, far, line) = scipy.sparse.lil_matrix(S.shape), fixed_coordinates(R, t)
-    fixed[first, first] = np.eye(POSE_DOF)
-    fixed[far, far] = line
-    weight = float(np.median(S.diagonal()))
-    factor = scipy.sparse.linalg.splu(
-        scipy.sparse.csc_matrix(S + weight * fixed),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
-    # Baarda's S-transformation from the fixed coordinates to the inner gauge.
-    return lambda B: _without(N, factor.solve(_without(N, B)))
-
-
-def _unit_columns(size: int, index: I64) -> F64:
-    """Return the columns ``index`` of the identity, which would itself be dense."""
-    columns = np.zeros((size, len(index)))
-    columns[index, np.arange(len(index))] = 1.0
-    return columns
-
-
-def _without(N: F64, B: F64) -> F64:
-    """Return the part of B (D, m) orthogonal to the orthonormal N (D, n)."""
-    return np.asarray(B - N @ (N.T @ B))
+    if not isinstance(S, np.ndarray):
+        return sparse_inverse(S, POSE_DOF, R, t)
+    C = invert_in_inner_gauge(S, gauge_basis(len(S), POSE_DOF, R, t))
+    return lambda B: C @ B
 
 
 def _shared_variances(
@@ -381,40 +332,35 @@ def _shared_variances(
         return variances
     used = np.unique(column)
     place = np.searchsorted(used, column)
-    T = scipy.sparse.csc_matrix(
-        (
-            np.ones(first + values.n_table),
-            (np.arange(first + values.n_table), np.concatenate([np.arange(first), first + place])),
-        ),
-        (S.shape[0], first + len(used)),
-    )
+    rows, columns = np.arange(first + values.n_table), np.concatenate([np.arange(first), first + place])
+    T = scipy.sparse.csc_matrix((np.ones(len(rows)), (rows, columns)), (S.shape[0], first + len(used)))
     together = T.T @ S @ T
     solve = _covariance(together if scipy.sparse.issparse(S) else np.asarray(together), cameras, views)
     shared = np.zeros(width)
-    shared[used] = np.diag(solve(_unit_columns(first + len(used), first + np.arange(len(used))))[first:])
+    shared[used] = np.diag(solve(unit_columns(first + len(used), first + np.arange(len(used))))[first:])
     return shared
 
 
-def _block_ratio(system: _Linearised, rows: F64, solve: _Solve, block: I64) -> F64:
+def _block_ratio(fit: LinearisedFit, rows: F64, block: I64) -> F64:
     """Squared pulls of the blocks on ``rows`` of C over sum C (S_b - S_b C S_b) C, their expectation."""
     squares, expected = np.zeros(len(rows)), np.zeros(len(rows))
-    of_residual, of_point = block[system.point], np.repeat(block, 3)
+    of_residual, of_point = block[np.repeat(fit.observations.point_index, 2)], np.repeat(block, 3)
     for b in range(int(block.max()) + 1):
         here = np.flatnonzero(of_residual == b)
-        J, taken = system.J[here], system.taken[np.flatnonzero(of_point == b)]
+        J, taken = fit.J[here], fit.taken[np.flatnonzero(of_point == b)]
         half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
-        expected += np.sum(half * rows, axis=1) - np.sum(solve(half.T).T * half, axis=1)
-        squares += (rows @ (J.T @ system.residual[here])) ** 2
+        expected += np.sum(half * rows, axis=1) - np.sum(fit.solve(half.T).T * half, axis=1)
+        squares += (rows @ (J.T @ fit.residual[here])) ** 2
     return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
 
 
-def _point_ratio(system: _Linearised, rows: F64) -> F64:
+def _point_ratio(fit: LinearisedFit, rows: F64) -> F64:
     """Return the same ratio with every point a block of its own, whose effect on the fit is negligible."""
-    squares = np.zeros(len(rows))
+    squares, point = np.zeros(len(rows)), np.repeat(fit.observations.point_index, 2)
     for n, c in enumerate(rows):
-        squares[n] = np.sum(np.bincount(system.point, (system.J @ c) * system.residual) ** 2)
+        squares[n] = np.sum(np.bincount(point, (fit.J @ c) * fit.residual) ** 2)
     # Not the variance: priors contribute to it without points.
-    expected = np.sum((system.J @ rows.T) ** 2, axis=0) - np.sum((system.taken @ rows.T) ** 2, axis=0)
+    expected = np.sum((fit.J @ rows.T) ** 2, axis=0) - np.sum((fit.taken @ rows.T) ** 2, axis=0)
     return np.asarray(squares / np.maximum(expected, 1e-300))
 
 

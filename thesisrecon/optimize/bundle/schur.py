@@ -1,7 +1,8 @@
 """Schur complement of bundle adjustment: points are eliminated, cameras are solved together.
 
 [[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
-+ W' a). Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum.
++ W' a). Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum. A banded
+Cholesky factor is linear in the views if an order keeps neighbours together (corridors, streets).
 """
 
 from __future__ import annotations
@@ -13,32 +14,116 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.small_matrices import floored_diagonal
+from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 from thesisrecon.optimize.bundle.elimination import (
     BlockIndex,
     PointSums,
     ReducedSums,
     eliminate_points,
-    mark_pairs,
     substitute_points,
 )
 from thesisrecon.optimize.bundle.observations import Jacobians, Observations, SortedObservations
-from thesisrecon.optimize.bundle.reduced_solvers import (
-    BandedCholesky,
-    ReducedSystem,
-    add_diagonal,
-    choose_solver,
-    solve_dense,
-)
 
 CHUNK = 4096
-# Every chunk has its own sums: few chunks if these are large.
-MAX_CHUNKS, CHUNK_BYTES = 16, 128e6
 
 Answer = TypeVar("Answer")
+
+
+def add_diagonal(sums: ReducedSums, pair: I64, values: F64) -> None:
+    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) is the block of two views."""
+    (b, C, e), c = sums.border.shape, np.arange(sums.border.shape[1])
+    sums.blocks[np.diag(pair)[:, None], c, c] += values[: b * C].reshape(b, C)
+    sums.corner[np.diag_indices(e)] += values[b * C :]
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """Symmetric positive system in blocks of views ``row`` <= ``column`` (n,)."""
+
+    row: I64
+    column: I64
+    sums: ReducedSums
+
+    def dense(self) -> F64:
+        """Return the upper triangle of the matrix; (D, D)."""
+        (b, C, e), edge = self.sums.border.shape, len(self.sums.rhs) - len(self.sums.corner)
+        views, S = np.zeros((b, C, b, C)), np.zeros((edge + e, edge + e))
+        views[self.row, :, self.column] = self.sums.blocks
+        S[:edge, :edge] = views.reshape(edge, edge)
+        S[:edge, edge:] = self.sums.border.reshape(edge, e)
+        S[edge:, edge:] = self.sums.corner
+        return S
+
+    def sparse(self) -> scipy.sparse.csc_matrix:
+        """Return the matrix; (D, D)."""
+        (b, C, e), blocks = self.sums.border.shape, self.sums.blocks
+        rows = np.broadcast_to(C * self.row[:, None, None] + np.arange(C)[:, None], blocks.shape).ravel()
+        columns = np.broadcast_to(C * self.column[:, None, None] + np.arange(C), blocks.shape).ravel()
+        views = scipy.sparse.coo_matrix((blocks.ravel(), (rows, columns)), (b * C, b * C))
+        border = scipy.sparse.csc_matrix(self.sums.border.reshape(b * C, e))
+        S = scipy.sparse.triu(scipy.sparse.bmat([[views, border], [None, self.sums.corner]])).tocsc()
+        return S + scipy.sparse.triu(S, 1).T
+
+
+def solve_dense(system: ReducedSystem) -> F64 | None:
+    """Return x (D,) by Cholesky, D^3 / 3 operations, or None if the system is not positive."""
+    # Row-major upper is column-major lower: LAPACK reads the transpose without a copy.
+    return solve_positive(system.dense().T, system.sums.rhs)
+
+
+@dataclass(frozen=True)
+class BandedCholesky:
+    """Banded factorisation by LAPACK of the views in the order ``place`` (b,); border by Schur complement."""
+
+    place: I64
+    reach: int
+
+    def solve(self, system: ReducedSystem) -> F64 | None:
+        """Return x (D,), or None if the system is not positive."""
+        s, (b, C, e) = system.sums, system.sums.border.shape
+        # band[j, i - j] = S[i, j] in the order of the views.
+        band, column = np.zeros((b * C, (self.reach + 1) * C)), np.arange(C)
+        i = (C * self.place[system.row])[:, None, None] + column[:, None]
+        j = (C * self.place[system.column])[:, None, None] + column
+        band[np.minimum(i, j), np.abs(i - j)] = s.blocks
+        if not np.isfinite(band).all():
+            return None
+        factor, info = scipy.linalg.lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+        if info != 0:
+            return None
+        border = s.border.reshape(b * C, e)
+        right = np.column_stack([s.rhs[: b * C], border]).reshape(b, C, e + 1)[np.argsort(self.place)]
+        solved, _ = scipy.linalg.lapack.dpbtrs(factor, right.reshape(b * C, e + 1), lower=1)
+        solved = solved.reshape(b, C, e + 1)[self.place].reshape(b * C, e + 1)
+        views, moved = solved[:, 0], solved[:, 1:]
+        tail = solve_positive(s.corner - border.T @ moved, s.rhs[b * C :] - border.T @ views)
+        if tail is None or not np.isfinite(views).all():
+            return None
+        return np.concatenate([views - moved @ tail, tail])
+
+
+def choose_solver(row: I64, column: I64, n_views: int, width: int, border: int) -> BandedCholesky | None:
+    """Return the banded solver for blocks of ``width`` and a border, None if dense Cholesky is less work."""
+    D = float(n_views * width + border)
+    if D <= 600:
+        return None
+    banded = order_views(row, column, n_views)
+    band = float((banded.reach + 1) * width)
+    # An operation on narrow bands takes twice the time of one of dense Cholesky.
+    return banded if 2.0 * D * band * (band + 4.0 * (border + 1)) < D**3 / 3.0 else None
+
+
+def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
+    """Order the views such that neighbours stand close (reverse Cuthill-McKee)."""
+    graph = scipy.sparse.coo_array((np.ones(len(row)), (row, column)), shape=(n_views, n_views)).tocsr()
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    place = np.empty(n_views, dtype=np.int64)
+    place[order] = np.arange(n_views)
+    return BandedCholesky(place, int(np.abs(place[row] - place[column]).max(initial=0)))
 
 
 @dataclass(frozen=True)
@@ -104,13 +189,16 @@ def build_layout(
 ) -> BundleLayout:
     """Find the pairs of views with common points, divide the points into chunks and choose a solver."""
     seen, start, n = observations.seen, observations.start, int(block.max(initial=-1)) + 1
-    marked = np.eye(n, dtype=bool)
-    mark_pairs(start, seen.view_index, block, marked)
-    row, column = (a.astype(np.int64) for a in np.nonzero(marked))
+    moves = block[seen.view_index] >= 0
+    places = seen.point_index[moves], block[seen.view_index[moves]]
+    points = scipy.sparse.csr_array((np.ones(len(places[0])), places), (len(start) - 1, n))
+    marked = (points.T @ points).toarray() > 0.0
+    row, column = (a.astype(np.int64) for a in np.nonzero(np.triu(marked | np.eye(n, dtype=bool))))
     pair = np.full((n, n), -1, dtype=np.int64)
     pair[row, column] = np.arange(len(row))
     bytes_each = 8.0 * (len(row) * width**2 + n * width * border + border**2)
-    most = max(1, min(MAX_CHUNKS, int(CHUNK_BYTES / max(bytes_each, 1.0))))
+    # Every chunk has its own sums: few chunks if these are large.
+    most = max(1, min(16, int(128e6 / max(bytes_each, 1.0))))
     count = int(np.clip(len(seen.xy) // CHUNK, 1, most))
     bounds = np.searchsorted(start, np.linspace(0, len(seen.xy), count + 1)[1:-1])
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
@@ -155,7 +243,7 @@ class BundleSystem:
             _add_prior(pair, total, self.prior)
         damped = damping * floored_diagonal(total.diagonal)
         # A column without effect does not move: any positive pivot will do.
-        add_diagonal(total.blocks, pair, total.corner, np.where(total.diagonal == 0.0, 1.0, damped))
+        add_diagonal(total, pair, np.where(total.diagonal == 0.0, 1.0, damped))
         return ReducedSystem(layout.row, layout.column, total), points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
@@ -195,7 +283,7 @@ def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:
     weight = np.bincount(first, w, minlength=size).astype(np.float64)
     weight += np.bincount(second[both], w[both], minlength=size)
     total.diagonal[:] += weight
-    add_diagonal(total.blocks, pair, total.corner, weight)
+    add_diagonal(total, pair, weight)
     first, second, w = first[both], second[both] - edge, w[both]
     inside = first >= edge
     np.add.at(total.corner, (first[inside] - edge, second[inside]), -w[inside])
