@@ -27,12 +27,6 @@ def rows_of_views(view: I64, n_views: int) -> list[I64]:
     return np.split(np.argsort(view, kind="stable"), ends[:-1])
 
 
-_TRIANGULAR = 1e-9
-"""Largest deviation of K from upper triangular with K33 = 1, by rounding."""
-_ORTHOGONAL = 2e-4
-"""Largest deviation of R'R from the identity; four printed digits leave at most 2 sqrt(3) 5e-5."""
-
-
 def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]]) -> None:
     """Raise ``ValueError`` if an array has a wrong shape; equal letters are equal sizes."""
     sizes: dict[str, int] = {}
@@ -62,7 +56,7 @@ def require_calibration(caller: str, K: F64) -> None:
     require_finite(caller, K)
     K = np.asarray(K, dtype=np.float64)
     low = np.append(K[[1, 2, 2], [0, 0, 1]], K[2, 2] - 1.0)
-    if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= _TRIANGULAR):
+    if not (min(K[0, 0], K[1, 1]) > 0.0 and np.abs(low).max() <= 1e-9):
         needed = "K upper triangular with positive focal lengths and K33 = 1"
         raise ValueError(f"{caller} needs {needed}; got {K.round(6).tolist()}")
 
@@ -70,7 +64,8 @@ def require_calibration(caller: str, K: F64) -> None:
 def require_rotations(caller: str, R: F64) -> None:
     """Raise ``ValueError`` if a matrix of R (..., 3, 3) is no rotation."""
     apart = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0))
-    if not apart <= _ORTHOGONAL:
+    # Four printed digits leave at most 2 sqrt(3) 5e-5.
+    if not apart <= 2e-4:
         raise ValueError(f"{caller} needs a rotation R; R'R deviates from the identity by {apart:.2g}")
     if not (np.linalg.det(R) > 0.0).all():
         raise ValueError(f"{caller} needs a rotation R; got a reflection, det R = -1")

@@ -184,10 +184,6 @@ class Camera:
         return np.zeros(1) if self.distortion is None else np.asarray(self.distortion, dtype=np.float64)
 
 
-_CONVERGED = 1e-9
-"""Relative step at which Newton's method has converged to rounding: the next error is its square."""
-
-
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
     """Return P (..., 3, 4) = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21)."""
     return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))
@@ -256,7 +252,8 @@ def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
             slope = factor * (factor + 2.0 * (_radial_factor(slopes, r2) - 1.0))
             step = (r2 * factor**2 - distorted) / slope
             r2 = r2 - step
-            if np.all(np.abs(step) <= _CONVERGED * np.abs(r2)):
+            # Converged to rounding: the next error is the square of the relative step.
+            if np.all(np.abs(step) <= 1e-9 * np.abs(r2)):
                 break
         factor = _radial_factor(k, r2)
         reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted

@@ -28,7 +28,6 @@ REMEDIES = {
 """Advice for a file that cannot be written."""
 WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing causes."""
-_MAX_SHOWN = 120
 NOT_MADE = "output-not-made"
 """Code of the warning about a figure, page or file that could not be made; the result is complete without."""
 STRICT_VARIABLE = "THESISRECON_STRICT"
@@ -57,7 +56,7 @@ def in_words(value: Any) -> str:
     except (ValueError, RecursionError):
         # Python refuses to print numbers of thousands of digits and infinite nesting.
         text = f"{type(value).__name__} too large to print"
-    return text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:

@@ -23,9 +23,6 @@ from thesisrecon.records import Reconstruction
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
 """Cameras, (K, R, t), cameras by image name, or a metric reconstruction."""
 
-# Pixels this far outside an image, in long sides, show that the size is wrong, for example height x width.
-_OUTSIDE = 0.1
-
 
 def checked_sizes(caller: str, sizes: I64, n: int) -> I64:
     """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
@@ -66,7 +63,8 @@ def require_inside(view: I64, xy: F64, sizes: I64) -> None:
     """Raise ``ValueError`` if pixels (K, 2) lie far outside the images of their views; ``sizes`` (V, 2)."""
     size = sizes[view]
     reach = (np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1)
-    if len(reach) and reach.max() > _OUTSIDE:
+    # Pixels this far outside show that the size is wrong, for example height x width.
+    if len(reach) and reach.max() > 0.1:
         k = int(reach.argmax())
         raise ValueError(
             f"pixels of view {view[k]} lie outside its size {tuple(size[k].tolist())} by {reach[k]:.0%} of "

@@ -34,13 +34,6 @@ COLUMNS: Mapping[str, tuple[int, ...]] = {
 """Rows and columns of each intrinsic in the covariance."""
 STD_NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1", "k2", "k3")
 """Names of the standard deviations in :attr:`thesisrecon.Camera.std`."""
-LOSSES = ("huber", "squared")
-_HUBER_SIGMAS = 2.0
-_LEAST_SIGMA_PX = 1e-6
-_SIMILARITY_DOF = 7
-_SETTLED = 1e-6
-_MAX_BEHIND = 0.5
-"""Fraction of observed points behind their cameras above which the poses must use another convention."""
 
 
 @dataclass(frozen=True)
@@ -160,8 +153,8 @@ def bundle_adjust(
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
     free = (free,) if isinstance(free, str) else tuple(free)
     chosen = _free(free)
-    if loss not in LOSSES:
-        raise ValueError(unknown_word("loss", loss, LOSSES))
+    if loss not in ("huber", "squared"):
+        raise ValueError(unknown_word("loss", loss, ("huber", "squared")))
     start = _start(views, shared, chosen)
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
@@ -170,18 +163,14 @@ def bundle_adjust(
     noise = weight = 1.0 if sigma_px is None else sigma_px
     # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
     for last in (True,) if sigma_px is not None else (False, True):
-        width = _HUBER_SIGMAS * noise if loss_px is None else loss_px
+        width = 2.0 * noise if loss_px is None else loss_px
         width = np.inf if loss == "squared" else width
         options = BundleOptions(
-            sigma_px=noise,
-            loss_px=width,
-            max_iterations=max_iterations,
-            settled=_SETTLED,
-            covariance=last,
-            point_covariance=last,
-        )
+            sigma_px=noise, loss_px=width, max_iterations=max_iterations, settled=1e-6,
+            covariance=last, point_covariance=last,
+        )  # fmt: skip
         fit = refine_metric_bundle(start, X, observed, free=chosen, prior=knowledge, options=options)
-        start, X, weight, noise = fit.cameras, fit.X, noise, max(fit.sigma_px, _LEAST_SIGMA_PX)
+        start, X, weight, noise = fit.cameras, fit.X, noise, max(fit.sigma_px, 1e-6)
     assert fit is not None
     assert fit.pose_covariance is not None
     assert fit.point_covariance is not None
@@ -194,7 +183,12 @@ def bundle_adjust(
     poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
     refined = tuple(
         replace(
-            view, K=K[i], R=fit.cameras.R[i], t=fit.cameras.t[i], distortion=rows[i, 5:], std=_by_name(std[i])
+            view,
+            K=K[i],
+            R=fit.cameras.R[i],
+            t=fit.cameras.t[i],
+            distortion=rows[i, 5:],
+            std=dict(zip(STD_NAMES, std[i].tolist(), strict=True)),
         )
         for i, view in enumerate(views)
     )
@@ -202,10 +196,6 @@ def bundle_adjust(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
         fit.point_covariance, fit.sigmas_to_minimum * weight / noise,
     )  # fmt: skip
-
-
-def _by_name(std: F64) -> dict[str, float]:
-    return {name: float(value) for name, value in zip(STD_NAMES, std, strict=True)}
 
 
 def _problem(
@@ -293,7 +283,8 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
     require_finite("bundle_adjust, for points with observations,", X[point])
     depth = np.einsum("kb,kb->k", start.R[view, 2], X[point]) + start.t[view, 2]
     behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
-    if behind > _MAX_BEHIND:
+    # Of most points only if the poses use another convention.
+    if behind > 0.5:
         raise ValueError(
             f"{behind:.0%} of the observed points lie behind their cameras; R is world to camera and "
             "t = -R centre"
@@ -301,7 +292,7 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
     seen = np.unique(view)
     assert start.shared is not None
     own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
-    unknowns = POSE_DOF * len(seen) + 3 * len(np.unique(point)) + own - _SIMILARITY_DOF
+    unknowns = POSE_DOF * len(seen) + 3 * len(np.unique(point)) + own - 7  # those of a similarity
     if 2 * len(view) < unknowns or len(seen) < 2:
         raise ValueError(
             f"bundle_adjust needs two views and as many equations as unknowns; {len(view)} observations in "

@@ -25,11 +25,6 @@ from thesisrecon.results import (
     SparseView,
 )
 
-_LINE = 0.01
-"""Extent of the centres across a line, relative to that along it, below which they are almost collinear."""
-_SHOWN = 3
-
-
 Model = str | Path | SparseModel | RunResult | Mapping[str, Camera]
 
 
@@ -142,8 +137,8 @@ def _stem(name: str) -> str:
 
 
 def _few(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(in_words(name) for name in names[:_SHOWN]) + more
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(in_words(name) for name in names[:3]) + more
 
 
 def _similarity(centres: F64, centres_b: F64, notes: list[str]) -> Similarity | None:
@@ -162,7 +157,7 @@ def _similarity(centres: F64, centres_b: F64, notes: list[str]) -> Similarity | 
             "rotations and intrinsics are compared"
         )
         return None
-    if min(_extent_across(points) for points in (centres, centres_b)) < _LINE:
+    if min(_extent_across(points) for points in (centres, centres_b)) < 0.01:
         notes.append(
             "the centres of the common cameras lie almost on one line; the rotation about it is uncertain, "
             "and with it the distances of points"

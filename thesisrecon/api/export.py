@@ -38,18 +38,8 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
 
-_MAX_GROWTH = 0.5
-"""Largest extension of an undistorted image beyond each side of the original, as a fraction of the side."""
-_INNER = 0.99
-"""Largest radius in an undistorted image, relative to that at which the distorted radius stops growing."""
-_MIN_SIDE_PX = 16
-_ROUNDING_PX = 1e-6
-_WORKING_BYTES = 17
-"""Measured memory to undistort an image and its mask, per pixel of the original and of the result."""
 _budget = MemoryBudget(MAX_DECODED_BYTES)
 """Separate from the budget for decoding, which each image needs while it occupies this one."""
-_FLOAT32_REL = 1e-4
-"""Largest single-precision rounding of coordinates, as a fraction of the extent of the points."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +214,7 @@ def _rounding_notes(model: SparseModel) -> list[str]:
     if len(model.X) < 2:
         return []
     rounding = float(np.spacing(np.float32(np.abs(model.X).max())))
-    if rounding <= _FLOAT32_REL * float(np.median(np.ptp(model.X, axis=0))):
+    if rounding <= 1e-4 * float(np.median(np.ptp(model.X, axis=0))):
         return []
     return [
         f"points are stored in single precision, rounded to {rounding:.2g}; subtract an offset from positions"
@@ -304,19 +294,21 @@ def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, 
     low = focal * [borders[0][:, 0].max(), borders[2][:, 1].max()]
     high = focal * [borders[1][:, 0].min(), borders[3][:, 1].min()]
     corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
-    inner = min(1.0, _INNER * _growing_radius(coefficients(view)) / corner)
+    inner = min(1.0, 0.99 * _growing_radius(coefficients(view)) / corner)
     low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
+    # The image extends beyond the original by at most half of each side.
+    max_growth, rounding_px = 0.5, 1e-6
     if centred:
-        reach = np.minimum(np.minimum(-low, high), np.array([width, height]) * (0.5 + _MAX_GROWTH))
-        size = np.floor(2.0 * reach + _ROUNDING_PX).astype(np.int64) + 1
+        reach = np.minimum(np.minimum(-low, high), np.array([width, height]) * (0.5 + max_growth))
+        size = np.floor(2.0 * reach + rounding_px).astype(np.int64) + 1
         K[:2, 2] = (size - 1) / 2
     else:
-        centre, growth = original[:2, 2], _MAX_GROWTH * np.array([width, height])
-        first = np.ceil(np.maximum(low + centre, -growth) - _ROUNDING_PX)
-        last = np.floor(np.minimum(high + centre, np.array([width, height]) - 1 + growth) + _ROUNDING_PX)
+        centre, growth = original[:2, 2], max_growth * np.array([width, height])
+        first = np.ceil(np.maximum(low + centre, -growth) - rounding_px)
+        last = np.floor(np.minimum(high + centre, np.array([width, height]) - 1 + growth) + rounding_px)
         size = (last - first).astype(np.int64) + 1
         K[:2, 2] = centre - first
-    if not (np.isfinite(K).all() and size.min() >= _MIN_SIDE_PX):
+    if not (np.isfinite(K).all() and size.min() >= 16):
         k = ", ".join(f"{value:.3g}" for value in coefficients(view))
         place = f"distortion {k}, principal point {original[0, 2]:.0f}, {original[1, 2]:.0f}"
         raise UsageError(
@@ -357,7 +349,8 @@ def _write_images(
     def write(i: int) -> bool:
         (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
         pinhole_K, pinhole_size = calibration(pinholes.views[i])
-        with _budget.reserve(_WORKING_BYTES * (math.prod(size) + math.prod(pinhole_size))):
+        # Measured: 17 bytes per pixel of the original and of the result.
+        with _budget.reserve(17 * (math.prod(size) + math.prod(pinhole_size))):
             (image,) = read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
             if image.size != size:
                 rule = rotation_words(model.as_stored)

@@ -25,17 +25,8 @@ from thesisrecon.records import Similarity
 from thesisrecon.results import SUMMARY, RunResult, SparseModel
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
 
-_MAX_TRIPLES = 1000
-"""All triples up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong."""
 _INLIER_SIGMAS = 3.37
 """99 % of the lengths of three-dimensional normal residuals are shorter."""
-_MIN_WIDTH_REL = 1e-3
-"""Smallest spread of the positions across their main direction, as a fraction of the spread along it."""
-_ROUNDING_REL = 1e-9
-"""Residuals below this fraction of the extent are rounding."""
-_PARAMETERS = 7
-_MAX_SPREAD_DEG, _FAR_SPREADS = 0.1, 100.0
-"""Degrees: sites are smaller than 11 km and far from (0, 0); lengths of this kind are of a rig of 10 cm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +164,8 @@ def _require_lengths(positions: F64) -> None:
     spread = float(np.quantile(np.abs(positions[:, :2] - centre), 0.75, axis=0).max())
     first, second = np.abs(positions[:, :2]).max(axis=0)
     inside = max(first, second) <= 180.0 and min(first, second) <= 90.0
-    if inside and spread < _MAX_SPREAD_DEG and float(np.linalg.norm(centre)) > _FAR_SPREADS * spread:
+    # Sites are smaller than 0.1 degrees (11 km) and far from (0, 0); lengths of this kind: a rig of 10 cm.
+    if inside and spread < 0.1 and float(np.linalg.norm(centre)) > 100.0 * spread:
         raise UsageError(
             "the positions look like latitude and longitude in degrees, which are no lengths; give a file "
             "whose header names the columns lat, lon and alt, or subtract an offset if they are lengths"
@@ -183,7 +175,7 @@ def _require_lengths(positions: F64) -> None:
 def _require_width(points: F64, what: str, sigma: float) -> None:
     """Require points off a line by more than their noise: the rotation about the line is free otherwise."""
     along, across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2] / math.sqrt(len(points))
-    if across <= max(_MIN_WIDTH_REL * along, sigma):
+    if across <= max(1e-3 * along, sigma):
         spread = f"RMS {across:.3g} across the line, {along:.3g} along it, noise {sigma:.2g}"
         raise UsageError(
             f"the {what} of the {len(points)} images lie on one line ({spread}), which leaves the rotation "
@@ -194,7 +186,8 @@ def _require_width(points: F64, what: str, sigma: float) -> None:
 def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity, B8, float]:
     """Similarity, inliers and noise of one coordinate."""
     n = len(source)
-    floor = _ROUNDING_REL * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
+    # Residuals below are rounding.
+    floor = 1e-9 * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
 
     def distances(found: Similarity) -> F64:
         return np.asarray(np.linalg.norm(found.apply(source) - target, axis=1))
@@ -219,7 +212,7 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
     for _ in range(20):
         _require_width(target[inlier], "positions", 0.0)
         best = estimate_similarity(source[inlier], target[inlier])
-        free = 3 * int(inlier.sum()) - _PARAMETERS
+        free = 3 * int(inlier.sum()) - 7
         sigma = math.sqrt(float(np.sum(distances(best)[inlier] ** 2)) / free)
         before, inlier = inlier, distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
         if inlier.sum() < 3 or (inlier == before).all():
@@ -229,10 +222,11 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
 
 
 def _triples(n: int, seed: int) -> list[list[int]]:
-    if math.comb(n, 3) <= _MAX_TRIPLES:
+    # All up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong.
+    if math.comb(n, 3) <= 1000:
         return [list(triple) for triple in combinations(range(n), 3)]
     rng = np.random.default_rng(seed)
-    return [rng.choice(n, 3, replace=False).tolist() for _ in range(_MAX_TRIPLES)]
+    return [rng.choice(n, 3, replace=False).tolist() for _ in range(1000)]
 
 
 def scaled(

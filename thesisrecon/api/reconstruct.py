@@ -22,9 +22,6 @@ from thesisrecon.pipeline.matching import FromImages
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Progress, Run, RunOptions, start_run
 
-_MAX_LISTED = 5
-"""Files left out for one reason that are listed one by one in the warnings."""
-
 
 def reconstruct(
     images: ImageSource,
@@ -175,13 +172,13 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
 
 
 def _refusals(refused: Mapping[str, str]) -> list[str]:
-    """A warning about each file that is left out, and one about many of the same reason."""
+    """A warning about each file that is left out, and one about more than five of the same reason."""
     names: dict[str, list[str]] = {}
     for name, reason in refused.items():
         names.setdefault(reason, []).append(name)
     found: list[str] = []
     for reason, files in names.items():
-        if len(files) > _MAX_LISTED:
+        if len(files) > 5:
             found.append(Notice("files-left-out", files[0], len(files) - 1, reason))
         else:
             found += [Notice("image-left-out", name, reason) for name in files]

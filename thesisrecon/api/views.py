@@ -32,12 +32,6 @@ from thesisrecon.views.tensor_synthesis import TensorSynthesis, prepare_synthesi
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
-_MIN_SIDE = 64
-"""Smaller images are not reduced."""
-_MIN_CONFIDENCE = 0.3
-"""Minimum confidence of the disparities from which the largest one is estimated."""
-_MAX_ROLL_DEG = 90.0
-"""Largest rotation of the images against each other: halfway, views show 0.7 of the field of view."""
 _SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
@@ -135,10 +129,10 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
 def _largest_disparity(left: U8 | F32, right: U8 | F32, config: PipelineConfig) -> float:
     """Estimate the largest disparity (px), with a margin, from the pair at a quarter of its size."""
     widest = 0.5 * float(left.shape[1])
-    if min(left.shape[:2]) < _MIN_SIDE:
+    if min(left.shape[:2]) < 64:
         return widest
     found = config.dense.match_rectified(_reduced(left), _reduced(right), max_disparity_px=widest / _COARSE)
-    sure = found.disparity[np.isfinite(found.disparity) & (found.confidence > _MIN_CONFIDENCE)]
+    sure = found.disparity[np.isfinite(found.disparity) & (found.confidence > 0.3)]
     if len(sure) == 0:
         return widest
     return min(widest, _COARSE * (1.05 * float(np.quantile(sure, 0.999)) + 2.0))
@@ -176,8 +170,9 @@ def prepare_pair(
             raise
         raise StageFailure(failure.reason, failure.evidence, _SIDE_BY_SIDE) from None
     assert isinstance(dense.frame, PlanarRectification)
-    if abs(roll := roll_between(dense.frame.H, first.size)) > _MAX_ROLL_DEG:
-        evidence = f"by {abs(roll):.0f} degrees, at most {_MAX_ROLL_DEG:.0f} leave views between them"
+    # Halfway, views then show 0.7 of the field of view.
+    if abs(roll := roll_between(dense.frame.H, first.size)) > 90.0:
+        evidence = f"by {abs(roll):.0f} degrees, at most 90 leave views between them"
         raise StageFailure("the images are rolled against each other", evidence, "turn one of them upright")
     return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
 

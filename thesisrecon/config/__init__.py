@@ -61,9 +61,6 @@ from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets
 from thesisrecon.surface.model import SurfaceModel
 
-PRECISE_SIGMAS = 2.5
-"""Inlier gate of the default estimator: tracks are built from precise matches only."""
-
 # Stage -> word in text -> class. A new method is one line here.
 KINDS: Mapping[str, Mapping[str, type[Any]]] = {
     "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
@@ -352,9 +349,8 @@ class PipelineConfig:
     features: Detector = field(default_factory=MultiScaleCorners)
     pairs: PairSelector = field(default_factory=OverlapEstimate)
     matching: Matcher = field(default_factory=SeedsAndGrowth)
-    epipolar: FundamentalEstimator = field(
-        default_factory=lambda: LocallyOptimisedRansac(inlier_sigmas=PRECISE_SIGMAS)
-    )
+    # Tracks are built from precise matches only.
+    epipolar: FundamentalEstimator = field(default_factory=lambda: LocallyOptimisedRansac(inlier_sigmas=2.5))
     verification: Verifier = field(default_factory=PairVerification)
     tracks: TrackBuilder = field(default_factory=AlignedTracks)
     projective: ProjectiveReconstructor = field(default_factory=IncrementalProjective)

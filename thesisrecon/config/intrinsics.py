@@ -21,8 +21,6 @@ Mode = Literal["known", "constant", "free"]
 
 _OF_COLUMN = ("focal", "aspect", "skew", "principal_point", "principal_point", "k1")
 """Mode setting of each column."""
-_MAX_CENTRE_OFFSET = 1.0
-"""Largest distance of a principal point from the image border, in long sides (crops may exclude it)."""
 _STD_SETTINGS = {
     "focal_std_rel": "focal",
     "aspect_std": "aspect",
@@ -198,7 +196,7 @@ def _check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int,
     x, y = options.principal_point_px
     for width, height in dict.fromkeys(original_sizes):
         outside = max(-x, x - width, -y, y - height)
-        if outside > _MAX_CENTRE_OFFSET * max(width, height):
+        if outside > max(width, height):
             where = f"{outside:.0f} px outside an image of {width} x {height} px, more than its long side"
             advice = "Give it in pixels of the original images"
             raise UsageError(f"principal_point_px = ({x:g}, {y:g}) is {where}. {advice}")

@@ -34,8 +34,6 @@ Pairs = str | Path | Sequence[Sequence[str]]
 Settings = Mapping[str, Any] | Sequence[str]
 """``{"stage.field": value}``, or texts ``stage.field=value``."""
 _NONE, _KIND = "none", "kind"
-_MAX_DEPTH = 16
-"""Maximum nesting of a setting, from its stage to its field."""
 
 
 def build_config(
@@ -225,7 +223,7 @@ def tables_from_settings(settings: Settings) -> Table:
     items = settings.items() if isinstance(settings, Mapping) else (_parse_setting(text) for text in settings)
     for place, value in items:
         path = place.strip().split(".") if isinstance(place, str) else []
-        if not 2 <= len(path) <= _MAX_DEPTH or not all(path):
+        if not 2 <= len(path) <= 16 or not all(path):
             example = "for example features.kind=harris-corners"
             option = "set" if isinstance(settings, Mapping) else "--set"
             raise UsageError(f"{option} takes stage.field=value, {example}; got {in_words(place)}")
