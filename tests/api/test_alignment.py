@@ -68,7 +68,7 @@ def test_wrong_positions_are_found_and_the_noise_is_measured(count, wrong, seed)
 def test_the_report_states_the_residual_of_each_position():
     model = make_model(5)
     positions = true_positions(model)
-    positions["2.jpg"] = positions["2.jpg"] + [0.0, 3.0, 4.0]
+    positions["2.jpg"] += [0.0, 3.0, 4.0]
     _, report = align_to_positions(model, positions)
     assert "2.jpg: 5  (outlier, not used)" in str(report)
     assert report.distance[2] == pytest.approx(5.0)
@@ -78,22 +78,21 @@ def test_too_few_and_collinear_positions_are_refused():
     model = make_model(6)
     positions = true_positions(model)
     few = {name: positions[name] for name in ("0.jpg", "1.jpg")}
-    with pytest.raises(UsageError, match=r"at least 3 images; got 2; 'x.jpg' is not an image of the model"):
-        align_to_positions(model, few | {"x.jpg": np.zeros(3)})
+    words = "at least 3 images; got 2; 'x.jpg' is not an image of the model"
+    refuses(UsageError, words, align_to_positions, model, few | {"x.jpg": np.zeros(3)})
     for wrong in ([0.0, np.nan, 1.0], [0.0, 1.0], 3.0, "0 1 2", None):
-        with pytest.raises(UsageError, match="three finite coordinates"):
-            align_to_positions(model, positions | {"0.jpg": wrong})
+        bad = positions | {"0.jpg": wrong}
+        refuses(UsageError, "three finite coordinates", align_to_positions, model, bad)
     line = [SparseView(f"{i}.jpg", np.eye(3), np.array([float(i), 0, 0])) for i in range(6)]
-    with pytest.raises(UsageError, match="camera centres of the 6 images lie on one line"):
-        align_to_positions(SparseModel(line), positions)
-    with pytest.raises(UsageError, match="the positions of the 6 images lie on one line"):
-        align_to_positions(model, {f"{i}.jpg": [1.0 * i, 2.0 * i, 0.0] for i in range(6)})
+    words = "camera centres of the 6 images lie on one line"
+    refuses(UsageError, words, align_to_positions, SparseModel(line), positions)
+    on_line = {f"{i}.jpg": [1.0 * i, 2.0 * i, 0.0] for i in range(6)}
+    refuses(UsageError, "the positions of the 6 images lie on one line", align_to_positions, model, on_line)
     # A street: beside its line there is only noise.
     rng = np.random.default_rng(1)
     street = [SparseView(v.name, v.R, v.t + rng.normal(0, 0.02, 3)) for v in line]
     noisy = {view.name: view.centre + rng.normal(0, 0.05, 3) for view in line}
-    with pytest.raises(UsageError, match="rotation about it undetermined"):
-        align_to_positions(SparseModel(street), noisy)
+    refuses(UsageError, "rotation about it undetermined", align_to_positions, SparseModel(street), noisy)
 
 
 def test_a_known_distance_gives_the_scale():

@@ -75,16 +75,13 @@ def test_a_biased_focal_length_is_not_reported_without_a_reason():
 def test_cameras_without_points_are_checked_for_critical_motions():
     rng = np.random.default_rng(0)
     K = np.tile(np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]]), (6, 1, 1))
-    P = compose_camera(
-        K, np.tile(np.eye(3), (6, 1, 1)), rng.normal(0.0, 1.0, (6, 3)) + np.array([0.0, 0.0, 5.0])
-    )
+    t = rng.normal([0.0, 0.0, 5.0], 1.0, (6, 3))
+    P = compose_camera(K, np.tile(np.eye(3), (6, 1, 1)), t)
     found = thesisrecon.self_calibrate(P @ G, (640, 480), method="nonlinear-quadric")
     assert not found.identifiable
     assert "pure translation" in found.reasons[0]
-    refuses(
-        StageFailure, "the cameras come without points; give xy", thesisrecon.self_calibrate,
-        P @ G, (640, 480), method="stratified",
-    )  # fmt: skip
+    words, given = "the cameras come without points; give xy", {"method": "stratified"}
+    refuses(StageFailure, words, thesisrecon.self_calibrate, P @ G, (640, 480), **given)
 
 
 @pytest.mark.parametrize("views", [3, 8])
@@ -125,15 +122,10 @@ def test_vanishing_points_give_the_plane_at_infinity(views):
         plane = thesisrecon.plane_at_infinity(scene.P @ G, scene.sizes, vanishing_points=given)
         assert np.abs(plane * np.sign(plane @ TRUE_PLANE) - TRUE_PLANE).max() < 1e-7
     v[1:, 2:] = np.nan
-    refuses(
-        StageFailure, "three directions of parallel lines; 2 have", thesisrecon.plane_at_infinity,
-        scene.P @ G, scene.sizes, vanishing_points=v,
-    )  # fmt: skip
     flat = np.einsum("vij,dj->vdi", scene.P[:, :, :3], [[1.0, 0, 0], [0, 1, 0], [1, 1, 0]])
-    refuses(
-        StageFailure, "lie in one plane", thesisrecon.plane_at_infinity,
-        scene.P @ G, scene.sizes, vanishing_points=flat,
-    )  # fmt: skip
+    locate, given = thesisrecon.plane_at_infinity, (scene.P @ G, scene.sizes)
+    refuses(StageFailure, "three directions of parallel lines; 2 have", locate, *given, vanishing_points=v)
+    refuses(StageFailure, "lie in one plane", locate, *given, vanishing_points=flat)
 
 
 def test_vanishing_points_without_a_baseline_are_refused():
@@ -196,7 +188,5 @@ def test_the_way_out_of_a_wrong_call_is_named():
     refuses(ValueError, way_out, thesisrecon.self_calibrate, metric)
     refuses(ValueError, "needs the sizes", thesisrecon.self_calibrate, scene.P)
     refuses(ValueError, "stratum='projective'", thesisrecon.upgrade_affine, scene.P)
-    refuses(
-        ValueError, "unknown method 'kruppa-equation'; did you mean kruppa-equations",
-        thesisrecon.self_calibrate, scene.P, scene.sizes, method="kruppa-equation",
-    )  # fmt: skip
+    words = "unknown method 'kruppa-equation'; did you mean kruppa-equations"
+    refuses(ValueError, words, thesisrecon.self_calibrate, scene.P, scene.sizes, method="kruppa-equation")

@@ -147,25 +147,19 @@ def test_cameras_are_paired_by_name_stem_and_order(truth):
     assert found.names_b == tuple(name for name in truth.names[1:] if name != "0005.jpg")
     times = [f"{k}.25" for k in range(14)]
     trajectory = renamed(truth, times, K=None, size=None)
-    assert compare_models(renamed(truth, [f"rgb/{name}.png" for name in times]), trajectory).names_b == tuple(
-        times
-    )
+    in_folder = renamed(truth, [f"rgb/{name}.png" for name in times])
+    assert compare_models(in_folder, trajectory).names_b == tuple(times)
     found = compare_models(trajectory, truth)
     assert found.names_b == tuple(truth.names)
     assert np.isnan(found.focal_error_rel).all()
     assert "focal_error_rel" not in found.summary
-    refuses(
-        UsageError,
-        r"no common camera: '0.25', '1.25', '2.25' and 11 more in the first and '0000.jpg'",
-        compare_models, trajectory, SparseModel(truth.views[:2]),
-    )  # fmt: skip
+    words = "no common camera: '0.25', '1.25', '2.25' and 11 more in the first and '0000.jpg'"
+    refuses(UsageError, words, compare_models, trajectory, SparseModel(truth.views[:2]))
 
 
 def test_too_few_cameras_and_cameras_on_a_line_are_compared_as_far_as_possible(truth):
     two = compare_models(truth, SparseModel(truth.views[:2]))
-    assert two.notes == (
-        "2 common cameras cannot be aligned, at least 3 are needed; rotations and intrinsics are compared",
-    )
+    assert two.notes[0].startswith("2 common cameras cannot be aligned, at least 3 are needed")
     assert two.similarity is None
     assert list(two.summary) == ["rotation_error_deg", "focal_error_rel", "principal_point_error_px"]
     one = compare_models(truth, SparseModel(truth.views[:1]))
@@ -186,17 +180,13 @@ def test_too_few_cameras_and_cameras_on_a_line_are_compared_as_far_as_possible(t
 def test_intrinsics_are_compared_at_the_size_of_the_second_model():
     K, half = np.array([[500.0, 0, 300], [0, 500, 200], [0, 0, 1]]), np.diag([0.5, 0.5, 1.0])
     half[:2, 2] = -0.25
-    a, b = (
-        SparseModel([SparseView("a", np.eye(3), np.zeros(3), M, size)])
-        for M, size in ((half @ K, (SIZE[0] // 2, SIZE[1] // 2)), (K, SIZE))
-    )
-    found = compare_models(a, b)
+    sizes = ((half @ K, (SIZE[0] // 2, SIZE[1] // 2)), (K, SIZE))
+    models = [SparseModel([SparseView("a", np.eye(3), np.zeros(3), *one)]) for one in sizes]
+    found = compare_models(*models)
     assert (abs(found.focal_error_rel[0]), found.principal_point_error_px[0]) < (1e-12, 1e-9)
 
 
 def test_the_table_is_plain(truth):
     table = compare_models(changed(truth, noisy), truth).as_table()
-    assert (
-        json.loads(json.dumps(table, default=lambda value: value.tolist()))["cameras"][2]["name"]
-        == "0002.jpg"
-    )
+    plain = json.loads(json.dumps(table, default=lambda value: value.tolist()))
+    assert plain["cameras"][2]["name"] == "0002.jpg"

@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -68,60 +67,65 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
 
 def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
-    refuses(ValueError, "between 0", thesisrecon.interpolate_view, left, right, 1.5)
-    refuses(ValueError, "the same size", thesisrecon.interpolate_view, left, right[:-3], 0.5)
-    refuses(ValueError, "uint8", thesisrecon.interpolate_view, left.astype(float), right, 0.5)
-    with pytest.raises(ValueError, match="shape of the images"):
-        thesisrecon.interpolate_view(left, right, 0.5, disparity=np.zeros((3, 4), np.float32))
-    d = np.zeros(left.shape[:2], np.float32)
-    odd: Any
-    for odd in ([d, d], d[..., None]):
-        with pytest.raises(ValueError, match=r"\(H, W\), or a tuple"):
-            thesisrecon.interpolate_view(left, right, 0.5, disparity=odd)
-    refuses(UsageError, "no image file", thesisrecon.interpolate_view, Path("nowhere.png"), right, 0.5)
+    d, small = np.zeros(left.shape[:2], np.float32), np.zeros((3, 4), np.float32)
+    for error, words, *images, s, disparity in (
+        (ValueError, "between 0", left, right, 1.5, None),
+        (ValueError, "the same size", left, right[:-3], 0.5, None),
+        (ValueError, "uint8", left.astype(float), right, 0.5, None),
+        (ValueError, "shape of the images", left, right, 0.5, small),
+        (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, [d, d]),
+        (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, d[..., None]),
+        (UsageError, "no image file", Path("nowhere.png"), right, 0.5, None),
+    ):
+        refuses(error, words, thesisrecon.interpolate_view, *images, s, disparity=disparity)
 
 
 def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
     a, b = photograph(0), photograph(1)
-    with pytest.raises(UsageError, match=r"0\.jpg and 0\.jpg are the same image"):
-        between.prepare_pair(a, Image("0.jpg", a.rgb.copy(), a.size))
-    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
-        between.prepare_pair(a, photograph(2, (40, 20)))
+    copy, small = Image("0.jpg", a.rgb.copy(), a.size), photograph(2, (40, 20))
+    sizes = r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"
+    refuses(UsageError, r"0\.jpg and 0\.jpg are the same image", between.prepare_pair, a, copy)
+    refuses(UsageError, sizes, between.prepare_pair, a, small)
     refuses(UsageError, "same image", interpolated_sequence, [a, b, a], 3)
-    with pytest.raises(UsageError, match=r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"):
-        interpolated_sequence([a, b, photograph(2, (40, 20))], 3)
+    refuses(UsageError, sizes, interpolated_sequence, [a, b, small], 3)
     # Forward motion: both epipoles at (21, 14).
     e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
     xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
     ahead = e + rng.uniform(1.05, 1.3, (100, 1)) * (xy - e)
     pair = SimpleNamespace(F=cross_matrix(np.append(e, 1.0)), xy1=xy, xy2=ahead)
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
-    with pytest.raises(
-        StageFailure, match=r"moved towards the scene or away from it; .*\(21, 14\) px, inside 0\.jpg"
-    ):
-        between.prepare_pair(a, b)
+    words = r"moved towards the scene or away from it; .*\(21, 14\) px, inside 0\.jpg"
+    refuses(StageFailure, words, between.prepare_pair, a, b)
     # An image and its copy: any F fits.
     pair.xy2 = xy + rng.normal(0.0, 0.01, xy.shape)
     refuses(StageFailure, "no parallax", between.prepare_pair, a, b)
 
 
-def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch):
-    class Dense:
-        failure = StageFailure("too distorted", "a number", "rectify in polar coordinates")
-
-        def match_two_views(self, *_, **__):
-            raise self.failure
-
-    F = cross_matrix(np.array([1.0, 0.0, 0.0]))
-    pair = SimpleNamespace(F=F, xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)))
+def sideways(monkeypatch, match_two_views):
+    """Matches of a sideways motion, and this dense matcher."""
+    pair = SimpleNamespace(
+        F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2))
+    )
     monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
-    config = PipelineConfig()
-    monkeypatch.setattr(MultiViewStereo, "match_two_views", Dense.match_two_views)
-    monkeypatch.setattr(MultiViewStereo, "failure", Dense.failure, raising=False)
-    with pytest.raises(StageFailure, match=r"too distorted; a number; take the images side by side"):
-        between.prepare_pair(photograph(0), photograph(1), config=config)
-    monkeypatch.setattr(MultiViewStereo, "failure", StageFailure("no parallax"))
-    refuses(StageFailure, "no parallax", between.prepare_pair, photograph(0), photograph(1), config=config)
+    monkeypatch.setattr(MultiViewStereo, "match_two_views", match_two_views)
+
+
+@pytest.mark.parametrize(
+    ("failure", "words"),
+    [
+        (
+            StageFailure("too distorted", "a number", "rectify in polar coordinates"),
+            "a number; take the images side",
+        ),
+        (StageFailure("no parallax"), "no parallax"),
+    ],
+)
+def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch, failure, words):
+    def match_two_views(*_, **__):
+        raise failure
+
+    sideways(monkeypatch, match_two_views)
+    refuses(StageFailure, words, between.prepare_pair, photograph(0), photograph(1))
 
 
 @pytest.mark.parametrize(
@@ -134,17 +138,12 @@ def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeyp
     turn[:2, 2] = middle - turn[:2, :2] @ middle
     known = DisparityMap(np.zeros((30, 40), np.float32), np.ones((30, 40), np.float32), 0.2)
     frame = PlanarRectification(np.stack([np.eye(3), turn]), (40, 30))
-    dense = SimpleNamespace(frame=frame, left=known, right=known)
-    pair = SimpleNamespace(
-        F=cross_matrix(np.array([1.0, 0.0, 0.0])), xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2))
-    )
-    monkeypatch.setattr(between, "match_pair", lambda *_, **__: pair)
-    monkeypatch.setattr(MultiViewStereo, "match_two_views", lambda *_, **__: dense)
+    sideways(monkeypatch, lambda *_, **__: SimpleNamespace(frame=frame, left=known, right=known))
     if possible:
         assert between.prepare_pair(photograph(0), photograph(1)).view(0.5).shape == (30, 40, 3)
         return
-    with pytest.raises(StageFailure, match=f"rolled against each other; by {degrees:.0f} degrees"):
-        between.prepare_pair(photograph(0), photograph(1))
+    words = f"rolled against each other; by {degrees:.0f} degrees"
+    refuses(StageFailure, words, between.prepare_pair, photograph(0), photograph(1))
 
 
 def test_records_are_matched_at_their_own_size_and_without_masked_pixels():
@@ -243,17 +242,13 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words", "code"),
     [
-        (["0004.jpg", "0004.jpg"], "is given twice", 2),
         (["0004.jpg", "copy.jpg"], "0004.jpg and copy.jpg are the same image", 2),
-        (["0004.jpg", "nowhere.jpg"], "there is no image file", 2),
         (["0004.jpg", "text.jpg"], "text.jpg is not an image", 3),
         (["0004.jpg", "small.jpg"], "the same size; 0004.jpg is 1024 x 768 and small.jpg is 512 x 384 px", 2),
         (["0004.jpg", "noise.png", "--max-size", "256"], "do not match", 3),
         (["0004.jpg"], "2 or 3 images; got 1", 2),
-        (["0004.jpg", "folder"], "is a folder", 2),
         (["0000.jpg", "0001.jpg", "0002.jpg", "0003.jpg"], "2 or 3 images; got 4", 2),
         (["0004.jpg", "0005.jpg", "--path", "orbit"], "--path", 2),
-        (["0004.jpg", "0005.jpg", "--frames", "0"], "'--frames'", 2),
         (["0004.jpg", "0005.jpg", "--max-size", "9"], "--max-size takes at least 64 px", 2),
         (["0004.jpg", "0005.jpg", "--method", "guessing"], "--method", 2),
         (["folder", "0004.jpg"], "is a folder", 2),
