@@ -17,17 +17,6 @@ from thesisrecon import reconstruct
 from thesisrecon.io._images import demo_images
 reconstruct(demo_images(), sys.argv[1], until="metric", max_size=480, threads=1)
 """
-SEEN = """
-import ctypes
-import scipy.linalg
-from numba.core.registry import cpu_target
-_, cpu, features = cpu_target.target_context.codegen().magic_tuple()
-print(cpu, "+avx512f" in features)
-for path in sorted({line.split()[-1] for line in open("/proc/self/maps") if "libscipy_openblas" in line}):
-    get = getattr(ctypes.CDLL(path), "scipy_openblas_get_corename" + "64_" * ("openblas64_" in path))
-    get.restype = ctypes.c_char_p
-    print(get().decode())
-"""
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(len(processors()) == 1, reason="this processor acts as no other"),
@@ -47,17 +36,6 @@ def runs(tmp_path_factory):
     for name in processors():
         _python(name, RUN, folder / name)
     return {name: load(folder / name) for name in processors()}
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_the_variables_choose_the_machine_code():
-    seen = {name: _python(name, SEEN).split() for name in processors()}
-    assert len(set(map(tuple, seen.values()))) == len(seen) or seen[NATIVE][0] == "haswell", seen
-    assert seen["sse2"][:2] == ["generic", "False"]
-    # Prescott's code has the name of the first processor that it serves.
-    assert set(seen["sse2"][2:]) <= {"Prescott", "Katmai"}
-    if "avx2" in seen:
-        assert set(seen["avx2"]) == {"haswell", "False", "Haswell"}
 
 
 def _observed(run):

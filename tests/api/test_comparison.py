@@ -1,4 +1,4 @@
-"""Comparison of models: known changes are found, and validation and pycolmap find the same."""
+"""Comparison of models: known changes are found, and pycolmap finds the same."""
 
 import json
 from dataclasses import replace
@@ -9,13 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
-from tests.io.test_colmap import NAMES, SIZE, export, scene
+from tests.io.test_colmap import SIZE
 from thesisrecon import Camera, RunResult, UsageError, compare_models
 from thesisrecon.io._models import read_model
 from thesisrecon.records import Similarity
 from thesisrecon.results import SparseModel, SparseView
-from validation.metrics.cameras import TrueCameras, measure_cameras
-from validation.references.colmap_reading import read_colmap_model
 
 TRUTH = Path(__file__).parents[2] / "fixtures" / "courtyard" / "cameras.json"
 WORLD = Similarity(0.3, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), np.array([5.0, -3.0, 8.0]))
@@ -67,24 +65,6 @@ def test_known_changes_of_intrinsics_and_poses_are_found(truth):
     assert 1.7 < found.rotation_error_deg[3] < 2.0
     assert found.centre_error.max() < 1e-12
     assert found.summary["rotation_error_deg"]["max"] == found.rotation_error_deg[3]
-
-
-def test_validation_measures_the_same(tmp_path):
-    """A COLMAP model of the noisy courtyard, read by both."""
-    ours = scene(k=(-0.1, 0.0, 0.0))
-    export(tmp_path, ours, scale=1.0)
-    names = [name for name, there in zip(NAMES, ours.registered, strict=True) if there]
-    true = changed(read_model(tmp_path), noisy)
-    found = compare_models(tmp_path, true)
-    K, R, C = (np.array([getattr(view, key) for view in true.views]) for key in ("K", "R", "centre"))
-    theirs = measure_cameras(read_colmap_model(tmp_path, names), TrueCameras(K, R, C))
-    summary = found.summary
-    assert summary["centre_error"]["mean"] == pytest.approx(theirs.centre_error, rel=1e-9)
-    assert summary["rotation_error_deg"]["median"] == pytest.approx(theirs.rotation_error_deg, rel=1e-9)
-    assert 100 * summary["focal_error_rel"]["median"] == pytest.approx(theirs.focal_error_pct, rel=1e-9)
-    offset = summary["principal_point_error_px"]["median"]
-    assert offset == pytest.approx(theirs.principal_point_error_px, rel=1e-9)
-    assert min(summary["focal_error_rel"]["median"], summary["centre_error"]["mean"]) > 1e-3
 
 
 @pytest.mark.references

@@ -1,4 +1,4 @@
-"""Validation with damaged COLMAP models, cameras, reports and studies."""
+"""Validation with damaged COLMAP models and cameras."""
 
 import json
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.bad_input import files
-from tests.bad_input.files import links, pipe, sparse, writes
 from tests.io.test_colmap import NAMES, export, scene
 
 pytestmark = pytest.mark.usefixtures("bounded")
@@ -52,23 +51,3 @@ def test_a_truth_of_wrong_types_is_refused(text, tmp_path, validated):
     (tmp_path / "cameras.json").write_text(text, encoding="utf-8")
     said = validated(["report", "-o", str(tmp_path / "out"), "--images", str(tmp_path)])
     assert "cameras.json does not hold cameras; it must " in said
-
-
-STUDIES = [
-    (pipe, "cannot be read: it is a pipe"),
-    (links("/dev/zero"), "cannot be read: it is a pipe, a device"),
-    (sparse(10**13), "cannot be read: it is larger"),
-    (writes(f"a = {'[' * 50_000}"), "is not TOML"),
-    (writes("title = 3"), "title takes text; got 3"),
-    (writes("scenes = 3\naxes = 4"), "axes takes a table"),
-    (writes("scenes = [3]\npreset = []\n[axes]"), "unknown preset []"),
-    (writes("scenes = ['a']\nconfig = 3\n[axes]"), "config takes a table"),
-    (writes("scenes = ['a']\nmetrics = [3]\n[axes]"), "a metric is a name"),
-]
-
-
-@pytest.mark.parametrize(("make", "words"), STUDIES, ids=[str(k) for k in range(len(STUDIES))])
-def test_an_invalid_study_is_rejected(make, words, tmp_path, validated):
-    make(tmp_path / "study.toml")
-    command = ["ablate", str(tmp_path / "study.toml"), "-o", str(tmp_path / "out"), "--plan"]
-    assert words in validated(command)

@@ -7,9 +7,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 import thesisrecon
@@ -137,17 +135,6 @@ def block(page, number=0):
 
 def test_the_example_of_the_conventions_runs():
     exec(compile(block("reference/conventions.md"), "conventions.md", "exec"), {})
-
-
-def test_points_are_undistorted_as_the_page_of_exports_shows(monkeypatch):
-    K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
-    camera = thesisrecon.Camera(K, np.eye(3), np.ones(3), (640, 480), distortion=(0.1, 0.0, 0.0))
-    monkeypatch.setattr(thesisrecon, "load", lambda _: SimpleNamespace(cameras={"0000.jpg": camera}))
-    names = {}
-    exec(compile(block("recipes/export.md", 1), "export.md", "exec"), names)
-    back = camera.project(names["pinhole"].unproject(names["undistorted"], np.ones(2)))
-    assert np.allclose(back, names["xy"])
-    assert np.abs(names["undistorted"] - names["xy"]).max() > 1.0
 
 
 @pytest.mark.slow

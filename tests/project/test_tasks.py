@@ -19,10 +19,6 @@ FOCAL_PX = 908.6
 pytestmark = pytest.mark.slow
 
 
-def lines_of(code):
-    return [line for line in code.splitlines() if line.strip() and not re.match(r"(from|import) ", line)]
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """A folder with images, a finished run, and a COLMAP model and database of the same images."""
@@ -50,11 +46,6 @@ def finished(place):
         names = run("Images to cameras, and a projected point", place, patch)
     shutil.copytree(place / "out" / "sparse", place / "sparse", dirs_exist_ok=True)
     return names
-
-
-def test_there_are_ten_tasks_of_ten_lines_at_most():
-    assert len(BLOCKS) == 10
-    assert {title: len(lines_of(code)) for title, code in BLOCKS.items() if len(lines_of(code)) > 10} == {}
 
 
 def test_images_give_cameras_and_a_projected_point(finished):
