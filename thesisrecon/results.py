@@ -31,8 +31,6 @@ from thesisrecon.records import (
 )
 
 SUMMARY = "summary.json"
-POSE_NAMES = ("rotation_x_deg", "rotation_y_deg", "rotation_z_deg", "centre_x", "centre_y", "centre_z")
-"""Names of the standard deviations of a pose in :attr:`thesisrecon.Camera.std`."""
 
 
 class SeenPoints(NamedTuple):
@@ -54,8 +52,9 @@ def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
     """Return the standard deviations of a pose as in :attr:`thesisrecon.Camera.std`, none if unknown."""
     if metric.pose_std is None or not np.isfinite(metric.pose_std[i]).all():
         return {}
-    values = np.concatenate([np.degrees(metric.pose_std[i, :3]), metric.pose_std[i, 3:]])
-    return dict(zip(POSE_NAMES, values.tolist(), strict=True))
+    rotation, centre = np.degrees(metric.pose_std[i, :3]).tolist(), metric.pose_std[i, 3:].tolist()
+    stds = {f"rotation_{axis}_deg": std for axis, std in zip("xyz", rotation, strict=True)}
+    return stds | {f"centre_{axis}": std for axis, std in zip("xyz", centre, strict=True)}
 
 
 def _number_of(image: str | int, images: tuple[Image, ...]) -> int:

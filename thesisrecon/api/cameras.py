@@ -159,7 +159,6 @@ def bundle_adjust(
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
     require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
-    fit = None
     noise = weight = 1.0 if sigma_px is None else sigma_px
     # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
     for last in (True,) if sigma_px is not None else (False, True):
@@ -171,7 +170,6 @@ def bundle_adjust(
         )  # fmt: skip
         fit = refine_metric_bundle(start, X, observed, free=chosen, prior=knowledge, options=options)
         start, X, weight, noise = fit.cameras, fit.X, noise, max(fit.sigma_px, 1e-6)
-    assert fit is not None
     assert fit.pose_covariance is not None
     assert fit.point_covariance is not None
     residual = fit.residual_px
@@ -415,12 +413,6 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     """
     if method is not None and method not in get_args(TriangulationMethod):
         raise ValueError(f"method must be one of {', '.join(get_args(TriangulationMethod))}; got {method!r}")
-    P, xy = _checked_views(P, xy)
-    return triangulate_points(P, xy, method=method)
-
-
-def _checked_views(P: F64, xy: F64) -> tuple[F64, F64]:
-    """Check cameras and pixels and return them as contiguous float64 arrays."""
     if np.iscomplexobj(P) or np.iscomplexobj(xy):
         raise ValueError("triangulate needs real numbers; got complex ones")
     P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
@@ -432,7 +424,7 @@ def _checked_views(P: F64, xy: F64) -> tuple[F64, F64]:
         raise ValueError("triangulate needs cameras that are not all zero")
     if np.isinf(xy).any():
         raise ValueError("triangulate needs finite pixels, or NaN for not seen; some are infinite")
-    return P, xy
+    return triangulate_points(P, xy, method=method)
 
 
 def reconstruction_from_cameras(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -195,7 +196,12 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
     # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.
     rank = (n + 4) // 2
     best, least = None, math.inf
-    for triple in _triples(n, seed):
+    # All up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong.
+    triples: Iterable[Any] = combinations(range(n), 3)
+    if math.comb(n, 3) > 1000:
+        rng = np.random.default_rng(seed)
+        triples = (rng.choice(n, 3, replace=False) for _ in range(1000))
+    for triple in map(list, triples):
         try:
             found = estimate_similarity(source[triple], target[triple])
         except ValueError:
@@ -219,14 +225,6 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
             inlier = before
             break
     return best, inlier, sigma
-
-
-def _triples(n: int, seed: int) -> list[list[int]]:
-    # All up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong.
-    if math.comb(n, 3) <= 1000:
-        return [list(triple) for triple in combinations(range(n), 3)]
-    rng = np.random.default_rng(seed)
-    return [rng.choice(n, 3, replace=False).tolist() for _ in range(1000)]
 
 
 def scaled(
