@@ -13,7 +13,6 @@ from thesisrecon.api.pairs import estimate_trifocal
 from thesisrecon.camera import decompose_camera
 from thesisrecon.epipolar.three_view_estimation import (
     NO_SEGMENTS,
-    _line_moves,
     _minimize_algebraic_error,
     _minimize_reprojection_error,
     _ReprojectionProblem,
@@ -278,13 +277,6 @@ def test_merton_college_is_transferred_into_the_third_view(source):
         of_lines.append(line_transfer_px(fit.T, segments[:, ~s]))
     assert np.median(np.concatenate(of_points)) <= 1.0
     assert np.median(np.concatenate(of_lines)) <= 1.0
-
-
-def test_a_line_follows_each_of_its_ends():
-    ends = np.dstack([np.random.default_rng(0).uniform(-2.0, 2.0, (20, 2, 2)), np.ones((20, 2))])
-    # At an end the line moves by the move of that end and by nothing of the other.
-    at_ends = np.einsum("mkc,mec->mke", _line_moves(ends), ends)
-    np.testing.assert_allclose(at_ends, np.tile(np.eye(2), (20, 1, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize(("n", "m"), [(200, 0), (0, 200)])

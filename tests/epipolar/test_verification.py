@@ -9,15 +9,20 @@ import pytest
 from tests.conftest import refuses
 from tests.epipolar.pairs import SIZE, Pair, make_pair, spoil
 from thesisrecon.api.pairs import estimate_fundamental
+from thesisrecon.epipolar.homography import induced_homographies
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import (
     PairVerification,
-    _plane_homographies,
     homography_inlier_ratio,
 )
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.two_view import fundamental_from_cameras, homography_residuals, sampson_residuals
+from thesisrecon.geometry.two_view import (
+    epipoles,
+    fundamental_from_cameras,
+    homography_residuals,
+    sampson_residuals,
+)
 from thesisrecon.records import FundamentalFit, Matches
 
 
@@ -111,8 +116,9 @@ def test_share_of_a_dominant_plane_is_measured():
 def test_homographies_of_a_plane_from_three_matches():
     pair = make_pair(12, np.random.default_rng(7), planar=True)
     triples = np.array([[0, 1, 2], [3, 4, 5], [6, 6, 7]])
-    H = _plane_homographies(pair.F, pair.xy1, pair.xy2, triples)
-    assert 1 <= len(H) <= 2
+    points = np.hstack([pair.xy1, pair.xy2])
+    H = induced_homographies(pair.F, epipoles(pair.F)[1], points, triples, 1e-2)
+    assert len(H) == 2
     for one in H:
         assert homography_residuals(one, pair.xy1, pair.xy2).max() < 1e-3
 

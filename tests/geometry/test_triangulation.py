@@ -24,7 +24,7 @@ from thesisrecon.geometry.polynomial_triangulation import (
 )
 from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
 from thesisrecon.geometry.triangulation import _jacobi_least, triangulate_observations
-from thesisrecon.geometry.two_view import epipolar_distances, fundamental_from_cameras
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.optimize.bundle.partial import minimize_reprojection
 
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]
@@ -115,22 +115,6 @@ def cost_of_planes(P, xy):
         with np.errstate(divide="ignore"):
             total += ((pixels @ lines[:, :2].T + lines[:, 2]) / size) ** 2
     return np.asarray(total.min(axis=1))
-
-
-@holds_for_every(
-    st.sampled_from(["general", "forward", "short baseline"]), st.sampled_from([0.0, 0.1, 3.0, 50.0])
-)
-def test_the_compiled_polynomial_method_is_its_plain_twin(rng, kind, sigma_px):
-    P, X = two_views(kind, rng)
-    xy = images(P, X)
-    xy = xy + sigma_px * rng.normal(size=xy.shape)
-    F = fundamental_from_cameras(*P)
-    ours, plain = correct_matches(F, *xy), twins.correct_matches(F, *xy)
-    np.testing.assert_allclose(ours, plain, atol=1e-5)
-    cost, least = (np.sum((np.stack(a) - xy) ** 2, axis=(0, 2)) for a in (ours, plain))
-    np.testing.assert_allclose(cost, least, rtol=1e-7, atol=1e-9)
-    if kind == "general":
-        assert epipolar_distances(-3.0 * F, *ours).max() < 1e-8
 
 
 @holds_for_every(st.sampled_from(KINDS))

@@ -234,14 +234,6 @@ def test_noise_is_compared_with_the_projective_residual_not_a_floor():
     assert own.identifiable
 
 
-def test_no_message_states_a_focal_that_the_self_check_may_reject():
-    for motion in (Motion.TURNTABLE, Motion.PLANAR, Motion.TRANSLATION):
-        scene = make_sequence(motion, np.random.default_rng(4), by_hand=True)
-        for sentence in report_at_the_truth(scene).sentences:
-            assert "all the same" not in sentence
-            assert "focal length is known" not in sentence or "if the cameras are" in sentence
-
-
 @pytest.mark.parametrize(
     ("given", "advice"),
     [

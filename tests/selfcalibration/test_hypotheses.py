@@ -12,7 +12,6 @@ from thesisrecon.selfcalibration._candidates import (
     _biased_focal,
     _no_candidate_failure,
     plane_from_focals,
-    select_candidate,
 )
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
@@ -100,20 +99,6 @@ def test_a_focal_without_a_solution_is_named_and_not_requested():
     assert "1 px (+- 5.0%)" in failure.value.evidence
     assert "the images contradict it" in failure.value.advice
     assert "give the focal length" not in str(failure.value)
-
-
-@pytest.mark.parametrize(
-    ("focals", "reported"), [((900.0,), "900 px"), ((800.0, 900.0, 1000.0), "800 to 1000 px")]
-)
-def test_given_focals_without_a_solution_are_named(focals, reported):
-    estimate = projective_reconstruction(make_scene(seed=6), seed=6)
-    prior = prior_for(estimate, IntrinsicsOptions(focal_px=900.0, focal="known", cameras="per-image"))
-    mean = prior.mean.copy()
-    mean[:, 0] = np.resize(focals, len(mean))
-    frame = normalized_frame(estimate, replace(prior, mean=mean))
-    with pytest.raises(StageFailure, match="near the given focal length") as failure:
-        select_candidate(frame, estimate, RotationCriterion(), [], max_candidates=3, min_in_front_ratio=0.9)
-    assert f"{reported} (+-" in failure.value.evidence
 
 
 @pytest.mark.parametrize(

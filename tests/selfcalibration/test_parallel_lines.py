@@ -16,12 +16,10 @@ from thesisrecon.selfcalibration.parallel_lines import (
     ParallelLines,
     VanishingPoints,
     _find_parallel_directions,
-    _fit_segments,
     _normalize_segments,
     _propose_vanishing_points,
     _refine_plane,
     _refined_point,
-    _triangulate_directions,
 )
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import load_fixture_scene
@@ -116,16 +114,6 @@ def test_a_direction_along_the_baseline_is_no_direction():
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
 
-def test_triangulated_points_are_seen_where_they_were():
-    scene = make_scene(seed=4)
-    v = np.einsum("vij,dj->dvi", scene.K @ scene.R, TURN)
-    v /= np.linalg.norm(v, axis=2, keepdims=True)
-    X, determined = _triangulate_directions(np.tile(scene.P / 1500.0, (3, 1, 1, 1)), v)
-    assert determined.all()
-    np.testing.assert_allclose(np.abs(np.sum(X[:, :3] * TURN, axis=1)), 1.0, atol=1e-9)
-    np.testing.assert_allclose(X[:, 3], 0.0, atol=1e-8)
-
-
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
 def test_directions_are_found_among_strays(sigma, stray, limit):
     scene = make_scene(seed=5, views=6)
@@ -177,16 +165,6 @@ def test_a_flat_image_has_no_segments_and_noise_has_few():
     assert LineSegments().detect(np.full((50, 60), 90.0, dtype=np.float32)).shape == (0, 4)
     noise = np.random.default_rng(0).normal(128.0, 5.0, (300, 400)).astype(np.float32)
     assert len(LineSegments().detect(noise)) < 10
-
-
-def test_fitted_segments_run_through_their_points():
-    t = np.linspace(0.0, 30.0, 31)
-    lines = np.column_stack([5 + 0.6 * t, 7 + 0.8 * t]), np.column_stack([t, np.full(31, 3.0)])
-    xy = np.concatenate([*lines, [[1.0, 2.0]]])
-    segments, rms = _fit_segments(xy, np.repeat([4, 9, 11], [31, 31, 1]))
-    assert segments.shape == (2, 4)
-    np.testing.assert_allclose(rms, 0.0, atol=1e-6)
-    np.testing.assert_allclose(segments[0], [5.0, 7.0, 23.0, 31.0], atol=1e-9)
 
 
 def courtyard(views):

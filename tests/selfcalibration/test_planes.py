@@ -11,12 +11,10 @@ from tests.synthetic import make_scene, projective_reconstruction
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import (
     CheiralityRegion,
     CheiralitySearch,
-    _local_minima,
     _plane_box,
 )
 from thesisrecon.selfcalibration.modulus import (
@@ -147,17 +145,6 @@ def test_noise_moves_the_focal_by_little(plane, way):
     np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=0.01)
 
 
-def test_the_modulus_descent_lowers_every_start():
-    found, plane = setup(make_scene(seed=8))
-    c = _modulus_coefficients(
-        found.frame.A, found.frame.a, _pairs_of_constant_cameras(found.constraints.first)
-    )
-    starts = plane + 0.02 * np.random.default_rng(0).normal(size=(10, 3))
-    ends, cost = minimize_batch(lambda p: _modulus_residuals(c, p)[0], starts, iterations=60, loss_scale=0.05)
-    assert cost.max() < 1e-20
-    np.testing.assert_allclose(ends, np.tile(plane, (10, 1)), atol=1e-9)
-
-
 def test_the_same_seed_gives_the_same_bytes():
     scene = make_scene(seed=9)
     given, prior = projective_reconstruction(scene, seed=9), prior_for(scene)
@@ -166,20 +153,6 @@ def test_the_same_seed_gives_the_same_bytes():
             Stratified(plane).calibrate(given, prior=prior, rng=np.random.default_rng(3)) for _ in range(2)
         )
         assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
-
-
-def test_local_minima_are_no_worse_than_any_of_their_neighbours():
-    score = np.random.default_rng(0).uniform(size=(5, 5, 5))
-    score[2, 2, :] = np.inf
-    expected = []
-    for cell in np.ndindex(score.shape):
-        near = [np.add(cell, step) for step in np.vstack([np.eye(3, dtype=int), -np.eye(3, dtype=int)])]
-        inside = [tuple(n) for n in near if (n >= 0).all() and (n < 5).all()]
-        if np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in inside):
-            expected.append(cell)
-    expected.sort(key=lambda cell: score[cell])
-    found = _local_minima(score)
-    assert [tuple(np.array(np.unravel_index(k, score.shape)).tolist()) for k in found] == expected
 
 
 def test_copies_of_one_point_set_no_bounds():

@@ -13,7 +13,6 @@ from enum import Enum
 import numpy as np
 import scipy
 
-from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import (
     PairFrame,
@@ -33,8 +32,7 @@ from thesisrecon.epipolar.homography import (
     refine_plane,
 )
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
-from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.two_view import homography_sampson_residuals
 from thesisrecon.optimize.least_squares import minimize_residuals
@@ -172,19 +170,18 @@ def _classify(case: _InlierData) -> Configuration:
     rng = np.random.default_rng(0)
     plane = find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
     if plane is not None:
-        h, squared = plane[0], plane[1] * case.sigma**2
+        H, squared = plane[0], plane[1] * case.sigma**2
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         errors = _excess_errors(case, near, float(squared[near].sum()))
         if errors < STANDARD_ERRORS and case.false_alarms(far, EPIPOLE) > MAX_CHANCE:
             inliers = case.points[near]
             # Least squares of all of them, for which the covariance holds.
-            refine_plane(h, inliers, 1e6 * noise, 4)
-            H = h.reshape(3, 3)
+            H = refine_plane(H, inliers, 1e6 * noise, 4)
             # Student's limit, since the noise is estimated.
             limit = float(scipy.special.stdtrit(len(inliers) - 7, 1.0 - ROTATION_RISK))
             rotation = (
-                _eigenvalue_errors(H, plane_covariance(h, inliers, noise)) < limit
+                _eigenvalue_errors(H, plane_covariance(H, inliers, noise)) < limit
                 and _rotation_test(H, inliers[:, :2], inliers[:, 2:]) <= 1.0
             )
             return Configuration.ROTATION if rotation else Configuration.PLANE
@@ -268,11 +265,10 @@ def _least_squares(f: F64, points: F64) -> float:
 def _fit_translation(points: F64, sigma: float) -> F64:
     """[e]x (9,) of most points: from pairs of them, then from all within a shrinking gate."""
     rng = np.random.default_rng(len(points))
-    identity = np.eye(3).ravel() / np.sqrt(3.0)
     some = points[rng.permutation(len(points))[:200]]
     pairs = rng.integers(0, len(some), (100, 2))
     weights = np.ones((1, len(some)))
-    F, _, found = fundamentals_of_plane(identity, some, weights, pairs, 4.0 * BAND * sigma)
+    F, _, found = fundamentals_of_plane(np.eye(3), some, weights, pairs, 4.0 * BAND * sigma)
     f: F64 = F[int(np.argmax(found[:, 0]))].copy()
     for gate in (4.0, 2.0, 1.5):
         _refine_translation(f, points, gate * 4.0 * sigma)
@@ -286,42 +282,22 @@ def _refine_translation(f: F64, points: F64, gate: float) -> None:
         return
     e /= np.linalg.norm(e)
     kept = points[np.asarray(sampson_distances(f, points)) < gate]
-    if len(kept) >= 5:
-        _correct_epipole(e, np.ascontiguousarray(kept))
-        f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
-
-
-@kernel
-def _correct_epipole(e: F64, points: F64) -> None:
-    """Minimise the Sampson distances of [e]x of matches (K, 4) over the unit vector ``e``, in place."""
-    normal, gradient, J, n, step = empty((3, 3)), empty(3), empty(3), empty(3), empty(3)
+    if len(kept) < 5:
+        return
+    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
+    normals = np.cross(x1, x2)
     for _ in range(CORRECTIONS):
-        normal[:], gradient[:] = 0.0, 0.0
-        for k in range(len(points)):
-            x1, y1, x2, y2 = points[k]
-            # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two
-            # rows, whose squares are g.
-            n[0], n[1], n[2] = y1 - y2, x2 - x1, x1 * y2 - y1 * x2
-            a0, a1 = e[1] - e[2] * y1, e[2] * x1 - e[0]
-            b0, b1 = y2 * e[2] - e[1], e[0] - x2 * e[2]
-            size = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + EXACT**2)
-            residual = (n[0] * e[0] + n[1] * e[1] + n[2] * e[2]) * size
-            by_g = residual * size * size
-            J[0] = n[0] * size - by_g * (b1 - a1)
-            J[1] = n[1] * size - by_g * (a0 - b0)
-            J[2] = n[2] * size - by_g * (a1 * x1 - a0 * y1 + b0 * y2 - b1 * x2)
-            for i in range(3):
-                gradient[i] += J[i] * residual
-                for j in range(3):
-                    normal[i, j] += J[i] * J[j]
+        # x2 . (e x x1) = e . (x1 x x2); its gradients are the first two entries of e x x1 by x2 and of
+        # x2 x e by x1.
+        (a0, a1, _), (b0, b1, _) = np.cross(e, x1).T, np.cross(x2, e).T
+        size = 1.0 / np.sqrt(a0**2 + a1**2 + b0**2 + b1**2 + EXACT**2)
+        r = normals @ e * size
+        by_g = np.stack([b1 - a1, a0 - b0, a1 * x1[:, 0] - a0 * x1[:, 1] + b0 * x2[:, 1] - b1 * x2[:, 0]])
+        J = (normals * size[:, None]).T - r * size**2 * by_g
         # The length of e has no effect on the distances: e e' fixes it.
-        held = normal[0, 0] + normal[1, 1] + normal[2, 2]
-        for i in range(3):
-            for j in range(3):
-                normal[i, j] += held * e[i] * e[j]
-        if not solve_damped(normal, gradient, 0.0, step):
-            break
-        e += step
-        e /= np.sqrt(e @ e)
+        normal = J @ J.T
+        step = np.linalg.lstsq(normal + np.trace(normal) * np.outer(e, e), -J @ r, rcond=None)[0]
+        e = (e + step) / np.linalg.norm(e + step)
         if step @ step < 1e-20:
             break
+    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()

@@ -13,7 +13,6 @@ from typing import Literal
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import (
     PairFrame,
@@ -25,6 +24,7 @@ from thesisrecon.epipolar._matches import (
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.homography import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
 from thesisrecon.epipolar.refinement import SAMPSON, refine
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.optimize.noise import student_factor
 from thesisrecon.records import DegeneracyReport, FundamentalFit
@@ -62,66 +62,30 @@ MAX_ERROR_PX = 1.0
 CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
 
 
-@kernel
-def _select_distinct(
-    order: I64, agree: F64, weights: F64, overlap: float, chosen: I64, count: int, most: int
-) -> int:
-    """Add models of ``order`` that share at most ``overlap`` of their weight with one chosen before.
-
-    Starts with ``count`` chosen models, stops at ``most`` and returns their number.
-    """
+def _select_distinct(order: I64, agree: F64, weights: F64, chosen: list[int], most: int) -> None:
+    """Add models of ``order``, to ``most`` in all, that share little weight with any chosen before."""
     for s in order:
-        own = 0.0
-        for k in range(len(weights)):
-            own += weights[k] * agree[s, k]
-        fresh = True
-        for c in range(count):
-            common = 0.0
-            for k in range(len(weights)):
-                common += weights[k] * agree[s, k] * agree[chosen[c], k]
-            if common > overlap * own:
-                fresh = False
-                break
-        if fresh:
-            chosen[count] = s
-            count += 1
-            if count >= most:
-                break
-    return count
+        own = weights * agree[s]
+        if all(own @ agree[c] <= SAME_MODEL * own.sum() for c in chosen):
+            chosen.append(int(s))
+        if len(chosen) >= most:
+            break
 
 
-@kernel
-def _contradicted_ratios(h: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
+def _contradicted_ratios(H: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
     """Fraction of the nearest neighbours of each chosen point that lie on the plane and contradict it.
 
     A neighbour contradicts if the parallax differs by more than the distance in image 1: two points of an
     opaque surface would change order. Points nearer than ``near`` are the same feature and do not count.
     """
-    parallax = empty((len(points), 2))
-    for k in range(len(points)):
-        x1, y1 = points[k, 0], points[k, 1]
-        w = h[6] * x1 + h[7] * y1 + h[8]
-        parallax[k, 0] = points[k, 2] - (h[0] * x1 + h[1] * y1 + h[2]) / w
-        parallax[k, 1] = points[k, 3] - (h[3] * x1 + h[4] * y1 + h[5]) / w
-    ratios, nearest, which = zeros(len(chosen)), empty(NEIGHBOURS), empty(NEIGHBOURS, np.int64)
-    for c in range(len(chosen)):
-        k, found = chosen[c], 0
-        for m in range(len(points)):
-            squared = (points[m, 0] - points[k, 0]) ** 2 + (points[m, 1] - points[k, 1]) ** 2
-            if squared < near * near or (found == NEIGHBOURS and squared >= nearest[found - 1]):
-                continue
-            place = min(found, NEIGHBOURS - 1)
-            while place > 0 and nearest[place - 1] > squared:
-                nearest[place], which[place] = nearest[place - 1], which[place - 1]
-                place -= 1
-            nearest[place], which[place] = squared, m
-            found = min(found + 1, NEIGHBOURS)
-        for n in range(found):
-            m = which[n]
-            apart = (parallax[m, 0] - parallax[k, 0]) ** 2 + (parallax[m, 1] - parallax[k, 1]) ** 2
-            ratios[c] += 1.0 if on_plane[m] and apart > nearest[n] else 0.0
-        ratios[c] /= max(found, 1)
-    return ratios
+    parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)
+    apart = np.linalg.norm(points[chosen, None, :2] - points[:, :2], axis=2)
+    apart[apart < near] = np.inf
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+    distance = np.take_along_axis(apart, nearest, axis=1)
+    differ = np.linalg.norm(parallax[nearest] - parallax[chosen, None], axis=2) > distance
+    counted = np.maximum(np.isfinite(distance).sum(axis=1), 1)
+    return np.asarray((on_plane[nearest] & differ).sum(axis=1) / counted)
 
 
 @dataclass(frozen=True)
@@ -150,7 +114,7 @@ class _CompetingModel:
 
 
 def _competing_starts(
-    f: F64, points: F64, weights: F64, h: F64, off_plane: B8, *, band: float, rng: Generator
+    f: F64, points: F64, weights: F64, H: F64, off_plane: B8, *, band: float, rng: Generator
 ) -> tuple[F64, float]:
     """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance.
 
@@ -169,14 +133,14 @@ def _competing_starts(
         half = PAIRS // 2
         pairs[:half, 0] = agreeing[rng.integers(0, len(agreeing), half)]
         pairs[:half, 1] = others[rng.integers(0, len(others), half)]
-    F, agree, sums = fundamentals_of_plane(h, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
+    F, agree, sums = fundamentals_of_plane(H, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
     # The two matches that define a model always agree with it.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
-    chosen, count = np.empty(2 * COMPETING, dtype=np.int64), 0
+    chosen: list[int] = []
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
         order = np.argsort(-value, kind="stable")
-        count = _select_distinct(order[:EXAMINED], agree, w, SAME_MODEL, chosen, count, (k + 1) * COMPETING)
-    return F[chosen[:count]], float(np.quantile(beyond, TYPICAL)) / WIDE
+        _select_distinct(order[:EXAMINED], agree, w, chosen, (k + 1) * COMPETING)
+    return F[chosen], float(np.quantile(beyond, TYPICAL)) / WIDE
 
 
 def _competing_model(start: F64, f: F64, points: F64, weights: F64, band: float) -> _CompetingModel:
@@ -216,14 +180,14 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
-    h, off_plane = plane[0], plane[1] > OFF_PLANE
+    H, off_plane = plane[0], plane[1] > OFF_PLANE
     weights, band = multiplicity_weights(xy1, xy2), band_px * frame.scale
-    of_plane, chance_of_model = _competing_starts(f, points, weights, h, off_plane, band=band, rng=rng)
+    of_plane, chance_of_model = _competing_starts(f, points, weights, H, off_plane, band=band, rng=rng)
     starts = [*of_plane, *(frame.matrix_in_frame(F) for F in fit.competing_models)]
     models = [_competing_model(start, f, points, weights, band) for start in starts]
     mine, near = fit.inliers, 2.0 * sigma_px * frame.scale
     agreeing, tried = float(weights[mine & off_plane].sum()), float(weights[off_plane].sum())
-    part = _contradicted_fraction(points[mine], weights[mine], h, off_plane[mine], near)
+    part = _contradicted_fraction(points[mine], weights[mine], H, off_plane[mine], near)
     contradicted = agreeing * part
     chance_of_match = chance_of_agreement(xy1, xy2, band_px)
     chance = max(chance_of_model, chance_of_match)
@@ -272,11 +236,11 @@ def _reasons(
     return found
 
 
-def _contradicted_fraction(points: F64, weights: F64, h: F64, off: B8, near: float) -> float:
+def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:
     """Fraction of the inliers ``off`` the plane among contradicting matches of the plane, from a sample."""
     chosen = np.flatnonzero(off)
-    chosen = np.ascontiguousarray(chosen[:: max(1, len(chosen) // SAMPLED)])
-    ratios, some = _contradicted_ratios(h, points, ~off, chosen, near), weights[chosen]
+    chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
+    ratios, some = _contradicted_ratios(H, points, ~off, chosen, near), weights[chosen]
     return float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
 
 

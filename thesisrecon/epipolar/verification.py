@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64
 from thesisrecon.epipolar.configuration import MINIMUM, Configuration, classify_configuration
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.homography import SUBSET, count_transferred, induced_homography
+from thesisrecon.epipolar.homography import SUBSET, induced_homographies
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_residuals
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
@@ -123,9 +124,11 @@ def homography_inlier_ratio(
     triples = np.argsort(rng.random((TRIPLES, min(len(chosen), 50))), axis=1)[:, :3]
     offsets = rng.integers(0, len(chosen), (TRIPLES, 1))
     triples = chosen[(triples + offsets) % len(chosen)]
-    planes, H = _plane_homographies(F, xy1, xy2, triples), np.eye(3)
-    if len(planes):
-        H = planes[int(np.argmax(count_transferred(planes, xy1[chosen], xy2[chosen], tolerance_px)))]
+    smallest_area = 1e-4 * float(np.ptp(xy1, axis=0).max()) ** 2
+    planes = induced_homographies(unit_norm(F), epipoles(F)[1], np.hstack([xy1, xy2]), triples, smallest_area)
+    moved = dehomogenize(homogenize(xy1[chosen]) @ planes.swapaxes(1, 2))
+    counts = (np.sum((moved - xy2[chosen]) ** 2, axis=2) < tolerance_px**2).sum(axis=1)
+    H = planes[counts.argmax()] if len(planes) else np.eye(3)
     inside = homography_residuals(H, xy1, xy2) < tolerance_px
     for _ in range(5):
         points1, points2 = xy1[inside], xy2[inside]
@@ -136,14 +139,3 @@ def homography_inlier_ratio(
             break
         inside = again
     return float(inside.mean())
-
-
-def _plane_homographies(F: F64, xy1: F64, xy2: F64, triples: I64) -> F64:
-    """Homographies (S', 3, 3) of the planes through three matches each, without nearly collinear triples."""
-    points, h, found = np.hstack([xy1, xy2]), np.empty(9), []
-    e2, f = epipoles(F)[1].copy(), unit_norm(F).ravel()
-    smallest_area = 1e-4 * float(np.ptp(xy1, axis=0).max()) ** 2
-    for triple in triples:
-        if induced_homography(f, e2, points, triple, smallest_area, h):
-            found.append(h.copy())
-    return np.array(found).reshape(-1, 3, 3)
