@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.api.cameras import triangulate
-from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.conftest import Bench
 from thesisrecon.config import preset
-from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations

@@ -19,10 +19,10 @@ from benchmarks.references import (
 )
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import distort, project_camera, undistort
-from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.geometry.resection import pose_from_three_points
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.geometry.two_view import homography_linear
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.triangulation import colmap_points

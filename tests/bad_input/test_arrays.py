@@ -5,11 +5,11 @@ import re
 import numpy as np
 
 from thesisrecon.camera import decompose_camera
-from thesisrecon.geometry import camera_matrix, conics, strata, three_view, two_view
+from thesisrecon.geometry import camera_matrix, strata, three_view, two_view
 from thesisrecon.geometry.conditioning import normalizing_transform
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
-from thesisrecon.geometry.resection import resect_linear
 from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.geometry.triangulation import resect_linear
 from thesisrecon.geometry.two_view import homography_linear
 
 RNG = np.random.default_rng(0)
@@ -51,10 +51,10 @@ def test_numbers_that_are_not_finite_are_rejected():
             (resect_linear, RNG.normal(size=(8, 4)), spoilt(XY, v)),
             (three_view.tensor_from_cameras, P, spoilt(OTHER, v), P),
             (three_view.fundamentals_from_tensor, spoilt(T, v)),
-            (three_view.transfer_lines, T, LINE, spoilt(LINE, v)), (conics.dual, spoilt(CONIC, v)),
+            (three_view.transfer_lines, T, LINE, spoilt(LINE, v)), (strata.dual, spoilt(CONIC, v)),
             (estimate_similarity, spoilt(RNG.normal(size=(5, 3)), v), RNG.normal(size=(5, 3))),
             (strata.transform, spoilt(np.eye(4), v), P, "cameras"),
-            (conics.image_of_absolute_conic, spoilt(np.eye(3), v)),
+            (strata.image_of_absolute_conic, spoilt(np.eye(3), v)),
         ]  # fmt: skip
         assert accepted(calls, "needs finite") == []
 
@@ -70,8 +70,8 @@ def test_singular_and_empty_arrays_are_rejected():
         (three_view.tensor_from_cameras, P, np.zeros((3, 4)), P),
         (correct_matches, np.zeros((3, 3)), XY, XY), (strata.transform, np.ones((4, 4)), P, "cameras"),
         (strata.transform, np.zeros((4, 4)), np.eye(4), "conics"),
-        (conics.image_of_absolute_conic, np.ones((3, 3))),
-        (conics.intersect_line, CONIC, np.zeros(3), LINE), (conics.curvature_sign, np.zeros((4, 4))),
+        (strata.image_of_absolute_conic, np.ones((3, 3))),
+        (strata.intersect_line, CONIC, np.zeros(3), LINE), (strata.curvature_sign, np.zeros((4, 4))),
         (two_view.epipoles, np.eye(4)), (two_view.canonical_cameras, np.zeros((2, 3))),
     ]  # fmt: skip
     assert accepted(calls, r"needs .*(invertible|zero|finite camera|\(3, 3\))") == []

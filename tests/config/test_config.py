@@ -27,7 +27,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEstimate, SequenceWindow
 from thesisrecon.records import INTRINSICS
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
-from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.cheirality import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 

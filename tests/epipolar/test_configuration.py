@@ -7,14 +7,14 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.api.pairs import estimate_fundamental
-from thesisrecon.epipolar.configuration import (
+from thesisrecon.epipolar.linear import estimate_eight_point
+from thesisrecon.epipolar.verification import (
     Configuration,
     _eigenvalue_errors,
     _rotation_homography,
     _rotation_test,
     classify_configuration,
 )
-from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize

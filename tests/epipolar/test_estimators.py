@@ -11,12 +11,16 @@ from tests.epipolar.pairs import angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.epipolar._sampling import sampson_distances
-from thesisrecon.epipolar.configuration import Configuration, _refine_translation, classify_configuration
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers
 from thesisrecon.epipolar.refinement import refine_fundamental
-from thesisrecon.epipolar.verification import PairVerification
+from thesisrecon.epipolar.verification import (
+    Configuration,
+    PairVerification,
+    _refine_translation,
+    classify_configuration,
+)
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import cross_matrix

@@ -7,7 +7,7 @@ from scipy import stats
 from tests.conftest import refuses
 from tests.epipolar.pairs import make_pair
 from thesisrecon.api.pairs import epipolar_lines
-from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_distance_std, epipoles
 from thesisrecon.records import FundamentalFit

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre
-from thesisrecon.geometry.conics import bilinear_form
+from thesisrecon.geometry.strata import bilinear_form
 
 
 def holds_for_every(*more, examples=30):

@@ -6,18 +6,19 @@ from hypothesis import strategies as st
 
 from tests.conftest import refuses
 from tests.geometry import properties
-from thesisrecon.geometry.conics import (
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.strata import (
     ABSOLUTE_CONIC,
     ABSOLUTE_DUAL_QUADRIC,
+    PLANE_AT_INFINITY,
     bilinear_form,
     calibration_from_image,
     curvature_sign,
     dual,
     image_of_absolute_conic,
     intersect_line,
+    transform,
 )
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.strata import PLANE_AT_INFINITY, transform
 from validation.scenes.transforms import random_transform
 
 dimensions = st.sampled_from([3, 4])

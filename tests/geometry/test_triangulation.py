@@ -22,8 +22,12 @@ from thesisrecon.geometry.polynomial_triangulation import (
     correct_matches,
     triangulate_polynomial,
 )
-from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
-from thesisrecon.geometry.triangulation import _jacobi_least, triangulate_observations
+from thesisrecon.geometry.triangulation import (
+    _jacobi_least,
+    pose_from_three_points,
+    resect_linear,
+    triangulate_observations,
+)
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.optimize.bundle.partial import minimize_reprojection
 

@@ -74,6 +74,6 @@ def test_a_page_has_its_table_and_names_what_exists(page):
 
 def test_functions_link_to_the_chapter_of_their_equations():
     assert theory.chapters_of("estimate_fundamental") == ["fundamental-matrix"]
-    assert theory.chapters_of("geometry.conics.dual") == ["geometry"]
+    assert theory.chapters_of("geometry.strata.dual") == ["geometry"]
     assert theory.chapters_of("bundle_adjust") == ["bundle-adjustment"]
     assert theory.chapters_of("load") == []

@@ -13,8 +13,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.pipeline.outputs import write_affine
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch
-from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
 

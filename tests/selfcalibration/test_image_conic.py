@@ -10,7 +10,7 @@ from tests.selfcalibration import stratified_scenes as scenes
 from tests.synthetic import make_scene
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conics import calibration_from_image
+from thesisrecon.geometry.strata import calibration_from_image
 from thesisrecon.selfcalibration._frame import infinite_homographies, square_pixel_constraints
 from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,

@@ -15,13 +15,11 @@ from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, Linear
 from thesisrecon.selfcalibration.cheirality import (
     CheiralityRegion,
     CheiralitySearch,
-    _plane_box,
-)
-from thesisrecon.selfcalibration.modulus import (
     ModulusConstraint,
     _modulus_coefficients,
     _modulus_residuals,
     _pairs_of_constant_cameras,
+    _plane_box,
 )
 from thesisrecon.selfcalibration.stratified import Stratified
 

@@ -16,9 +16,8 @@ from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.runtime._run import stream
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
-from thesisrecon.selfcalibration.modulus import ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines, plane_from_vanishing_points
 from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
 

@@ -13,7 +13,7 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import depth, project
 from thesisrecon.geometry.conditioning import centred_frame, whitening_transform
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.resection import pose_from_three_points, resect_linear
+from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear
 from thesisrecon.optimize.bundle.partial import refine_camera, refine_pose
 from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
 

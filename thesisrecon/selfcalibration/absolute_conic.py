@@ -14,7 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, StageFailure
-from thesisrecon.geometry.conics import calibration_from_image
+from thesisrecon.geometry.strata import calibration_from_image
 from thesisrecon.selfcalibration._frame import (
     HOMOGRAPHY_NOISE,
     ConicConstraints,

@@ -17,8 +17,7 @@ from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure,
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch
-from thesisrecon.selfcalibration.modulus import ModulusConstraint
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import minimize_quadric
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import compose_camera
-from thesisrecon.epipolar.configuration import Configuration
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.camera_matrix import project
 
 K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])

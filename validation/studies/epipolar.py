@@ -9,9 +9,9 @@ import numpy as np
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import PairFrame
-from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.refinement import fundamental_covariance, refine_fundamental
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipoles, sampson_residuals, symmetric_residuals
 from thesisrecon.records import FundamentalFit

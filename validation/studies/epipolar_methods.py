@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar.configuration import Configuration
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
 from thesisrecon.epipolar.refinement import Criterion, Parameters, refine_fundamental
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.metrics.fundamental_precision import fundamental_bound
