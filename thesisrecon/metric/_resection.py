@@ -13,7 +13,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice, counted
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.resection import pose_from_three_points
+from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
 from thesisrecon.metric._model import (
     EARLY_SIGMAS,
