@@ -549,6 +549,24 @@ def test_the_final_pairs_are_read_back(tmp_path, monkeypatch):
     assert all(pair.accepted for pair in load(tmp_path).pairs)
 
 
+def test_oblique_views_are_tried_while_they_help(tmp_path, monkeypatch):
+    """Thousands of images that do not overlap would each be tried with several others."""
+    tried = []
+
+    def matched(job, views, pairs, kind, original=matching._matched):
+        tried.append((kind, len(pairs)))
+        pairs = original(job, views, pairs, kind)
+        helps = kind and len(tried) < 4
+        return [replace(pair, accepted=bool(helps)) for pair in pairs]
+
+    monkeypatch.setattr(matching, "pairs_to_connect", lambda *_: list(range(6)))
+    monkeypatch.setattr(matching, "prepare_oblique", lambda _config, _image, features: features)
+    monkeypatch.setattr(matching, "OBLIQUE_PAIRS", 1)
+    monkeypatch.setattr(matching, "_matched", matched)
+    run(tmp_path, until="matches", threads=1)
+    assert tried == [("", 6), ("-oblique", 1), ("-oblique", 1), ("-oblique", 1)]
+
+
 def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path):
     with pytest.raises(UsageError, match=r"'9\.png', which is not among the 4 images"):
         run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))

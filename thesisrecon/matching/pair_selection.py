@@ -466,7 +466,7 @@ def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:
 
 
 def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView], most: int) -> list[int]:
-    """Numbers, ascending, of the rejected pairs that would connect the groups of matched images.
+    """Numbers of the rejected pairs that would connect the groups of matched images, of most evidence first.
 
     Each image outside the largest group is in at most ``most``, those with the strongest overlap evidence.
     """
@@ -485,4 +485,4 @@ def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView],
             of_view[view].append(n)
     for numbers in of_view.values():
         chosen.update(sorted(numbers, key=lambda n: -evidence[n])[:most])
-    return sorted(chosen)
+    return sorted(chosen, key=lambda n: (-evidence[n], n))

@@ -33,6 +33,8 @@ MIN_GROUP = 3
 """Minimum number of images of a group that is reconstructed separately."""
 CACHE_BYTES = 2**30
 """Prepared views take several times the memory of their image and are quickly prepared again."""
+OBLIQUE_PAIRS = 64
+"""Pairs of most overlap evidence that are matched with oblique views; as many again while one is accepted."""
 MAX_BATCH, BATCHES_PER_WORKER, MAX_RESULT_BYTES = 64, 8, 2**25
 """Pairs of a batch, batches, and pickled bytes of the result of a batch, at most."""
 PAIR_BYTES, MATCH_BYTES = 2**14, 80
@@ -79,12 +81,15 @@ class FromImages:
         pairs = [(int(i), int(j)) for i, j in choice.pairs]
         found, kinds = _matched_in_turn(job, views, pairs)
         again = pairs_to_connect(views.features, found, oblique_pairs(job.config))
-        if again:
-            oblique = _prepared(job, views.features, partial(prepare_oblique, job.config))
-            second = _matched(job, oblique, [pairs[n] for n in again], "-oblique")
-            for n, pair in zip(again, second, strict=True):
+        oblique = views.prepared_by(partial(prepare_oblique, job.config))
+        while again:
+            now, again = again[:OBLIQUE_PAIRS], again[OBLIQUE_PAIRS:]
+            second = _matched(job, oblique, [pairs[n] for n in now], "-oblique")
+            for n, pair in zip(now, second, strict=True):
                 if pair.accepted:
                     found[n], kinds[n] = pair, "-oblique"
+            if not any(pair.accepted for pair in second):
+                break
         final = reject_repeated_structure(found, len(job.images))
         rejected = {n: pair.reason for n, pair in enumerate(final) if pair is not found[n]}
         return report_matches(job, final, kinds, rejected)
@@ -154,7 +159,9 @@ class PreparedViews(Sequence[Any]):
 
     def __init__(self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]]) -> None:
         self._prepare, self._given = prepare, dict(given)
-        self._made: RecentlyUsed[int, Any] = RecentlyUsed(CACHE_BYTES)
+        # The cache may hold the same views of several methods.
+        self._method = object()
+        self._made: RecentlyUsed[tuple[object, int], Any] = RecentlyUsed(CACHE_BYTES)
 
     def __reduce__(self) -> tuple[type[PreparedViews], tuple[Prepare, dict[int, tuple[Image, Features]]]]:
         return PreparedViews, (self._prepare, self._given)
@@ -165,7 +172,13 @@ class PreparedViews(Sequence[Any]):
     def __getitem__(self, view: int) -> Any:  # type: ignore[override]
         if view not in self._given:
             raise IndexError(f"view {view} is not among those given")
-        return self._made.get(view, lambda: self._prepare(*self._given[view]))
+        return self._made.get((self._method, view), lambda: self._prepare(*self._given[view]))
+
+    def prepared_by(self, prepare: Prepare) -> PreparedViews:
+        """The same views by another method, in the same cache."""
+        other = PreparedViews(prepare, self._given)
+        other._made = self._made
+        return other
 
     @property
     def features(self) -> list[Features]:
@@ -254,7 +267,7 @@ def _matched_in_turn(
     features, matching = views.features, job.config.matching
     if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
         return _matched(job, views, pairs, ""), [""] * len(pairs)
-    found = _matched(job, _prepared(job, features, partial(_prepare_share, matching)), pairs, FEWER)
+    found = _matched(job, views.prepared_by(partial(_prepare_share, matching)), pairs, FEWER)
     found, kinds = _of_all_corners(found, features, matching.many_share), [FEWER] * len(pairs)
     kept = reject_repeated_structure(found, len(features))
     long = has_narrow_cut(tracks_of_corners([found.xy for found in features], kept))
