@@ -7,7 +7,6 @@ from tests.synthetic import disparity, photograph, stereo_scene, texture
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._prepared import _corner_patches, prepare_image
-from thesisrecon.matching._seeds import _scan_correlations, _update_largest_of_columns
 from thesisrecon.matching.growth import _fit_local_affines, _match_guided
 from thesisrecon.matching.strength import (
     _displacement_weight,
@@ -29,26 +28,6 @@ def unit(window):
 def prepared(gray):
     image = photograph(gray)
     return prepare_image(image, with_constants(HarrisCorners, spacing_rel=0.01)().detect(image))
-
-
-def test_scan_equals_its_numpy_twin():
-    correlation = RNG.uniform(-1, 1, (40, 60)).astype(np.float32)
-    xy = RNG.uniform(0, 50, (60, 2)).astype(np.float32)
-    index, value, second_best = _scan_correlations(correlation, xy, np.full(60, 15.0**2, np.float32))
-    best = correlation.argmax(axis=1)
-    elsewhere = ((xy[None] - xy[best][:, None]) ** 2).sum(-1) > 15.0**2
-    assert np.array_equal(index, best)
-    assert np.array_equal(value, correlation.max(axis=1))
-    assert np.allclose(second_best, np.where(elsewhere, correlation, -1.0).max(axis=1))
-
-
-@pytest.mark.parametrize("rows", [1, 4, 50])
-def test_largest_of_columns_over_blocks_equals_that_of_all_rows(rows):
-    correlation = RNG.uniform(-1, 1, (rows, 30)).astype(np.float32)
-    largest = np.full(30, -2.0, np.float32)
-    for first in range(0, rows, 17):
-        _update_largest_of_columns(correlation[first : first + 17], largest)
-    assert np.array_equal(largest, correlation.max(axis=0))
 
 
 def affine_twin(xy, near, xy1, xy2, prior):

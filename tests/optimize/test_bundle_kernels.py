@@ -196,17 +196,6 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
 
 
-def test_image_points_are_those_of_the_residuals_with_their_depths():
-    block = make_block(k1=0.03, lens=(-0.04, 0.05), points=50)
-    c = block.cameras
-    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    seen = Observations(block.view, block.point, block.xy)
-    xy, depth = metric_kernels.image_points(model, block.view, block.point)
-    np.testing.assert_allclose(xy - block.xy, metric_kernels.project_metric(model, seen), atol=1e-9)
-    wanted = np.einsum("kb,kb->k", c.R[block.view, 2], block.X[block.point]) + c.t[block.view, 2]
-    np.testing.assert_allclose(depth, wanted)
-
-
 def test_chunks_give_the_sums_of_the_whole(monkeypatch):
     block = make_block(views=6, points=200, groups=1)
     cameras, X = perturbed(block)
@@ -214,27 +203,6 @@ def test_chunks_give_the_sums_of_the_whole(monkeypatch):
     whole = refine_metric_bundle(cameras, X, seen, free=free)
     monkeypatch.setattr(schur, "CHUNK", 100)
     np.testing.assert_allclose(refine_metric_bundle(cameras, X, seen, free=free).X, whole.X, atol=1e-6)
-
-
-def test_products_and_forms_of_the_reduced_matrix_are_those_of_the_dense_one():
-    rng = np.random.default_rng(5)
-    row, column = np.array([0, 0, 1, 2, 2, 3]), np.array([0, 2, 1, 2, 3, 3])
-    blocks = rng.normal(size=(6, 2, 2))
-    blocks[row == column] += np.swapaxes(blocks[row == column], 1, 2)
-    border, corner = rng.normal(size=(4, 2, 3)), rng.normal(size=(3, 3))
-    corner += corner.T
-    dense = np.zeros((11, 11))
-    for i in range(6):
-        dense[2 * row[i] : 2 * row[i] + 2, 2 * column[i] : 2 * column[i] + 2] = blocks[i]
-    dense[:8, 8:], dense[8:, 8:] = border.reshape(8, 3), corner
-    full = np.triu(dense) + np.triu(dense, 1).T
-    system = schur.ReducedSystem(row, column, ReducedSums(blocks, border, corner, *np.zeros((3, 11))))
-    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(dense))
-    more, pair = np.arange(11.0), np.full((4, 4), -1)
-    pair[row, column] = np.arange(6)
-    schur.add_diagonal(system.sums, pair, more)
-    full += np.diag(more)
-    np.testing.assert_array_equal(np.triu(system.dense()), np.triu(full))
 
 
 @pytest.mark.parametrize("solve", [schur.solve_dense, schur.BandedCholesky(np.arange(3), 2).solve])

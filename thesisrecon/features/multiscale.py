@@ -30,7 +30,8 @@ def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -
     b, a = np.mgrid[:side, :side] - 0.5 * (side - 1)
     x, y = xy.T[:, :, None, None]
     places = [y + s * a + c * b, x + c * a - s * b]
-    return scipy.ndimage.map_coordinates(image, places, order=1, mode="nearest").reshape(len(xy), side**2)
+    found: F32 = scipy.ndimage.map_coordinates(image, places, order=1, mode="nearest")
+    return found.reshape(len(xy), side**2)
 
 
 @dataclass(frozen=True)

@@ -183,10 +183,14 @@ def identifiability_report(
     undetermined = views[std >= MAX_FOCAL_STD]
     # A prior that fixes the focal length does so for any motion.
     known_focal = bool((problem.prior.std[:, 0] < MAX_FOCAL_STD).all())
+    has_rotated = (
+        evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
+        and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
+    )
     determined = (
         len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
         and excess >= 0
-        and (_has_rotated(evidence) or known_focal)
+        and (has_rotated or known_focal)
     )
     contradicted = _has_excess_noise(evidence)
     identifiable = determined and not contradicted
@@ -266,13 +270,6 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
         return [Notice("uncertain-focal", _percent(std), advice)]
     # Rotating the camera does not help against a wrong prior of the intrinsics.
     return [] if _has_excess_noise(evidence) else [advice]
-
-
-def _has_rotated(evidence: Mapping[str, float]) -> bool:
-    return (
-        evidence["rotation_significance"] >= MIN_ROTATION_SIGNIFICANCE
-        and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
-    )
 
 
 def _has_excess_noise(evidence: Mapping[str, float]) -> bool:

@@ -274,12 +274,12 @@ def _information(
 def _gram_matrix(A: scipy.sparse.csr_matrix) -> F64:
     """Return A'A as a dense matrix, since most pairs of views share points here."""
     G = np.zeros((A.shape[1], A.shape[1]))
-    add_gram(A.indptr, A.indices, A.data, G)
+    _add_gram(A.indptr, A.indices, A.data, G)
     return G + np.tril(G, -1).T
 
 
 @kernel
-def add_gram(start: I32, column: I32, value: F64, G: F64) -> None:
+def _add_gram(start: I32, column: I32, value: F64, G: F64) -> None:
     """Add the lower triangle of A'A; row i of A has the values of start[i] <= k < start[i + 1]."""
     for i in range(len(start) - 1):
         for k in range(start[i], start[i + 1]):
