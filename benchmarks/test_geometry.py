@@ -60,7 +60,7 @@ def test_triangulation(bench: Bench, group: str, method: str, solve: object) -> 
 @pytest.mark.parametrize("method", ["ours", "Ceres"])
 def test_bundle_adjustment(bench: Bench, method: str, views: int) -> None:
     rng = np.random.default_rng(3)
-    walk = make_walk(views, "street", rng)
+    walk = make_walk(views, rng)
     cameras, X = walk.start(rng)
     options = BundleOptions(loss_px=1.0, max_iterations=100)
 

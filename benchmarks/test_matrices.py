@@ -26,7 +26,7 @@ from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.geometry.two_view import homography_linear
 from validation.references.fundamental import opencv_eight_point, opencv_seven_point
 from validation.references.triangulation import colmap_points
-from validation.scenes.triangulation import beside, cameras_of
+from validation.scenes.rigs import beside, cameras_of
 from validation.scenes.two_views import make_two_views
 
 Call = Callable[..., Any]

@@ -11,8 +11,7 @@ from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface._simplification import simplify_surface
 from thesisrecon.surface.fusion import VolumetricFusion
 from validation.references.open3d_geometry import OpenTsdf, decimate_open3d
-from validation.scenes.image_files import read_rgb
-from validation.scenes.real import load_fixture_depth, load_fixture_scene
+from validation.scenes.real import load_fixture_depth, load_fixture_scene, read_rgb
 
 STEP = 2
 # Errors and sides of simplified faces, m: those of the fusion by default.

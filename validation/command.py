@@ -17,12 +17,11 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.io._outputs import join_claim
 from thesisrecon.runtime._signals import with_resume_advice
 from validation.ablation import command as ablation
-from validation.runs.gates import read_gates
 from validation.runs.page import write_pages
 from validation.runs.processes import own_cores
 from validation.runs.records import ReportOptions
 from validation.runs.report import run_tasks
-from validation.runs.results import Results, collect, read_results, write_results
+from validation.runs.results import Results, collect, read_gates, read_results, write_results
 from validation.runs.scenes import load_images
 from validation.runs.study import MODULES, OF_PAGES, report_progress, run_studies, run_study
 from validation.stages import STAGES, available_scenes
@@ -143,7 +142,6 @@ def _last_results(options: ReportOptions) -> Results | None:
 
 
 def _print_progress(line: str) -> None:
-    """Print progress on a terminal."""
     if sys.stderr.isatty():
         print(line, file=sys.stderr, flush=True)
 

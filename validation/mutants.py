@@ -29,11 +29,10 @@ from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import clear_folder, join_claim
 from thesisrecon.runtime._signals import install_signal_handlers
 from validation.runs.processes import own_cores, run_process
+from validation.runs.tables import text_table
 from validation.scenes.real import ROOT
 
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "optimize")
-MIN_SCORE = 0.85
-COPIED = ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml")
 LIMIT_S = 420.0
 """Time limit of a test run (s)."""
 COLD_S = 3600.0
@@ -121,7 +120,6 @@ def _inside(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _changes(node: Any) -> Iterator[ast.AST]:
-    """Yield the replacements of a node."""
 
     def changed(**fields: Any) -> ast.AST:
         found: ast.AST = type(node)(**{**dict(ast.iter_fields(node)), **fields})
@@ -159,7 +157,6 @@ def _changes(node: Any) -> Iterator[ast.AST]:
 
 
 def _is_whole(node: ast.expr) -> bool:
-    """Return whether an operand is certainly an integer."""
     if isinstance(node, ast.Constant):
         return isinstance(node.value, int)
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len"
@@ -197,7 +194,7 @@ class Bench:
     def set_up(self) -> None:
         clear_folder(self.tree)
         self.tree.mkdir(parents=True)
-        for name in COPIED:
+        for name in ("thesisrecon", "validation", "tests", "fixtures", "pyproject.toml"):
             source, target = ROOT / name, self.tree / name
             if source.is_dir():
                 shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
@@ -206,10 +203,7 @@ class Bench:
 
     @contextmanager
     def planted(self, file: str, text: str) -> Iterator[None]:
-        """Replace ``file`` by the faulty ``text`` for a while.
-
-        Kernels are cached by the code they are made from, bytecode by the time of the file.
-        """
+        """Replace ``file`` by the faulty ``text`` for a while."""
         path = self.tree / file
         sound, before = path.read_text(encoding="utf-8"), path.stat().st_mtime
         path.write_text(text, encoding="utf-8")
@@ -255,10 +249,7 @@ def _module(file: str) -> str:
 
 
 def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterator[Verdict]:
-    """Yield the verdict of each fault in order.
-
-    Raises ``ValueError`` if a test fails without a fault.
-    """
+    """Yield the verdict of each fault in order."""
     bench.set_up()
     judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
     if not warm:
@@ -283,18 +274,17 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant], *, warm: bool) -> Iterato
 
 def table(verdicts: Sequence[Verdict]) -> str:
     """Return Markdown: the score of each package, then every fault."""
-    lines = ["| package | faults | caught | score |", "| --- | --- | --- | --- |"]
+    scores, faults = list[list[object]](), list[list[object]]()
     for package in PACKAGES:
-        own = [v for v in verdicts if Path(v.mutant.file).parts[1] == package]
+        own = [bool(v.by) for v in verdicts if Path(v.mutant.file).parts[1] == package]
         if own:
-            caught = sum(bool(v.by) for v in own)
-            lines.append(f"| {package} | {len(own)} | {caught} | {100.0 * caught / len(own):.0f} % |")
-    lines += ["", "| file | line | was | became | caught by |", "| --- | --- | --- | --- | --- |"]
+            scores.append([package, len(own), sum(own), f"{100.0 * sum(own) / len(own):.0f} %"])
     for v in verdicts:
-        texts = [" ".join(text.split()).replace("|", "\\|")[:60] for text in (v.mutant.old, v.mutant.new)]
-        by = v.by.replace("|", "\\|") or "**not caught**"
-        lines.append(f"| {v.mutant.file} | {v.mutant.line} | `{texts[0]}` | `{texts[1]}` | {by} |")
-    return "\n".join(lines)
+        texts = [f"`{' '.join(text.split())[:60]}`" for text in (v.mutant.old, v.mutant.new)]
+        cells = [text.replace("|", "\\|") for text in (*texts, v.by or "**not caught**")]
+        faults.append([v.mutant.file, v.mutant.line, *cells])
+    head = text_table(["package", "faults", "caught", "score"], scores)
+    return f"{head}\n\n{text_table(['file', 'line', 'was', 'became', 'caught by'], faults)}"
 
 
 def read_verdicts(path: Path) -> list[Verdict]:
@@ -337,7 +327,7 @@ def main(arguments: list[str] | None = None) -> int:
     score = sum(bool(v.by) for v in results.values()) / max(len(results), 1)
     faults = counted(len(results), "fault")
     print(f"{faults}, {100.0 * score:.0f} % caught; the table is {parsed.out / 'mutants.md'}")
-    return int(score < MIN_SCORE)
+    return int(score < 0.85)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from validation.metrics.fundamental_precision import (
     fundamental_bound,
 )
 from validation.scenes.two_views import make_two_views
-from validation.studies.epipolar import DEFAULT, GOLD, check_precision
+from validation.studies.epipolar_methods import DEFAULT, GOLD, check_precision
 
 
 def bound_of(seed, n=40, sigma=0.5):

@@ -19,7 +19,7 @@ from thesisrecon.geometry.strata import (
     intersect_line,
     transform,
 )
-from validation.scenes.transforms import random_transform
+from validation.scenes.rigs import random_transform
 
 dimensions = st.sampled_from([3, 4])
 

@@ -10,7 +10,7 @@ from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import homography_residuals
-from validation.scenes.transforms import random_transform
+from validation.scenes.rigs import random_transform
 
 
 def compatibility_residual(H, F):

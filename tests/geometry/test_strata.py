@@ -17,7 +17,7 @@ from thesisrecon.geometry import strata
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.strata import ABSOLUTE_CONIC, ABSOLUTE_DUAL_QUADRIC, curvature_sign, dual
-from validation.scenes.transforms import random_transform
+from validation.scenes.rigs import random_transform
 
 groups = st.sampled_from(list(strata.DEGREES_OF_FREEDOM))
 ORDER = list(strata.DEGREES_OF_FREEDOM)

@@ -14,7 +14,7 @@ from thesisrecon.geometry.conditioning import unit_tensor
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
-from validation.scenes.transforms import random_transform
+from validation.scenes.rigs import random_transform
 
 NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.io._colmap_writing import write_colmap_model
 from thesisrecon.records import Reconstruction, Tracks
-from validation.references.colmap_reading import read_colmap_model
+from validation.references.colmap import read_colmap_model
 
 V, N = 5, 40
 NAMES = ["a b.jpg", "böld.jpg", "c.jpg", "d.jpg", "e.jpg"]

@@ -8,8 +8,7 @@ from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_a
 from tests.synthetic import make_scene
 from thesisrecon import reconstruct_from_tracks
 from validation.metrics.intervals import pose_scores
-from validation.scenes.moving import Lens, drive, hand_held
-from validation.studies.moving_cameras import measure
+from validation.studies.moving_cameras import Lens, drive, hand_held, measure
 
 MAX_SIGMAS = 3.0
 

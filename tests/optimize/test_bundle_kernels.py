@@ -337,7 +337,7 @@ def test_the_gram_matrix_of_sparse_rows_is_that_of_dense_ones():
 @pytest.mark.parametrize("own", [False, True])
 def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
     rng, views = np.random.default_rng(0), 120
-    walk = make_walk(views, "street", rng)
+    walk = make_walk(views, rng)
     cameras, free = walk.cameras, np.array([True, False, False, False, False, True])
     if own:
         cameras = replace(

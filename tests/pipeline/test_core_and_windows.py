@@ -21,7 +21,7 @@ from validation.scenes.walks import SIZE, make_walk
 
 def street(views):
     """A street whose images share points with their neighbours only."""
-    walk = make_walk(views, "street", np.random.default_rng(1), sigma_px=0.3, denser=4)
+    walk = make_walk(views, np.random.default_rng(1), sigma_px=0.3, denser=4)
     c, seen = walk.cameras, walk.seen
     tracks = Tracks(seen.view_index, seen.point_index, seen.xy, views, len(walk.X))
     return TrueScene(c.K, c.R, c.t, walk.X, 0.02, tracks, np.tile(SIZE, (views, 1)))
@@ -145,7 +145,7 @@ def test_a_core_has_ties_with_parallax_and_doubles():
 
 
 def test_fixed_cameras_stay_and_the_others_converge():
-    walk = make_walk(12, "street", np.random.default_rng(0), sigma_px=0.0)
+    walk = make_walk(12, np.random.default_rng(0), sigma_px=0.0)
     cameras, X = walk.start(np.random.default_rng(1), size=0.01)
     fixed = np.arange(12) < 9
     for name in ("R", "t"):
@@ -159,7 +159,7 @@ def test_fixed_cameras_stay_and_the_others_converge():
 
 
 def test_threads_do_not_change_the_adjustment():
-    walk = make_walk(150, "street", np.random.default_rng(0), denser=3)
+    walk = make_walk(150, np.random.default_rng(0), denser=3)
     assert len(walk.seen.xy) > 3 * schur.CHUNK
     cameras, X = walk.start(np.random.default_rng(1))
     fits = [
@@ -197,7 +197,7 @@ def test_points_are_chosen_again_by_their_residuals(monkeypatch):
     noisy = np.arange(n) % 2 == 0
     shift = rng.normal(0.0, 1.0, scene.tracks.xy.shape) * noisy[scene.tracks.point_index, None]
     tracks = replace(scene.tracks, xy=scene.tracks.xy + shift)
-    cameras = make_walk(40, "street", np.random.default_rng(1)).cameras
+    cameras = make_walk(40, np.random.default_rng(1)).cameras
     model = _model.MetricEstimate(
         tracks, scene.sizes, cameras, np.ones(40, bool), scene.X, np.ones(n, bool),
         np.ones(len(tracks.xy), bool), 0.5,

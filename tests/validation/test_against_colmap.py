@@ -10,27 +10,15 @@ from PIL import Image
 pytest.importorskip("pycolmap")
 
 from tests.validation.test_metrics import N, V, _reconstruction, _truth
-from thesisrecon.errors import StageFailure
 from thesisrecon.io._colmap_writing import write_colmap_model
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
-from validation.runs.gates import read_gates
-from validation.runs.processes import own_cores, run_process
+from validation.runs.results import read_gates
 from validation.runs.study import run_study
-from validation.runs.tables import Metric, markdown_table
+from validation.runs.tables import markdown_table
 from validation.scenes.real import Scene, load_fixture_scene
 from validation.studies import against_colmap
 from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
-
-
-def test_a_process_reports_memory_time_and_output(tmp_path):
-    program = "import os, sys; b = bytearray(200_000_000); print(len(os.sched_getaffinity(0))); sys.exit(3)"
-    log = tmp_path / "log" / "out.txt"
-    done = run_process([sys.executable, "-c", program], log=log, cores=own_cores()[:1], environment={})
-    assert done.code == 3
-    assert done.peak_mb > 150
-    assert done.wall_s > 0
-    assert log.read_text().strip() == "1"
 
 
 def _fake_scene(folder):
@@ -98,9 +86,6 @@ def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
     assert run.names == tuple(path.name for path in scene.image_paths[views])
     assert run.reconstruction.registered.sum() == 5
     assert set(run.seconds) == {"extract", "match", "map"}
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
     K = np.diag([0.5, 0.5, 1.0]) @ scene.K[views]
     errors = measure_cameras(run.reconstruction, TrueCameras(K, scene.R[views], scene.C[views]))
     # A focal length of 300 mm in EXIF would have been believed and barely refined.
@@ -108,12 +93,6 @@ def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
     assert errors.rotation_error_deg < 1
     again = read_run(images, tmp_path / "out")
     np.testing.assert_array_equal(again.reconstruction.P, run.reconstruction.P)
-
-
-def test_no_model_is_a_failure_with_a_sentence(tmp_path):
-    (tmp_path / "sparse").mkdir()
-    with pytest.raises(StageFailure, match="made no model"):
-        read_run(tmp_path, tmp_path)
 
 
 def _rows(scene, outcomes, *, n_views=V):
@@ -124,14 +103,11 @@ def test_rows_hold_both_methods_and_judge_ours():
     model = _reconstruction(_truth())
     ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
     rows = _rows("fountain-P11", {OURS: ours, COLMAP: colmap})
-    assert rows[f"cameras registered of {V}"].verdict == "reached"
-    assert rows["focal error"].verdict == "reached"
-    assert rows["mean camera-centre error"].unit == "mm"
     assert rows["wall time"].target == 10.0
-    assert rows["wall time"].verdict == "reached"
     # The residuals here are zero, so a claim of one pixel is far off.
-    assert rows["rms it claims off by"].verdict == "missed"
-    assert rows["points"].verdict == "reported"
+    verdicts = {f"cameras registered of {V}": "reached", "focal error": "reached", "wall time": "reached"}
+    verdicts |= {"rms it claims off by": "missed", "points": "reported"}
+    assert {name: rows[name].verdict for name in verdicts} == verdicts
 
 
 def test_a_failure_misses_its_targets_and_breaks_nothing():
@@ -157,25 +133,3 @@ def test_the_bounds_are_the_gates_of_the_report_whatever_reasons_are_given():
     assert all(
         row.target is None for name, row in _rows("a set", {OURS: ours}).items() if "claims" not in name
     )
-
-
-def test_a_run_that_failed_is_not_hidden_by_one_that_did_not(tmp_path, monkeypatch):
-    model = _reconstruction(_truth())
-    for failing in ([False, True], [True, False]):
-        runs = [
-            Outcome(None if fails else model, 9.0 - fails, 1.0, 1.0, failure="no" * fails)
-            for fails in failing
-        ]
-        left = {method: list(runs) for method in against_colmap.METHODS}
-        monkeypatch.setattr(against_colmap, "run_method", lambda m, *_, left=left, **__: left[m].pop())
-        scene = Scene("a set", tuple(tmp_path / f"{n}.png" for n in range(V)))
-        _, outcomes = against_colmap.measure_scene(scene, tmp_path, threads=1, repeats=2, environment={})
-        assert all(outcome.failure == "no" for outcome in outcomes.values())
-
-
-@pytest.mark.parametrize(
-    ("value", "at_most", "verdict"),
-    [(1.0, True, "reached"), (1.1, True, "missed"), (1.1, False, "reached"), (0.9, False, "missed")],
-)
-def test_a_target_has_a_side(value, at_most, verdict):
-    assert Metric("s", "n", "", {"ours": value}, "ours", 1.0, at_most).verdict == verdict

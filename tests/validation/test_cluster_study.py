@@ -1,6 +1,5 @@
 """Simulated clusters: list scheduling of cases with known answers, and a toy run."""
 
-import math
 import pickle
 
 import pytest
@@ -30,13 +29,6 @@ def tasks_of(*seconds, sent=0, received=0):
 )
 def test_a_task_goes_to_the_first_free_worker(seconds, workers, expected):
     assert critical_path(tasks_of(*seconds), workers) == expected
-
-
-def test_a_long_list_keeps_all_workers_busy_and_no_order_is_worse_than_twice_the_bound():
-    seconds = [1.0 + math.sin(k) ** 2 for k in range(100)]
-    for workers in (2, 4, 8):
-        least = max(sum(seconds) / workers, max(seconds))
-        assert least <= critical_path(tasks_of(*seconds), workers) <= least + max(seconds)
 
 
 def test_arguments_and_results_share_one_line_each_way():
@@ -78,16 +70,3 @@ def test_the_efficiency_is_the_work_of_one_worker_by_workers_and_path():
     assert cells[1][:8] == ["features", "2", "3", "4.0", "2.00", "125.00", "0.00", "3.0"]
     assert cells[1][8:] == ["0.67", "5.0", "0.40"]
     assert cells[3] == ["whole run", "2", "", "6.0", "", "", "", "5.0", "0.60", "7.0", "0.43"]
-
-
-def test_large_batches_prepare_each_view_once(tmp_path):
-    meter = TaskMeter()
-    options = {"config": fake_config(), "threads": 1, "until": "matches"}
-    reconstruct(photographs(12), tmp_path, executor=meter, **options)
-    (matching,) = meter.matching.values()
-    few, many = meter.tasks(1)["matches"], meter.tasks(16)["matches"]
-    assert (len(few), len(many)) == (9, 66)
-    pairs = sum(task.seconds for task in matching.pairs.values())
-    assert sum(task.seconds for task in few) <= sum(task.seconds for task in many)
-    assert sum(task.seconds for task in few) >= pairs
-    assert sum(task.sent for task in few) < sum(task.sent for task in many)

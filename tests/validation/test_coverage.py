@@ -6,14 +6,7 @@ import pytest
 from validation.metrics.intervals import IntervalScores, holding_std
 from validation.scenes.dinosaur import load_dinosaur
 from validation.studies import calibration_coverage
-from validation.studies.calibration_coverage import one_camera
 from validation.studies.dinosaur import compare, to_metrics
-
-
-def test_a_value_that_all_views_share_counts_once():
-    scores = IntervalScores(np.array([[np.nan] * 3, [1.0] * 3, [1.0] * 3]), np.array([np.nan, 0.1, 0.1]))
-    assert one_camera(scores, "shared").z.shape == (1, 3)
-    assert one_camera(scores, "per-image") is scores
 
 
 def test_without_a_trusted_result_no_coverage_is_reached(monkeypatch):
@@ -43,12 +36,3 @@ def comparison():
 def test_all_cameras_are_found_and_explain_the_tracks_as_well_as_the_published_ones(comparison):
     missed = [row for row in to_metrics(comparison) if row.verdict == "missed"]
     assert not missed, missed
-
-
-@pytest.mark.real
-def test_hardly_an_observation_is_refused_and_the_noise_is_small(comparison):
-    found = comparison.reconstruction
-    assert found.inlier.mean() > 0.97
-    assert found.valid.mean() > 0.98
-    assert comparison.rms_px(comparison.ours) < 0.45
-    assert np.nanmedian(comparison.ours.px) < 0.25

@@ -8,11 +8,10 @@ from functools import cache
 
 import pytest
 
-from validation.runs.gates import read_gates
 from validation.runs.processes import own_cores
 from validation.runs.records import ReportOptions
 from validation.runs.report import run_tasks
-from validation.runs.results import collect
+from validation.runs.results import collect, read_gates
 from validation.runs.scenes import IMAGE_SCENES, available_scenes
 from validation.stages import STAGES
 

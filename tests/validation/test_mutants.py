@@ -3,10 +3,8 @@
 import ast
 from pathlib import Path
 
-import pytest
-
 from validation import mutants
-from validation.mutants import PACKAGES, Bench, Mutant, Verdict, draw, imports_of, mutants_of, table
+from validation.mutants import Bench, Mutant, Verdict, imports_of, mutants_of, table
 from validation.scenes.real import ROOT
 
 SOURCE = '''
@@ -55,18 +53,6 @@ def test_one_thing_changes_in_functions_and_nothing_in_settings_or_words(tmp_pat
     )
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_drawn_faults_are_python_and_repeatable(package):
-    drawn = draw(ROOT, package, 30, seed=1)
-    assert len(drawn) == 30
-    assert drawn == draw(ROOT, package, 30, seed=1) != draw(ROOT, package, 30, seed=2)
-    for mutant in drawn:
-        text = (ROOT / mutant.file).read_text(encoding="utf-8")
-        faulty = mutant.apply(text)
-        assert faulty != text
-        ast.parse(faulty)
-
-
 def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch):
     monkeypatch.setattr(Bench, "tree", ROOT)
     own, others = Bench(Path("nowhere")).judges("thesisrecon/geometry/three_view.py")
@@ -101,9 +87,3 @@ def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp
     assert judged == [4, 1]
     assert "4 faults, 100 % caught" in capsys.readouterr().out
     assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4
-
-
-def test_bad_options_give_a_usage_error(capsys):
-    with pytest.raises(SystemExit):
-        mutants.main(["--packages", "nothing"])
-    assert "invalid choice" in capsys.readouterr().err

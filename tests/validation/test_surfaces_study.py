@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.surface.sphere import photograph, ring_of
-from thesisrecon.records import DepthMap, Reconstruction, TexturedMesh, Tracks
-from validation.metrics import depth, surfaces
+from thesisrecon.records import DepthMap, Reconstruction, Tracks
+from validation.metrics import depth
 from validation.references.libraries import NoReference, load
 from validation.scenes.real import load_fixture_scene
 from validation.stages import surface as surface_stage
@@ -22,9 +22,6 @@ except NoReference as missing:
 def courtyard_map(view, factor, std):
     """The true depth of a view, ``factor`` times too far, in a world of half the size."""
     scene = load_fixture_scene("courtyard")
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
     true, stride, _ = depth.true_depth(scene, view)
     K = np.diag([1.0 / stride, 1.0 / stride, 1.0]) @ scene.K[view]
     P = K @ scene.R[view] @ np.column_stack([np.eye(3), -0.5 * scene.C[view]])
@@ -66,31 +63,6 @@ def test_depth_is_read_where_sparse_points_are_seen():
     np.testing.assert_allclose(one.deviations, [0.0, 2.0], atol=1e-4)
     assert one.known == pytest.approx(2 / 3)
     assert one.right == pytest.approx(1 / 3)
-
-
-def test_points_are_spread_evenly():
-    vertices = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [0, 0, 5], [1, 0, 5], [1, 1, 5]])
-    mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6]]))
-    points = surfaces.points_on(mesh, 9000)
-    low = points[:, 2] < 1.0
-    assert low.sum() == pytest.approx(8000, abs=20)
-    np.testing.assert_allclose(points[low].mean(axis=0), [2.0, 0.5, 0.0], atol=0.05)
-    assert points[low].min() >= 0.0
-    np.testing.assert_array_equal(points, surfaces.points_on(mesh, 9000))
-
-
-def test_expected_points_are_those_visible_in_two_images():
-    scene = load_fixture_scene("courtyard")
-    assert scene.K is not None
-    assert scene.R is not None
-    assert scene.C is not None
-    pixel = np.linalg.inv(scene.K[6]) @ [512.0, 384.0, 1.0]
-    true = surfaces.load_fixture_depth(6)[0][192, 256]
-    along = np.array([0.5, 1.0, 1.02, 1.5])[:, None] * true * (scene.R[6].T @ pixel) + scene.C[6]
-    count = surfaces.asked_for(along, scene)
-    assert count[0] >= 2  # in the air
-    assert count[1] >= 2
-    assert count[3] == 0  # behind the wall
 
 
 def test_ours_is_held_against_the_grid_of_open3d():

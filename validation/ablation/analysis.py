@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,17 +27,14 @@ from validation.ablation.study import Measure
 from validation.runs.tables import number, text_table
 
 Verdict = Literal["better", "worse", "negligible", "no difference shown", "no sample"]
-ALPHA = 0.05
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a variant with another under one condition, by one measure.
-
-    ``interval`` holds differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported`
-    returns quotients). ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from
-    it, "negligible" where the whole interval is, and "no sample" where there is no interval.
-    """
+    """Comparison of a variant with another under one condition, by one measure. ``interval`` holds
+    differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported` returns quotients).
+    ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from it, "negligible"
+    where the whole interval is, and "no sample" where there is no interval."""
 
     measure: Measure
     variant: str
@@ -83,11 +79,7 @@ class Analysis:
 
 
 def analyse(rows: Rows) -> Analysis:
-    """Compare all variants with the baseline on the same scene, seed and condition, and rank them.
-
-    Only pairs with the measure in both rows count; failures of a variant are counted separately. What is the
-    sample, draws or scenes, is the task's.
-    """
+    """Compare all variants with the baseline on the same scene, seed and condition, and rank them."""
     plan = rows.plan
     names = [v.name for v in plan.variants]
     others = [(name, plan.baseline) for name in names if name != plan.baseline]
@@ -171,7 +163,7 @@ def _verdict(found: Comparison, p: float) -> Verdict:
         return "no sample"
     if found.ratio and max(abs(found.interval.low), abs(found.interval.high)) <= found.measure.negligible:
         return "negligible"
-    if p > ALPHA:
+    if p > 0.05:
         return "no difference shown"
     return "better" if (found.interval.mean < 0.0) == (found.measure.better == "less") else "worse"
 
@@ -211,7 +203,6 @@ def _cells(table: _Table, measure: Measure) -> list[Cell]:
 
 
 def _warnings(rows: Rows) -> list[str]:
-    """Return warnings about the tables."""
     plan, found = rows.plan, []
     table = _Table(rows)
     if table.sample == "scenes" and len(table.groups) < MIN_SCENES:
@@ -220,15 +211,14 @@ def _warnings(rows: Rows) -> list[str]:
     missing = len(plan.rows) - len(rows)
     if missing:
         found.append(f"{missing} of {len(plan.rows)} rows have not been computed")
-    for scene, condition in itertools.product(dict.fromkeys(r.scene for r in plan.rows), plan.conditions):
-        here = [r for r in rows if (r.scene, r.condition) == (scene, condition.name)]
-        if here and all(r.failure for r in here):
-            where = f"{scene} ({condition.name})" if condition.name else scene
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for name in ("scene", "variant"):
+        for r in rows:
+            where = f"{r.scene} ({r.condition})" if name == "scene" and r.condition else getattr(r, name)
+            groups.setdefault((name, where), []).append(r)
+    for (_, where), here in groups.items():
+        if all(r.failure for r in here):
             found.append(f"every row of {where} failed: {here[0].failure}")
-    for variant in plan.variants:
-        here = [r for r in rows if r.variant == variant.name]
-        if here and all(r.failure for r in here):
-            found.append(f"every row of {variant.name} failed: {here[0].failure}")
     for measure in plan.measures:
         if len(rows) and not any(measure.name in r.metrics for r in rows):
             found.append(f"no row has the metric {measure.name}")
@@ -242,12 +232,11 @@ def text_of(analysis: Analysis) -> str:
     """Markdown: a table for each measure, and one of the rows that failed."""
     blocks = [f"warning: {w}" for w in analysis.warnings]
     blocks += [_measure_text(analysis, measure) for measure in analysis.plan.measures]
-    failed = [list(vars(f).values()) for f in failures_of(analysis.rows)]
+    failed = failures_of(analysis.rows)
     return "\n\n".join([*blocks, *([text_table(["failed", "scene", "why"], failed)] if failed else [])])
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """A variant that failed on a scene, for one reason."""
 
     variant: str

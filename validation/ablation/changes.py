@@ -3,16 +3,80 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from thesisrecon.config import KINDS, PipelineConfig, preset
 from thesisrecon.config.text import config_from_tables, dataclass_from_table
 from thesisrecon.errors import UsageError, unknown_word
-from validation.ablation.own import is_own, load_own
 from validation.ablation.study import FunctionTask
+
+PREFIX = "ablation_own_"
+
+
+@dataclass(frozen=True)
+class Source:
+    """User source file: module name, path and text."""
+
+    module: str
+    path: str
+    text: str
+
+    def install(self) -> ModuleType:
+        """The module of this text, run once in each process."""
+        if self.module not in sys.modules:
+            module = ModuleType(self.module)
+            module.__file__ = self.path
+            # A dataclass looks up its module during creation.
+            sys.modules[self.module] = module
+            try:
+                exec(compile(self.text, self.path, "exec"), module.__dict__)
+            except BaseException:
+                del sys.modules[self.module]
+                raise
+        return sys.modules[self.module]
+
+
+_SOURCES: dict[str, Source] = {}
+
+
+def is_own(word: str) -> bool:
+    """Return whether a word names something of a file: ``corners.py:MyCorners``."""
+    file, colon, name = word.rpartition(":")
+    return bool(colon) and file.endswith(".py") and name.isidentifier()
+
+
+def load_own(word: str, where: str, folder: Path = Path()) -> Any:
+    """Return the object named by ``word``, with a file relative to ``folder``."""
+    file, _, name = word.rpartition(":")
+    path = (folder / file).resolve()
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise UsageError(f"{where}: there is no file {path} to read {name} from") from None
+    digest = hashlib.sha256(f"{path}\0{text}".encode()).hexdigest()[:16]
+    source = Source(f"{PREFIX}{path.stem}_{digest}", str(path), text)
+    try:
+        module = source.install()
+    except Exception as error:
+        raise UsageError(f"{where}: {path} does not run: {type(error).__name__}: {error}") from None
+    _SOURCES[source.module] = source
+    if not hasattr(module, name):
+        public = [k for k, v in vars(module).items() if getattr(v, "__module__", "") == source.module]
+        raise UsageError(f"{where}: {unknown_word(f'name in {path.name}', name, public)}")
+    return getattr(module, name)
+
+
+def sources_of(modules: Iterable[str]) -> tuple[Source, ...]:
+    """The sources of those modules that are files of the user."""
+    return tuple(_SOURCES[m] for m in sorted(set(modules)) if m in _SOURCES)
+
 
 TASK = "task"
 STAGES = tuple(f.name for f in dataclasses.fields(PipelineConfig))
@@ -27,11 +91,7 @@ class Setting:
 
 
 def apply_changes(setting: Setting, changes: Mapping[str, Any], folder: Path) -> Setting:
-    """``setting`` with every change made, in order.
-
-    Raises :class:`UsageError` for a path that does not exist (naming the nearest), a value of another type, a
-    variant without the method of its stage, and values that a variant refuses.
-    """
+    """``setting`` with every change made, in order."""
     for path, value in changes.items():
         setting = _changed(setting, path, value, folder)
     return setting
@@ -96,16 +156,12 @@ def _check_variant(stage: str, value: Any) -> None:
         if not isinstance(value, wanted):
             raise UsageError(f"{stage} takes {wanted.__name__}; got {type(value).__name__}")
         return
-    missing = [n for n in methods_of(wanted) if not callable(getattr(value, n, None))]
+    methods = [n for n, v in vars(wanted).items() if not n.startswith("_") and callable(v)]
+    missing = [n for n in methods if not callable(getattr(value, n, None))]
     if missing:
         raise UsageError(
             f"{stage}: a {wanted.__name__} must have the method {missing[0]}; {type(value).__name__} has none"
         )
-
-
-def methods_of(protocol: type[Any]) -> list[str]:
-    """Return the method names of a protocol."""
-    return [n for n, v in vars(protocol).items() if not n.startswith("_") and callable(v)]
 
 
 def _is_object(value: Any) -> bool:
@@ -142,7 +198,6 @@ def level_name(path: str, value: Any) -> str:
 
 
 def _non_default_fields(value: Any) -> dict[str, Any]:
-    """The fields of an object that differ from what it has by default."""
     try:
         usual = type(value)()
     except TypeError:

@@ -18,9 +18,8 @@ from thesisrecon.io._files import printable
 from thesisrecon.runtime._signals import CODES, with_resume_advice
 from validation.ablation.analysis import analyse, failures_of
 from validation.ablation.page import write_analysis
-from validation.ablation.plan import Plan, plan_study
+from validation.ablation.plan import Plan, plan_study, read_study
 from validation.ablation.run import ProgressCallback, Rows, State, ablate, parts_of, read_rows
-from validation.ablation.toml import read_study
 
 KEPT = "run the same command to continue from the finished rows in {}"
 SHOWN = 20
@@ -98,7 +97,6 @@ def plan_summary(plan: Plan) -> str:
 
 
 def _summary(rows: Rows, page: Path) -> str:
-    """Failures, a line for each variant and scene, and the path of the page."""
     failed = sum(bool(r.failure) for r in rows)
     found = [f"{f.variant} failed on {f.scene}: {f.why}" for f in failures_of(rows)]
     more = [f"... and {len(found) - SHOWN} more on the page"] if len(found) > SHOWN else []

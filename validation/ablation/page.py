@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import join_claim
 from validation.ablation.analysis import (
     Analysis,
@@ -19,30 +20,23 @@ from validation.ablation.analysis import (
     comparison_text,
     failures_of,
     mean_text,
+    text_of,
 )
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
-from validation.ablation.tables import write_tables
 from validation.runs.page import plot_at, write_page
-from validation.runs.records import Plot, slug
-from validation.runs.rows import plot, scatter
-from validation.runs.tables import number
-from validation.stamp import commit
+from validation.runs.records import Plot, plot, scatter, slug
+from validation.runs.tables import commit, number, stamp, write_csv
 
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
 SYMBOLS = ("circle", "square", "diamond")
 LOGARITHMIC = {"type": "log"}
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
-MAX_LEVELS = 40
-"""Maximum number of rows in an interval plot."""
 
 
 def write_analysis(analysis: Analysis, out: str | Path) -> Path:
-    """Write ``index.html`` and the tables into ``out`` and return the path of the page.
-
-    Raises :class:`~thesisrecon.errors.OutputError` if the folder cannot be written.
-    """
+    """Write ``index.html`` and the tables into ``out`` and return the path of the page."""
     out = Path(out)
     with join_claim(out):
         tables, plan = write_tables(analysis, out), analysis.plan
@@ -126,7 +120,6 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
 
 
 def _about(drawn: Collection[str]) -> str:
-    """State the population of the intervals."""
     if drawn == {"scenes"}:
         return "The intervals generalise to similar scenes: the scenes are the sample."
     if drawn == {"draws"}:
@@ -192,9 +185,8 @@ def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell]) -> Plo
 
 
 def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) -> Plot | None:
-    """The differences from the baseline with their intervals, a row each."""
     shown = [c for c in comparisons if math.isfinite(c.interval.mean)]
-    if not shown or len(shown) > MAX_LEVELS:
+    if not shown or len(shown) > 40:
         return None
     ratio = all(c.ratio for c in shown)
     shown = [c for c in shown if c.ratio == ratio]
@@ -222,7 +214,6 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
 
 
 def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
-    """Plot accuracy over processor time with the Pareto front."""
     if len({c.variant for c in cells}) < 2 or len({c.condition for c in cells}) > 1:
         return None
     known = [c for c in cells if math.isfinite(c.mean) and math.isfinite(c.cost_s)]
@@ -250,3 +241,67 @@ def _with_unit(text: str, measure: Measure) -> str:
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+Record = Mapping[str, Any]
+
+
+def _row_records(analysis: Analysis) -> list[Record]:
+    """One flat table: a row each, with a column for every axis, condition and measure."""
+    plan = analysis.plan
+    levels = {v.name: v.levels for v in (*plan.variants, *plan.conditions)}
+    axes = list(dict.fromkeys(axis for level in levels.values() for axis in level))
+    other_names = (name for row in analysis.rows for name in row.metrics)
+    names = list(dict.fromkeys([*(m.name for m in plan.measures), *other_names]))
+    found: list[Record] = []
+    for row in analysis.rows:
+        stored = vars(row)
+        entries = {**levels[row.variant], **levels[row.condition]}
+        found.append(
+            {name: stored[name] for name in ("variant", "condition", "scene", "seed")}
+            | {f"axis:{axis}": entries.get(axis) for axis in axes}
+            | {name: row.metrics.get(name) for name in names}
+            | {name: stored[name] for name in ("failure", "seconds", "cost_s", "key")}
+        )
+    return found
+
+
+def _comparison_record(c: Comparison) -> Record:
+    mean, low, high = as_reported(c)
+    return {
+        "metric": c.measure.name,
+        "unit": c.measure.unit,
+        "variant": c.variant,
+        "against": c.against,
+        "condition": c.condition,
+        "of": "quotients" if c.ratio else "differences",
+        "mean": mean,
+        "low": low,
+        "high": high,
+        "p": c.interval.p,
+        "p_holm": c.p,
+        "effect_size": c.interval.effect,
+        "pairs": c.interval.pairs,
+        "sample": c.interval.sample,
+        "sample_size": c.interval.count,
+        "verdict": c.verdict,
+    }
+
+
+def _cell_record(c: Cell) -> Record:
+    own = {name: value for name, value in vars(c).items() if name != "measure"}
+    return {"metric": c.measure.name, "unit": c.measure.unit, **own}
+
+
+def write_tables(analysis: Analysis, out: Path) -> list[Path]:
+    """Write ``rows``, ``comparisons`` and ``means`` as CSV, and the tables for people as ``tables.md``."""
+    write_text(out / "tables.md", f"{stamp()}\n\n{text_of(analysis)}\n")
+    comparisons = [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)]
+    tables = {
+        "rows": _row_records(analysis),
+        "comparisons": comparisons,
+        "means": [_cell_record(c) for c in analysis.cells],
+    }
+    for name, records in tables.items():
+        write_csv(out / f"{name}.csv", records)
+    return [out / "tables.md", *(out / f"{name}.csv" for name in tables)]

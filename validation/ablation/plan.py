@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 import platform
+import tomllib
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,20 +17,33 @@ from typing import Any
 
 import thesisrecon
 from thesisrecon._code_digest import code_digest
-from thesisrecon.config import KINDS, PipelineConfig
-from thesisrecon.config.text import table_from_dataclass, tables_from_config
+from thesisrecon.config import KINDS, PipelineConfig, preset
+from thesisrecon.config.text import (
+    config_from_tables,
+    dataclass_from_table,
+    table_from_dataclass,
+    tables_from_config,
+)
 from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.io._files import read_bytes
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
-from validation.ablation.changes import STAGES, TASK, Setting, apply_changes, level_name
-from validation.ablation.own import PREFIX
+from validation.ablation.changes import (
+    PREFIX,
+    STAGES,
+    TASK,
+    Setting,
+    apply_changes,
+    is_own,
+    level_name,
+    load_own,
+)
 from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study
-from validation.ablation.tasks import Reconstruction
+from validation.ablation.tasks import TASKS, Reconstruction
 
 ROOT = Path(__file__).resolve().parents[1]
 RUN_BY_ROWS = ("scenes", "metrics", "references", "runs", "stages", "studies", "ablation/tasks")
 """Folders of the code that the rows run, without that of the library."""
-_VERSIONS = ("numpy", "scipy", "numba")
 Levels = Mapping[str, str]
 
 
@@ -74,11 +88,7 @@ class Plan:
 
 
 def plan_study(study: Study) -> Plan:
-    """Return the plan of a study.
-
-    Raises :class:`UsageError` for an unknown path, scene, metric or baseline, a wrong type, an axis without
-    values, and seeds that are not whole numbers.
-    """
+    """Return the plan of a study."""
     task = _task_of(study)
     start = Setting(study.config, task)
     variants = _variants(study)
@@ -192,7 +202,6 @@ def _scenes(study: Study, task: Any) -> tuple[str, ...]:
 
 
 def _axes(axes: Mapping[str, Axis], what: str) -> list[list[Variant]]:
-    """The levels of each axis."""
     if not isinstance(axes, Mapping):
         raise UsageError(f"the {what}es are a table: path or name -> levels; got {axes!r}")
     return [_levels(name, axis, what) for name, axis in axes.items()]
@@ -229,7 +238,6 @@ def _check_path(path: str, what: str) -> None:
 
 
 def _combined(axes: Sequence[Sequence[Variant]]) -> Iterator[Variant]:
-    """Every combination of levels."""
     for levels in itertools.product(*axes) if axes else ():
         yield _joined(levels, ", ".join(v.name for v in levels))
 
@@ -308,7 +316,6 @@ def _task_identity(task: Any) -> list[Any]:
 
 
 def _own_code(subject: Any) -> str:
-    """Return a digest of the code of a user."""
     module = getattr(subject, "__module__", type(subject).__module__)
     ours = module.split(".")[0] in ("thesisrecon", "validation")
     return "" if ours or module.startswith(PREFIX) else code_digest(subject)
@@ -325,5 +332,80 @@ def versions() -> dict[str, str]:
         "thesisrecon": thesisrecon.__version__,
         "code": content.hexdigest()[:16],
         "python": platform.python_version(),
-        **{name: version(name) for name in _VERSIONS},
+        **{name: version(name) for name in ("numpy", "scipy", "numba")},
     }
+
+
+_TEXTS = ("title", "words", "mode", "baseline", "start")
+_TABLES = ("axes", "conditions", "config")
+_KEYS = (*_TEXTS, *_TABLES, "task", "preset", "scenes", "seeds", "subsets", "metrics")
+
+
+def read_study(path: str | Path) -> Study:
+    """Read the study of a file."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(read_bytes(path).decode("utf-8"))
+    except OSError as error:
+        raise UsageError(f"the study {path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"the study {path} is not TOML: {error}") from None
+    try:
+        return study_from_table(table, path.parent)
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def study_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Study:
+    """Return the study of a table; its files are relative to ``folder``."""
+    for key, value in table.items():
+        if key not in _KEYS:
+            raise UsageError(unknown_word("key of a study", key, _KEYS))
+        if key in _TEXTS and not isinstance(value, str):
+            raise UsageError(f"{key} takes text; got {value!r}")
+        if key in _TABLES and not isinstance(value, Mapping):
+            raise UsageError(f"{key} takes a table; got {value!r}")
+    for key in ("scenes", "axes"):
+        if key not in table:
+            raise UsageError(f"a study needs {key}")
+    plain = {
+        key: table[key]
+        for key in (*_TEXTS, "axes", "conditions", "scenes", "seeds", "subsets")
+        if key in table
+    }
+    return Study(
+        **plain,
+        metrics=_metrics(table.get("metrics", [])),
+        task=_task(table.get("task", "reconstruction"), folder),
+        config=config_from_tables(table.get("config", {}), preset(table.get("preset", "default"))),
+        folder=folder,
+    )
+
+
+def _task(value: Any, folder: Path) -> Any:
+    """Return a task by kind or user file; a table also gives parameters."""
+    table = {"kind": value} if isinstance(value, str) else value
+    if not isinstance(table, Mapping) or not isinstance(table.get("kind"), str):
+        raise UsageError(f"task takes a kind, or a table with its kind and parameters; got {value!r}")
+    kind, fields = table["kind"], {k: v for k, v in table.items() if k != "kind"}
+    if not is_own(kind):
+        if kind not in TASKS:
+            raise UsageError(unknown_word("task", kind, TASKS))
+        return dataclass_from_table(TASKS[kind], fields, "task")
+    found = load_own(kind, "task", folder)
+    if isinstance(found, type):
+        return dataclass_from_table(found, fields, "task")
+    if fields:
+        raise UsageError(f"the task {kind} is a function and has no parameters; got {', '.join(fields)}")
+    return found
+
+
+def _metrics(names: Any) -> list[str | Measure]:
+    if not isinstance(names, list):
+        raise UsageError(f"metrics take a list; got {names!r}")
+    for item in names:
+        if not isinstance(item, str) and (not isinstance(item, Mapping) or "name" not in item):
+            raise UsageError(f"a metric is a name or a table with one; got {item!r}")
+    return [
+        item if isinstance(item, str) else dataclass_from_table(Measure, item, "metrics") for item in names
+    ]

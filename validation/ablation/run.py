@@ -15,20 +15,17 @@ from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.io._files import write_json
 from thesisrecon.io._outputs import join_claim
 from validation.ablation.plan import Plan, PlannedRow, plan_study
-from validation.ablation.store import STEPS, WORK, Outcome, Store, finite
 from validation.ablation.study import FunctionTask, Study
-from validation.ablation.workers import Job, Workers, pack, workers_of
-from validation.runs.jobs import run_jobs
+from validation.ablation.workers import STEPS, WORK, Job, Outcome, Store, Workers, finite, pack, workers_of
+from validation.runs.processes import run_jobs
 
 LOST = "the worker process of this row was killed or ran out of memory"
 
 
 @dataclass(frozen=True)
 class Row:
-    """A finished row: its place in the study and its outcome.
-
-    ``cost_s`` is the processor time (s) of the row including shared steps.
-    """
+    """A finished row: its place in the study and its outcome. ``cost_s`` is the processor time (s) of the row
+    including shared steps."""
 
     key: str
     variant: str
@@ -169,8 +166,7 @@ def parts_of(rows: Sequence[PlannedRow]) -> list[_Part]:
 
 
 def _chain(row: PlannedRow) -> Sequence[tuple[str, str]]:
-    """Return the steps of a row with keys, empty for a task without. The last one is the row itself
-    where its measures are all that is left."""
+    """Return the steps of a row with keys, empty for a task without steps."""
     steps = getattr(row.setting.task, "steps", None)
     return [] if steps is None else list(steps(row.setting.config, row.scene, row.seed))
 

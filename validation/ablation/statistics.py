@@ -28,20 +28,15 @@ STUDENTISED_FROM = 12
 MIN_SCENES = 3
 """Fewer scenes are no sample of scenes."""
 RESAMPLES = 4999
-_ROUNDING = 1e-6
-"""Differences that vary by less than this fraction of their mean do not vary."""
-_BLOCK = 2_000_000
 
 
 @dataclass(frozen=True)
 class Interval:
     """The mean of paired differences, its 95 % interval and two-sided p, and the effect size: the mean over
-    the standard deviation of a sampled value, with Hedges' correction for few.
-
-    ``count`` values of ``sample`` ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts
-    the differences. All but the mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES``
-    scenes, or draws that change nothing.
-    """
+    the standard deviation of a sampled value, with Hedges' correction for few. ``count`` values of ``sample``
+    ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts the differences. All but the
+    mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES`` scenes, or draws that change
+    nothing."""
 
     mean: float
     low: float
@@ -71,7 +66,8 @@ def paired_interval(groups: Sequence[F64], sample: Sample, *, level: float = 0.9
         if len(groups) < MIN_SCENES:
             return _without_sample(float(means.mean()), pairs, sample, len(groups))
         return _interval([means], [groups], level, pairs, sample)
-    settled = max(float(np.ptp(g)) for g in groups) <= _ROUNDING * np.abs(means).max()
+    # Differences that vary by less than this fraction of their mean do not vary.
+    settled = max(float(np.ptp(g)) for g in groups) <= 1e-6 * np.abs(means).max()
     if min(map(len, groups)) < 2 or settled:
         return _without_sample(float(means.mean()), pairs, sample, pairs)
     return _interval(groups, [[np.array([v]) for v in g] for g in groups], level, pairs, sample)
@@ -107,12 +103,11 @@ def _interval(
 
 
 def resampled_t(strata: Sequence[Sequence[F64]], *, resamples: int = RESAMPLES) -> F64:
-    """|t| of hierarchical resamples, ascending, (resamples,): values of each stratum are drawn with
-    replacement, then the differences inside each drawn value."""
+    """Return |t| (resamples,) of hierarchical resamples of strata, ascending."""
     rng = np.random.default_rng(0)
     mean = np.mean([np.mean([inner.mean() for inner in values]) for values in strata])
     found = []
-    block = max(1, _BLOCK // sum(len(inner) for values in strata for inner in values))
+    block = max(1, 2_000_000 // sum(len(inner) for values in strata for inner in values))
     for start in range(0, resamples, block):
         count = min(block, resamples - start)
         means, squared = np.zeros(count), np.zeros(count)
@@ -141,8 +136,7 @@ def _resampled_values(values: Sequence[F64], count: int, rng: np.random.Generato
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Adjust p-values for multiple comparisons (Holm 1979): all below alpha are jointly correct with a
-    probability of 1 - alpha. NaN is ignored."""
+    """Adjust p-values for multiple comparisons (Holm 1979); NaN is ignored."""
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(len(values), np.nan)
     known = np.flatnonzero(np.isfinite(values))
@@ -155,8 +149,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 def mean_ranks(blocks: F64) -> F64:
-    """Mean rank of each column (B, V) -> (V,), 1 the least of its row; equal values share their ranks, and
-    NaN come last."""
+    """Mean rank (V,) of each column of (B, V), 1 the least of its row; ties share ranks, NaN come last."""
     filled = np.where(np.isnan(blocks), np.inf, blocks)
     return np.asarray(stats.rankdata(filled, axis=1).mean(axis=0))
 

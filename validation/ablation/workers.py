@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -15,11 +16,78 @@ from pathlib import Path
 from typing import Any
 
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, unknown_word
+from thesisrecon.io._files import read_json, write_json
 from thesisrecon.runtime._executors import ProcessPool, available_threads
-from validation.ablation.changes import Setting
-from validation.ablation.own import Source, sources_of
-from validation.ablation.store import SHARED, WORK, Outcome
+from validation.ablation.changes import Setting, Source, sources_of
 from validation.ablation.study import Place
+
+ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """``metrics`` are its numbers; ``failure`` is the error message or empty. ``seconds`` is its wall time,
+    ``cpu_s`` its processor time; ``steps`` are the keys of reused shared steps. ``lost``: the process ended
+    before the row."""
+
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    failure: str = ""
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    steps: tuple[str, ...] = ()
+    lost: bool = False
+
+
+@dataclass(frozen=True)
+class Store:
+    """The folder of a study."""
+
+    path: Path
+
+    def prepare(self) -> None:
+        """Create the folder; :class:`OutputError` if it cannot be written."""
+        try:
+            for name in (ROWS, STEPS, SHARED, WORK):
+                (self.path / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"the output folder {self.path}", error) from None
+
+    def load(self, key: str, kind: str = ROWS) -> Outcome | None:
+        """Return the outcome of this key, or None if absent or damaged."""
+        record = read_json(self.path / kind / f"{key}.json")
+        try:
+            numbers = {str(name): float(value) for name, value in record["metrics"].items()}
+            return Outcome(
+                numbers,
+                str(record["failure"]),
+                float(record["seconds"]),
+                float(record["cpu_s"]),
+                tuple(record["steps"]),
+            )
+        except (TypeError, KeyError, ValueError, AttributeError):
+            return None
+
+    def save(self, key: str, outcome: Outcome, record: Mapping[str, Any], kind: str = ROWS) -> None:
+        """Store an outcome with the ``record`` of its row."""
+        found = {
+            # JSON has no NaN and no infinity; store them as words.
+            "metrics": {k: v if math.isfinite(v) else str(v) for k, v in outcome.metrics.items()},
+            "failure": outcome.failure,
+            "seconds": outcome.seconds,
+            "cpu_s": outcome.cpu_s,
+            "steps": list(outcome.steps),
+        }
+        write_json(self.path / kind / f"{key}.json", {**record, **found}, cached=True)
+
+
+def finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict[str, float], str]:
+    """Return the finite numbers of ``metrics`` and a message about missing ``wanted`` ones."""
+    good = {name: float(v) for name, v in metrics.items() if math.isfinite(float(v))}
+    missing = [name for name in wanted if name not in metrics]
+    broken = [f"{name} is {float(metrics[name])}" for name in wanted if name in metrics and name not in good]
+    absent = [f"the task returned no {', no '.join(missing)}"] if missing else []
+    return good, "; ".join([*broken, *absent])
+
 
 EXECUTORS = ("local", "processes")
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -27,8 +95,7 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 @dataclass(frozen=True)
 class Job:
-    """Input of a worker: ``setting`` as bytes, since user classes are known only after their source
-    is installed. ``step`` is the shared step to be prepared, empty for the row itself."""
+    """Input of a worker: ``setting`` as bytes; ``step`` is the shared step, empty for the row itself."""
 
     key: str
     setting: bytes
@@ -58,7 +125,6 @@ def _pickler() -> Any:
 
 
 def _modules(value: Any) -> set[str]:
-    """The modules of every object of a setting."""
     found, waiting = set(), [value]
     while waiting:
         item = waiting.pop()
@@ -71,8 +137,7 @@ def _modules(value: Any) -> set[str]:
 
 
 def carry_out(job: Job) -> Outcome:
-    """Compute the row or the requested step. Errors are recorded, not raised, except for a full disk
-    (:class:`OutputError`), because the row itself has not failed."""
+    """Compute the row or the step. Errors are recorded; a full disk raises :class:`OutputError`."""
     for source in job.sources:
         source.install()
     setting: Setting = pickle.loads(job.setting)
@@ -108,7 +173,6 @@ def _plain(metrics: Any) -> dict[str, float]:
 
 
 def _where(error: BaseException) -> str:
-    """Return file and line of an error, for the author of the variant."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next

@@ -24,12 +24,10 @@ class TrueCameras:
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the registered cameras; None if they are too few to be aligned.
-
-    ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
-    ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares
-    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is off.
-    """
+    """Errors of the registered cameras; None if they are too few to be aligned. ``focal_error_pct``: median
+    over views of |f / f_true - 1|, f the geometric mean of fx and fy. ``principal_point_error_px``: median
+    distance. ``centre_error``: mean distance after the least-squares similarity, in the truth's unit.
+    ``rotation_error_deg``: median angle after the common rotation is off."""
 
     focal_error_pct: float
     principal_point_error_px: float
@@ -53,11 +51,7 @@ class Reprojection:
 
 
 def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> CameraErrors:
-    """Compare the registered cameras with the truth of the same views.
-
-    Raises ``ValueError`` for a reconstruction that is not metric, has other views than the truth, or no
-    registered camera.
-    """
+    """Compare the registered cameras with the truth of the same views."""
     views = np.flatnonzero(reconstruction.registered)
     if reconstruction.stratum != "metric" or reconstruction.K is None or len(views) == 0:
         raise ValueError("measure_cameras needs a metric reconstruction with at least one registered camera")
@@ -83,10 +77,7 @@ def relative_centre_error(errors: CameraErrors, C: F64) -> float:
 
 
 def measure_reprojection(reconstruction: Reconstruction) -> Reprojection:
-    """Project every point into every registered view that sees it as an inlier, and measure the distances.
-
-    Raises ``ValueError`` if there is no such observation.
-    """
+    """Project every point into every registered view that sees it as an inlier, and measure the distances."""
     assert reconstruction.K is not None
     tracks = reconstruction.tracks
     kept = reconstruction.inlier & reconstruction.valid[tracks.point_index]

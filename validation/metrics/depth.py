@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.records import DepthMap, DisparityMap, Reconstruction, Similarity
 from validation.scenes.real import Scene, load_fixture_depth
@@ -15,17 +15,11 @@ from validation.scenes.stereo import StereoPair
 
 SAME = 0.01
 """Maximum relative depth error of a correct depth, and between views of the same point."""
-NORMAL_MEDIAN = 0.6745
-"""Median absolute value of a standard normal variable."""
-NEAR_TO_FAR = np.array(
-    [[48, 18, 59], [70, 107, 227], [40, 187, 236], [50, 242, 152], [238, 207, 58], [208, 48, 5]]
-)
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Errors of one map: relative ``error`` of its known depths (N,), ``deviations`` (N,) in units of
-    the stated standard deviation, and the shares ``known`` and ``right`` of the knowable pixels."""
+    """Relative ``error`` (N,) of known depths, and in ``deviations``; shares ``known`` and ``right``."""
 
     error: F64
     deviations: F64
@@ -35,9 +29,7 @@ class Judged:
 
 @dataclass(frozen=True)
 class JudgedMaps:
-    """Mean scores of all maps: ``median`` relative error, the shares ``right`` and ``known`` of what
-    can be known (means over the maps, and the ``worst`` map's share right), the share ``right_of_known``, and
-    the median error in stated ``deviations``, ideally 1."""
+    """Scores of all maps: median error, mean shares, worst share right, median of ``deviations``."""
 
     median: float
     right: float
@@ -52,7 +44,8 @@ def together(judged: Sequence[Judged]) -> JudgedMaps:
     if not judged:
         raise ValueError("there is no depth map to judge")
     error = np.concatenate([one.error for one in judged])
-    off = [float(np.median(one.deviations)) / NORMAL_MEDIAN for one in judged if len(one.deviations)]
+    # Median absolute value of a standard normal variable.
+    off = [float(np.median(one.deviations)) / 0.6745 for one in judged if len(one.deviations)]
     return JudgedMaps(
         float(np.median(error)) if len(error) else float("nan"),
         float(np.mean([one.right for one in judged])),
@@ -64,8 +57,7 @@ def together(judged: Sequence[Judged]) -> JudgedMaps:
 
 
 TrueDepth = tuple[F64, int, B8]
-"""True depth of a view (h, w), its stride in pixels of the image, and where another view sees the place
-too."""
+"""True depth of a view (h, w), its stride in pixels, and where another view sees the place."""
 
 
 def true_depth(scene: Scene, view: int) -> TrueDepth:
@@ -99,8 +91,7 @@ def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:
 
 
 def at_true_places(found: DepthMap, shape: tuple[int, int], stride: int, width_px: int) -> tuple[F64, F64]:
-    """Depths and deviations of a map at the samples of a true one of this ``shape`` and ``stride``, nearest
-    pixel; ``width_px`` is that of the image whose pixels the stride counts."""
+    """Depths and deviations of a map at the samples of a true one of this ``shape`` and ``stride``."""
     shrink = found.depth.shape[1] / width_px
     rows, columns = (
         np.clip(np.rint((stride * np.arange(n) + 0.5) * shrink - 0.5), 0, m - 1).astype(np.int64)
@@ -138,34 +129,6 @@ def judge_against_points(found: DepthMap, model: Reconstruction) -> Judged:
 def _judged(error: F64, deviations: F64, total: int) -> Judged:
     total = max(total, 1)
     return Judged(error, deviations, len(error) / total, float(np.sum(error < SAME)) / total)
-
-
-def depth_range(depths: Sequence[F32 | F64]) -> tuple[float, float]:
-    """1 and 99 % quantiles of the inverse depths, for :func:`depth_colours`; (0, 1) where none is known."""
-    known = np.concatenate([1.0 / d[np.isfinite(d)].astype(np.float64) for d in depths])
-    if not len(known):
-        return 0.0, 1.0
-    low, high = np.quantile(known, [0.01, 0.99])
-    return float(low), float(max(high, low + 1e-12))
-
-
-def depth_colours(depth: F32 | F64, limits: tuple[float, float]) -> U8:
-    """(H, W, 3): inverse depth between two ``limits``, near red, far blue, unknown black."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return error_colours((1.0 / depth.astype(np.float64) - limits[0]) / (limits[1] - limits[0]))
-
-
-def error_colours(share: F64) -> U8:
-    """(H, W, 3): 0 blue to 1 red, unknown black."""
-    known = np.isfinite(share)
-    return np.where(known[..., None], coloured(np.where(known, share, 0.0)), 0).astype(np.uint8)
-
-
-def coloured(share: F64) -> U8:
-    """(..., 3): 0 blue to 1 red, beyond as at the end."""
-    stops = np.linspace(0.0, 1.0, len(NEAR_TO_FAR))
-    rgb = [np.interp(np.clip(share, 0.0, 1.0), stops, NEAR_TO_FAR[:, k]) for k in range(3)]
-    return np.stack(rgb, axis=-1).astype(np.uint8)
 
 
 def bad_pixels(disparity: F32, pair: StereoPair, limit_px: float) -> float:

@@ -20,8 +20,7 @@ LEVEL = 1.96
 
 @dataclass(frozen=True)
 class IntervalScores:
-    """``z`` (V, 3): (value - truth) / std of :data:`NAMES`, NaN where a view is not registered or the value
-    was given; ``std_rel`` (V,): stated standard deviation of the focal over its value."""
+    """Errors ``z`` (V, 3) of :data:`NAMES` in their stds, or NaN; ``std_rel`` (V,) of the focal."""
 
     z: F64
     std_rel: F64
@@ -31,11 +30,6 @@ class IntervalScores:
         z = self.z[:, list(columns)]
         z = z[np.isfinite(z)]
         return float(np.mean(np.abs(z) <= LEVEL)) if len(z) else float("nan")
-
-    def worst(self, columns: Sequence[int] = (0, 1, 2)) -> float:
-        """Largest |z| of these columns; NaN without any."""
-        z = np.abs(self.z[:, list(columns)])
-        return float(np.nanmax(z)) if np.isfinite(z).any() else float("nan")
 
 
 def interval_scores(metric: MetricResult, K: F64) -> IntervalScores:

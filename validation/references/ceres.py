@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,33 +71,22 @@ def cameras_from_colmap(model: pycolmap.Reconstruction, like: MetricCameras) -> 
     return MetricCameras(R, t, np.array(rows), like.group, like.shared), X
 
 
-SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
-
-
 @dataclass(frozen=True)
 class CeresOptions:
-    """Options of Ceres: Huber's loss turns at ``loss_px``; ``principal_point`` frees it;
-    ``function_tolerance`` 0 is COLMAP's default, 1e-6 Ceres'; ``solver`` a name of :data:`SOLVERS`, or "" for
-    COLMAP's choice."""
+    """Huber's loss turns at ``loss_px``; ``function_tolerance`` 0 is COLMAP's default, 1e-6 Ceres'."""
 
     loss_px: float = np.inf
     principal_point: bool = False
     threads: int = 1
     function_tolerance: float = 1e-6
     max_iterations: int = 100
-    solver: str = ""
 
 
-@dataclass(frozen=True)
-class CeresResult:
-    """Result of Ceres: ``cost`` and ``initial_cost`` 1/2 sum rho in px^2, ``steps`` linear systems solved,
-    ``wall_s`` of everything from the model in memory to the refined model, ``cpu_s`` processor time."""
+class CeresResult(NamedTuple):
+    """Result of Ceres; the seconds do not include building the model."""
 
     cameras: MetricCameras
     X: F64
-    cost: float
-    initial_cost: float
-    steps: int
     wall_s: float
     cpu_s: float
 
@@ -109,14 +98,12 @@ def refine_with_ceres(
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     model = colmap_model(cameras, X, seen, size)
     wall, cpu = time.perf_counter(), time.process_time()
-    summary: Any = bundle_adjuster(model, options).solve()
+    bundle_adjuster(model, options).solve()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    report = summary.ceres_summary
     refined, points = cameras_from_colmap(model, cameras)
     moved = X.copy()
     moved[np.bincount(seen.point_index, minlength=len(X)) > 0] = points
-    steps = report.num_successful_steps + report.num_unsuccessful_steps
-    return CeresResult(refined, moved, report.final_cost, report.initial_cost, steps, wall, cpu)
+    return CeresResult(refined, moved, wall, cpu)
 
 
 def bundle_adjuster(model: pycolmap.Reconstruction, options: CeresOptions) -> pycolmap.CeresBundleAdjuster:
@@ -136,11 +123,6 @@ def bundle_adjuster(model: pycolmap.Reconstruction, options: CeresOptions) -> py
     solver = ceres.solver_options
     solver.num_threads, solver.max_num_iterations = options.threads, options.max_iterations
     solver.function_tolerance = options.function_tolerance
-    if options.solver:
-        ceres.auto_select_solver_type = False
-        solver.mergedict(
-            {"linear_solver_type": SOLVERS[options.solver], "preconditioner_type": "SCHUR_JACOBI"}
-        )
     return pycolmap.create_default_ceres_bundle_adjuster(adjustment, config, model)
 
 

@@ -11,28 +11,72 @@ import argparse
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from thesisrecon.errors import StageFailure
+import numpy as np
+
+from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
-from thesisrecon.records import Reconstruction
-from validation.references.colmap_reading import read_colmap_model
+from thesisrecon.io._models import read_model
+from thesisrecon.records import Reconstruction, Tracks
 from validation.references.libraries import pycolmap
 
-DEFAULT_FOCAL_REL = 1.2
+
+def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
+    """Read a COLMAP model as a metric reconstruction in the pixels of its images.
+
+    ``names`` number the views; those without an image are not registered. All points are valid and all
+    observations inliers. ``sigma_px`` is 1.4826 times the median absolute coordinate residual. UsageError
+    for missing or damaged files and for cameras other than pinholes with three radial coefficients,
+    ``ValueError`` for an image not in ``names``.
+    """
+    model = read_model(folder)
+    unknown = sorted(set(model.names) - set(names))
+    if unknown:
+        raise ValueError(f"names must hold each image once; missing: {unknown[:3]}")
+    V, N = len(names), len(model.X)
+    K, distortion, P = np.zeros((V, 3, 3)), np.zeros((V, 3)), np.zeros((V, 3, 4))
+    sizes, registered = np.zeros((V, 2), np.int64), np.isin(names, model.names)
+    index = np.array([names.index(name) for name in model.names], np.int64)
+    residual = np.zeros((len(model.xy), 2))
+    for k, (i, view) in enumerate(zip(index.tolist(), model.views, strict=True)):
+        if view.K is None or view.distortion is None or view.size is None:
+            raise UsageError(f"the camera of {view.name} has other distortion than three radial coefficients")
+        K[i], distortion[i], sizes[i] = view.K, view.distortion, view.size
+        P[i] = compose_camera(view.K, view.R, view.t)
+        here = model.view_index == k
+        # Points may lie in a camera's principal plane, or so far away that squares overflow.
+        with np.errstate(all="ignore"):
+            X = model.X[model.point_index[here]]
+            seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
+            residual[here] = np.abs(seen - model.xy[here])
+    residual = residual[np.isfinite(residual)]
+    order = np.lexsort((index[model.view_index], model.point_index))
+    view_index, point_index = index[model.view_index][order], model.point_index[order]
+    return Reconstruction(
+        stratum="metric",
+        P=P,
+        X=np.column_stack([model.X, np.ones(N)]),
+        registered=registered,
+        valid=np.ones(N, dtype=np.bool_),
+        inlier=np.ones(len(order), dtype=np.bool_),
+        tracks=Tracks(view_index, point_index, model.xy[order], V, N),
+        sizes=sizes,
+        sigma_px=1.4826 * float(np.median(residual)) if len(residual) else 0.0,
+        reasons=tuple("" if there else "not in the COLMAP model" for there in registered),
+        K=K,
+        distortion=distortion,
+    )
 
 
 def match_with_pycolmap(
     images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None
 ) -> dict[str, float]:
-    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both.
-
-    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database and
-    the times, ``pairs`` a file with two names of images in each line.
-    """
+    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both."""
     _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
 
@@ -66,10 +110,9 @@ def _begin(out: Path) -> None:
 
 
 def _guess_focals(database: Path) -> None:
-    """Replace every focal length, including EXIF ones, by a guess."""
     store = pycolmap.Database.open(database)
     for camera in store.read_all_cameras():
-        guess = DEFAULT_FOCAL_REL * max(camera.width, camera.height)
+        guess = 1.2 * max(camera.width, camera.height)
         camera.params = [guess, *camera.params[1:]]
         camera.has_prior_focal_length = False
         store.update_camera(camera)
@@ -78,8 +121,7 @@ def _guess_focals(database: Path) -> None:
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """Result of COLMAP: ``names[i]`` is view i of ``reconstruction`` (its largest
-    model, in our pixel convention), ``seconds`` of "extract", "match" and "map"."""
+    """``names[i]`` is view i of the largest model; ``seconds`` of "extract", "match" and "map"."""
 
     names: tuple[str, ...]
     reconstruction: Reconstruction
@@ -88,24 +130,38 @@ class ReferenceRun:
 
 def map_with_pycolmap(
     images: Path,
-    matched: Path,
     out: Path,
     *,
+    matched: Path | None = None,
     refine_principal_point: bool = False,
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
 ) -> None:
-    """Map the matches of ``match_with_pycolmap`` in ``matched``.
+    """Map the matches of ``match_with_pycolmap`` in ``out``, or in ``matched``, for :func:`read_run`.
 
-    ``out`` is another folder, emptied first, for :func:`read_run`; the global mapper (GLOMAP) refines what it
-    refines by default. Raises :class:`StageFailure` if COLMAP makes no model.
+    The global mapper (GLOMAP) refines what it refines by default. The models are not read: that is our work,
+    which would count as COLMAP's. Raises :class:`StageFailure` if COLMAP makes no model.
     """
-    if not (matched / "seconds.json").is_file():
-        raise StageFailure("COLMAP left no matches to start from")
-    _begin(out)
-    for name in ("database.db", "seconds.json"):
-        shutil.copy(matched / name, out / name)
-    _map(images, out, refine_principal_point, threads=threads, mapper=mapper)
+    if matched is not None:
+        if not (matched / "seconds.json").is_file():
+            raise StageFailure("COLMAP left no matches to start from")
+        _begin(out)
+        for name in ("database.db", "seconds.json"):
+            shutil.copy(matched / name, out / name)
+    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    pycolmap.set_random_seed(0)
+    paths, begun = (out / "database.db", images, out / "sparse"), time.perf_counter()
+    if mapper == "global":
+        paths[2].mkdir(exist_ok=True)
+        pycolmap.global_mapping(*paths, pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0))
+    else:
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
+        options.mapper.num_threads = threads
+        options.ba_refine_principal_point = refine_principal_point
+        pycolmap.incremental_mapping(*paths, options)
+    seconds["map"] = time.perf_counter() - begun
+    write_text(out / "seconds.json", json.dumps(seconds))
+    _model_folders(out)
 
 
 def read_run(images: Path, out: Path) -> ReferenceRun:
@@ -123,34 +179,6 @@ def _model_folders(out: Path) -> list[Path]:
     return folders
 
 
-def _map(
-    images: Path,
-    out: Path,
-    refine_principal_point: bool,
-    *,
-    threads: int,
-    mapper: Literal["incremental", "global"],
-) -> None:
-    """Map the database in ``out``, whose folder "sparse" the models go to, with COLMAP's defaults.
-
-    The models are not read: that is our work, which would count as COLMAP's.
-    """
-    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    pycolmap.set_random_seed(0)
-    paths, begun = (out / "database.db", images, out / "sparse"), time.perf_counter()
-    if mapper == "global":
-        paths[2].mkdir(exist_ok=True)
-        pycolmap.global_mapping(*paths, pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0))
-    else:
-        options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
-        options.mapper.num_threads = threads
-        options.ba_refine_principal_point = refine_principal_point
-        pycolmap.incremental_mapping(*paths, options)
-    seconds["map"] = time.perf_counter() - begun
-    write_text(out / "seconds.json", json.dumps(seconds))
-    _model_folders(out)
-
-
 def reconstruct_with_pycolmap(
     images: Path,
     out: Path,
@@ -159,14 +187,9 @@ def reconstruct_with_pycolmap(
     threads: int = 2,
     pairs: Path | None = None,
 ) -> None:
-    """SIFT, matching (of a list of ``pairs``, else of all) and incremental mapping with COLMAP's default
-    options, on the CPU.
-
-    ``images`` is a folder of images, ``out`` a folder that is emptied first and keeps the database, the
-    models and the times, for :func:`read_run`. Raises ``StageFailure`` if COLMAP makes no model.
-    """
+    """Match (all pairs or a list) and map a folder of images on the CPU; ``out`` is emptied first."""
     match_with_pycolmap(images, out, threads=threads, pairs=pairs)
-    _map(images, out, refine_principal_point, threads=threads, mapper="incremental")
+    map_with_pycolmap(images, out, refine_principal_point=refine_principal_point, threads=threads)
 
 
 def main() -> None:

@@ -115,10 +115,7 @@ SOLVERS: dict[str, Solver] = {
 
 
 def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> Estimate:
-    """F and inliers of matches (N, 2) px by one of ``SOLVERS``; never raises for hard data.
-
-    The inliers are in the order of the matches, independent of the shuffled order.
-    """
+    """F and inliers of matches (N, 2) px by one of ``SOLVERS``; never raises for hard data."""
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
     F, mask = SOLVERS[method](some1, some2, threshold_px, seed)

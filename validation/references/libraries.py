@@ -26,10 +26,8 @@ class NoReference(ImportError):
 
 
 class Library:
-    """The library ``module``, imported when something of it is first used.
-
-    Every use raises :class:`NoReference` if it cannot be had.
-    """
+    """The library ``module``, imported when something of it is first used. Every use raises
+    :class:`NoReference` if it cannot be had."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -39,10 +37,7 @@ class Library:
 
 
 def load(module: str) -> ModuleType:
-    """The reference library ``module``, one of :data:`PACKAGES`.
-
-    Raises :class:`NoReference` if it is missing or does not load.
-    """
+    """The reference library ``module``, one of :data:`PACKAGES`."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Open3D with our types: motions by ICP, distances to meshes, images of them, and surfaces of depth maps.
+"""Open3D with our types: distances to meshes, and surfaces of depth maps.
 
 Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
 (0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0
@@ -13,17 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64, U8
-from thesisrecon.camera import Camera, decompose_camera
+from thesisrecon.arrays import F64
+from thesisrecon.camera import decompose_camera
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
 
 
 def camera_of(P: F64, *, shift: float = 0.0) -> tuple[F64, F64]:
-    """K (3, 3) with its principal point moved by ``shift`` px, and the world-to-camera matrix (4, 4).
-
-    Raises ``ValueError`` for skew, which Open3D does not support.
-    """
+    """K (3, 3) with its principal point moved by ``shift`` px, and the world-to-camera matrix (4, 4)."""
     K, R, t = decompose_camera(P)
     if abs(K[0, 1]) > 1e-6 * K[0, 0]:
         raise ValueError(f"Open3D does not support skew; got {K[0, 1]:.3g} px")
@@ -42,24 +39,6 @@ def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
     return float(np.median(np.concatenate(widths)))
 
 
-ITERATIONS = 60
-
-
-def _cloud(X: F64) -> Any:
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(X, dtype=np.float64)))
-
-
-def refine_by_icp(moving: F64, fixed: F64, reach: float) -> F64:
-    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3); pairs are no
-    farther apart than ``reach``."""
-    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-9, 1e-9, ITERATIONS)
-    method = o3d.pipelines.registration.TransformationEstimationPointToPoint(False)
-    found = o3d.pipelines.registration.registration_icp(
-        _cloud(moving), _cloud(fixed), reach, np.eye(4), method, criteria
-    )
-    return np.array(found.transformation, dtype=np.float64)
-
-
 class Nearest:
     """A surface prepared for distance queries."""
 
@@ -75,28 +54,6 @@ class Nearest:
         return np.asarray(found.numpy(), dtype=np.float64)
 
 
-def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
-    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
-
-    Raises ``RuntimeError`` if the machine has no graphics that it can use.
-    """
-    width, height = camera.size
-    renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
-    material = o3d.visualization.rendering.MaterialRecord()
-    material.shader = "defaultUnlit"
-    drawn = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    )
-    if mesh.colors is not None:
-        drawn.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
-    renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
-    renderer.scene.view.set_post_processing(False)
-    renderer.scene.add_geometry("model", drawn, material)
-    K, world = camera_of(camera.P, shift=0.5)
-    renderer.setup_camera(K, world, width, height)
-    return np.asarray(renderer.render_to_image()).copy()
-
-
 def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
     """Reduce a mesh to a number of faces by quadric decimation (Garland and Heckbert 1997)."""
     full = o3d.geometry.TriangleMesh(
@@ -109,14 +66,9 @@ def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
 @dataclass(frozen=True)
 class OpenTsdf:
     """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
-
-    ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it.
-    ``truncation_voxels``. ``least_views``: how many maps must have seen a voxel.
-    """
+    ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it."""
 
     voxel_px: float = 1.5
-    truncation_voxels: float = 4.0
-    least_views: int = 1
 
     def fuse(self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView]) -> TexturedMesh:
         """The surface with colours of its vertices, means over the images ``views`` of the maps."""
@@ -132,7 +84,7 @@ class OpenTsdf:
         )
         for depth_map, view in zip(depth_maps, views, strict=True):
             self._integrate(grid, depth_map, view)
-        found = grid.extract_triangle_mesh(self.least_views - 0.5)
+        found = grid.extract_triangle_mesh(0.5)
         colors = np.clip(np.rint(found.vertex.colors.numpy()), 0, 255).astype(np.uint8)
         faces = found.triangle.indices.numpy().astype(np.int64)
         return TexturedMesh(found.vertex.positions.numpy().astype(np.float64), faces, colors=colors)
@@ -145,7 +97,7 @@ class OpenTsdf:
         color = o3d.t.geometry.Image(o3d.core.Tensor(view.rgb.astype(np.float32)))
         intrinsic, extrinsic = o3d.core.Tensor(K), o3d.core.Tensor(world)
         far = 1.01 * float(np.nanmax(depth_map.depth, initial=0.0)) + 1e-9
-        cut = (1.0, far, self.truncation_voxels)
+        cut = (1.0, far, 4.0)
         blocks = grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *cut)
         grid.integrate(blocks, depth, color, intrinsic, intrinsic, extrinsic, *cut)
 

@@ -45,8 +45,7 @@ Size = tuple[int, int]
 
 
 def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectification | None:
-    """``cv2.stereoRectifyUncalibrated`` (Hartley), the frame as large as the image as it is used there;
-    None if it refuses."""
+    """``cv2.stereoRectifyUncalibrated`` (Hartley) into the image's frame; None if it refuses."""
     done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
     if not done:
         return None
@@ -70,10 +69,8 @@ MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MOD
 @dataclass(frozen=True)
 class OpenCVSemiGlobal:
     """``cv2.StereoSGBM`` on colour, block 3, P1 = 216, P2 = 864, with its checks; ``mode`` one of ``MODES``.
-
-    It has no disparities for the left columns that a disparity of the range would take out of the image.
-    With ``widened`` the images are repeated to the left so that it has them.
-    """
+    It has no disparities for the left columns that a disparity of the range would take out of the image. With
+    ``widened`` the images are repeated to the left so that it has them."""
 
     mode: str
     widened: bool = True
@@ -97,8 +94,7 @@ HALF_WINDOW_PX = 5
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """``K`` (3, 3) and ``k1`` as OpenCV finds them, ``std`` (5,) its deviations of fx, fy, cx, cy, k1, and
-    ``rms_px`` of the corners."""
+    """``K`` (3, 3), ``k1``, ``std`` (5,) of fx, fy, cx, cy, k1 as OpenCV states them, and ``rms_px``."""
 
     K: F64
     k1: float
@@ -107,8 +103,7 @@ class BoardCalibration:
 
 
 def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
-    """(N, 2) inner corners, ``size`` along and across, row by row from the corner that comes first on the
-    image's diagonal; :class:`StageFailure` if OpenCV does not find them."""
+    """(N, 2) inner corners, row by row from the corner that comes first on the image's diagonal."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     found, corners = cv2.findChessboardCorners(grey, size)
     if not found:
@@ -122,8 +117,7 @@ def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
 
 
 def calibrate_from_corners(X: F64, corners: Sequence[F64], size: tuple[int, int]) -> BoardCalibration:
-    """``cv2.calibrateCamera`` of board points X (N, 3) and what each image of ``size`` shows of them;
-    free are fx, fy, cx, cy and k1."""
+    """``cv2.calibrateCamera`` of board points X (N, 3) and their images; free are fx, fy, cx, cy and k1."""
     points = [X.astype(np.float32)] * len(corners)
     places = [np.ascontiguousarray(xy, dtype=np.float32) for xy in corners]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3

@@ -22,8 +22,7 @@ ROWS = 512
 
 @dataclass(frozen=True)
 class SiftKeypoints:
-    """All keypoints of one image: ``xy`` (N, 2) px, ``size`` and ``response`` (N,), ``descriptors``
-    (N, 128)."""
+    """Keypoints of an image: ``xy`` (N, 2), ``size`` and ``response`` (N,), ``descriptors`` (N, 128)."""
 
     xy: F64
     size: F32
@@ -146,54 +145,3 @@ class SiftRatioTest:
 def sift_front_end(config: PipelineConfig) -> PipelineConfig:
     """The same pipeline with SIFT in the place of corners and correlation."""
     return replace(config, features=SiftCorners(), matching=SiftRatioTest())
-
-
-@dataclass(frozen=True)
-class AffineSift(SiftRatioTest):
-    """SIFT on simulated oblique views (``cv2.AffineFeature``), its second nearest descriptor elsewhere."""
-
-    apart_px: float = 8.0
-    neighbours: int = 8
-
-    def prepare(self, image: Image, features: Features) -> SiftKeypoints:  # noqa: ARG002
-        """The keypoints of all simulated views."""
-        sift = cv2.SIFT.create(AFFINE_KEYPOINTS, **SETTINGS)
-        keypoints, descriptors = cv2.AffineFeature.create(sift).detectAndCompute(grey_of(image), None)
-        size = np.array([k.size for k in keypoints], dtype=np.float32)
-        xy = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-        return SiftKeypoints(xy, size, size, np.asarray(descriptors, np.float32))
-
-    def match(
-        self,
-        view1: SiftKeypoints,
-        view2: SiftKeypoints,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental,  # noqa: ARG002
-        rng: np.random.Generator,  # noqa: ARG002
-    ) -> Matches:
-        """The best match of each place in both images."""
-        finder = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
-        found = finder.knnMatch(view1.descriptors, view2.descriptors, k=self.neighbours)
-        index = np.array([[m.trainIdx for m in row] for row in found], dtype=np.int64)
-        distance = np.array([[m.distance for m in row] for row in found])
-        off = view2.xy[index] - view2.xy[index[:, :1]]
-        elsewhere = np.hypot(off[..., 0], off[..., 1]) > self.apart_px
-        second = np.where(elsewhere, distance, distance[:, -1:]).min(axis=1)
-        one = np.flatnonzero(distance[:, 0] < self.ratio * second)
-        one = one[np.argsort(distance[one, 0], kind="stable")]
-        two = index[one, 0]
-        for side in (0, 1):
-            place = np.rint((view1.xy[one], view2.xy[two])[side] / 2.0)
-            rows = np.sort(np.unique(place, axis=0, return_index=True)[1])
-            one, two = one[rows], two[rows]
-        return _alike_matches(view1, view2, pair, one, two)
-
-
-AFFINE_KEYPOINTS = 2000
-"""Keypoints of each of the 43 simulated views."""
-
-
-def affine_sift_front_end(config: PipelineConfig) -> PipelineConfig:
-    """The same pipeline with SIFT on simulated views."""
-    return replace(config, features=SiftCorners(), matching=AffineSift())

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.errors import counted
+from validation.runs.records import scatter
 from validation.runs.results import Results, Row
-from validation.runs.rows import scatter
 from validation.runs.tables import number
 
 ROW_PX, FRAME_PX = 17, 90
@@ -68,7 +68,6 @@ def overview(results: Results, earlier: Results | None) -> dict[str, Any]:
         "rows": [],
         "references": [],
         "plots": plots,
-        "pictures": (),
         "notes": [*notes, *changes(results, earlier)],
     }
 

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import PIL.Image
-
 from thesisrecon import __version__
 from thesisrecon.errors import counted, made
 from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
 from validation.runs.overview import cost_ratio, overview
-from validation.runs.records import Judgement, Picture, Plot, ReportOptions, Stage, key_of, slug
+from validation.runs.records import Plot, ReportOptions, Stage, key_of, slug
 from validation.runs.report import Judged
 from validation.runs.results import Results, Row
 from validation.runs.tables import number
 
 HERE = Path(__file__).parent
 TEMPLATE = HERE / "report.html.j2"
-WIDEST_PX = 1400
-JPEG_QUALITY = 88
 
 
 @dataclass(frozen=True)
@@ -54,7 +48,7 @@ def write_pages(
     def write_scene(scene: str) -> None:
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         sections = [
-            _section(stages[name], rows, names) | _figures(options.folder(name, scene), name, judgement)
+            _section(stages[name], rows, names) | {"notes": judgement.notes}
             for (name, where), (judgement, _) in judged.items()
             if where == scene
         ]
@@ -78,10 +72,7 @@ def write_pages(
     write_page(
         options.out / "index.html",
         TEMPLATE,
-        [
-            overview(results, earlier),
-            *(section for section in whole if section["rows"]),
-        ],
+        [overview(results, earlier), *(section for section in whole if section["rows"])],
         title="Ours and the references",
         links=links,
         verdict=_verdict(results.rows, results.missing),
@@ -126,17 +117,7 @@ def _section(stage: Stage, rows: Sequence[Row], names: Mapping[str, str]) -> dic
         "rows": [_row(row, names) for row in rows],
         "references": list(dict.fromkeys(name for row in rows for name in row.reference)),
         "plots": (),
-        "pictures": (),
         "notes": (),
-    }
-
-
-def _figures(folder: Path, stage: str, judgement: Judgement) -> dict[str, Any]:
-    """Return what the judgement in the folder ``folder`` adds to the section of its stage."""
-    return {
-        "plots": [plot_at(f"{slug(stage)}-{n}", plot) for n, plot in enumerate(judgement.plots)],
-        "pictures": [_picture(folder, picture) for picture in judgement.pictures],
-        "notes": judgement.notes,
     }
 
 
@@ -153,20 +134,3 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
 def plot_at(folder: str, plot: Plot) -> dict[str, Any]:
     """Return a plot as an entry of a section; ``folder`` becomes part of its identifier."""
     return {"id": f"plot-{folder}", **vars(plot), "solid": "scene" in plot.figure.get("layout", {})}
-
-
-def _picture(folder: Path, picture: Picture) -> dict[str, Any]:
-    """Return the image as a data URL at page width."""
-    with PIL.Image.open(folder / picture.file) as opened:
-        rgb = opened.convert("RGB")
-    rgb.thumbnail((WIDEST_PX, WIDEST_PX))
-    sink = io.BytesIO()
-    rgb.save(sink, "JPEG", quality=JPEG_QUALITY)
-    address = "data:image/jpeg;base64," + base64.b64encode(sink.getvalue()).decode("ascii")
-    return {
-        "address": address,
-        "title": picture.title,
-        "caption": picture.caption,
-        "width": rgb.width,
-        "height": rgb.height,
-    }

@@ -1,4 +1,7 @@
-"""Run child processes on given cores with a time limit, and measure processes and calls."""
+"""Jobs, child processes on given cores with a time limit, and measured calls.
+
+A child ends with the thread that started it (``prctl(PR_SET_PDEATHSIG)``).
+"""
 
 from __future__ import annotations
 
@@ -9,29 +12,51 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from threading import Event
+from typing import Any, TypeVar
 
 from thesisrecon.io._files import write_text
 from thesisrecon.runtime._signals import kill_on_exit
 from validation.scenes.real import ROOT
 
-POLL_S = 0.02
+Job = TypeVar("Job")
+Answer = TypeVar("Answer")
+
+
+def run_jobs(
+    waiting: list[Job],
+    submit: Callable[[Job], Future[Answer]],
+    is_ready: Callable[[Job, Collection[Job]], bool],
+    most: int,
+) -> Iterator[list[tuple[Job, Future[Answer]]]]:
+    """Submit jobs in order as soon as they are ready, at most ``most`` at a time; yield those that ended."""
+    running: dict[Future[Answer], Job] = {}
+    while waiting or running:
+        for job in tuple(waiting):
+            if len(running) < most and is_ready(job, running.values()):
+                waiting.remove(job)
+                running[submit(job)] = job
+        done, _ = wait(running, return_when=FIRST_COMPLETED)
+        yield [(running.pop(future), future) for future in done]
+
+
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 _PIN = (
-    "import os, sys; os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(',')}); "
+    "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); "
+    "os.sched_setaffinity(0, {int(c) for c in sys.argv[1].split(',')}); "
     "os.execv(sys.argv[2], sys.argv[2:])"
 )
 
 
 @dataclass(frozen=True)
 class Process:
-    """How a child ended: exit ``code`` (negative: signal), wall and processor seconds, peak memory, and
-    whether it timed out."""
+    """How a child ended: exit ``code`` (negative: signal), seconds, memory, and whether it timed out."""
 
     code: int
     wall_s: float
@@ -53,10 +78,13 @@ def run_process(
     environment: Mapping[str, str],
     limit_s: float | None = None,
     cwd: Path = ROOT,
+    stop: Event | None = None,
+    loaded: Path | None = None,
 ) -> Process:
     """Run ``command`` in the folder ``cwd`` on these cores and wait; its output goes to the file ``log``.
 
-    After ``limit_s`` the child and its children are killed.
+    After ``limit_s``, or if ``stop`` is set, the child and its children are killed. If a file ``loaded`` is
+    given, the time counts from when the child writes it, after its imports.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start, timed_out = time.perf_counter(), False
@@ -78,10 +106,13 @@ def run_process(
                     pid, status, usage = os.wait4(child.pid, os.WNOHANG)
                     if pid:
                         break
-                    if not timed_out and limit_s is not None and time.perf_counter() - start > limit_s:
-                        timed_out = True
+                    if loaded is not None and not loaded.is_file():
+                        start = time.perf_counter()
+                    late = limit_s is not None and time.perf_counter() - start > limit_s
+                    if (stop is not None and stop.is_set()) or (late and not timed_out):
+                        timed_out = late
                         kill()
-                    time.sleep(POLL_S)
+                    time.sleep(0.02)
         except BaseException:
             kill()
             raise
@@ -131,16 +162,9 @@ def reset_peak() -> None:
 
 
 def call_apart(
-    function: Callable[..., Any],
-    *arguments: Any,
-    cores: int = 2,
-    environment: Mapping[str, str] = ONE_THREAD,
+    function: Callable[..., Any], *arguments: Any, cores: int = 2, environment: Mapping[str, str] = ONE_THREAD
 ) -> tuple[Any, Process]:
-    """Call a module-level function in a new process on its own cores.
-
-    Arguments and answer are written as JSON. Return the answer and what the process used; ``RuntimeError``
-    with the end of its output if it fails.
-    """
+    """Call a module-level function in a new process on its own cores."""
     with tempfile.TemporaryDirectory() as folder:
         answer, log = Path(folder) / "answer.json", Path(folder) / "log"
         name = f"{function.__module__}:{function.__name__}"

@@ -7,7 +7,7 @@ A run may resume another one: references are reused, and our results where setti
 Own methods have names that begin with "ours". Only numbered folders of a library run are copied; the library
 itself checks whether settings and code of a stage have changed.
 
-As a program (of the process pool) it runs one task: OPTIONS STAGE SCENE [METHOD]; without a method, the
+As a program it runs one task: OPTIONS STAGE SCENE [METHOD]; without a method, the
 judgement on the outcomes in ``outcomes.json``.
 """
 
@@ -17,10 +17,14 @@ import importlib
 import json
 import shutil
 import sys
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
 from typing import Any
 
 from thesisrecon.errors import StageFailure
@@ -28,11 +32,8 @@ from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import clear_folder
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
-from validation.runs.jobs import run_jobs
-from validation.runs.process_pool import ProcessPool
-from validation.runs.processes import failure_of, last_line, own_cores
-from validation.runs.records import Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
-from validation.runs.rows import OURS
+from validation.runs.processes import failure_of, last_line, own_cores, run_jobs, run_process
+from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task
 from validation.runs.tables import Metric
 
 Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
@@ -65,16 +66,17 @@ def run_tasks(options: ReportOptions, stages: Mapping[str, Stage], report: Calla
     write_text(options.out / "options.json", json.dumps(options.to_json()))
     tasks = tasks_of(options, stages)
     ended = {} if earlier is None else reuse_results(earlier, options, tasks, stages)
-    behind = tasks_behind(tasks, stages)
-    # Start long chains first to finish early.
-    waiting = sorted((task for task in tasks if task not in ended), key=lambda task: -behind[task])
+    waiting = [task for task in tasks if task not in ended]
+    idle, stop = SimpleQueue[int](), Event()
     cores = own_cores()[: options.threads]
-    modules = ("validation.runs.report", options.stages_from)
+    for core in cores:
+        idle.put(core)
     # On an interrupt the processes end first: their threads wait for nothing else.
-    with ThreadPoolExecutor(len(cores)) as threads, ProcessPool(modules, cores, ENVIRONMENT) as pool:
+    with ThreadPoolExecutor(len(cores)) as threads, ExitStack() as stack:
+        stack.callback(stop.set)
         jobs = run_jobs(
             waiting,
-            lambda task: threads.submit(_run_task, task, options, dict(ended), pool),
+            lambda task: threads.submit(_run_task, task, options, dict(ended), idle, stop),
             lambda task, running: _is_ready(task, waiting, running, ended, stages),
             len(cores),
         )
@@ -83,29 +85,11 @@ def run_tasks(options: ReportOptions, stages: Mapping[str, Stage], report: Calla
                 ended[task] = future.result()
                 # In task order, so that tables do not depend on the order of completion.
                 ended = {t: ended[t] for t in tasks if t in ended}
-                report(f"[{len(ended)}/{len(tasks)}] {_progress_line(task, ended[task])}")
+                name = f"{task.scene}: {task.stage}, {task.method or 'judged'}"
+                spent = ended[task].failure or f"{ended[task].wall_s:.1f} s"
+                report(f"[{len(ended)}/{len(tasks)}] {name}: {spent}")
     judged = [task for task in ended if task.method == JUDGE]
     return {(t.stage, t.scene): (_judgement(ended[t]), _outcomes(t, ended)) for t in judged}
-
-
-def tasks_behind(tasks: list[Task], stages: Mapping[str, Stage]) -> dict[Task, int]:
-    """Return how many tasks depend, directly or indirectly, on each."""
-    followers: dict[Task, set[Task]] = {task: set() for task in tasks}
-    for task in tasks:
-        before = [Task(s, task.scene, method) for s, method in stages[task.stage].needs(task.method)]
-        if task.method == JUDGE:
-            before += [t for t in tasks if (t.stage, t.scene) == (task.stage, task.scene) and t != task]
-        for other in before:
-            if other in followers:
-                followers[other].add(task)
-
-    def reached(task: Task, seen: set[Task]) -> set[Task]:
-        for follower in followers[task] - seen:
-            seen.add(follower)
-            reached(follower, seen)
-        return seen
-
-    return {task: len(reached(task, set())) for task in tasks}
 
 
 def _is_ready(
@@ -136,7 +120,7 @@ def _is_ours(task: Task) -> bool:
 
 
 def _run_task(
-    task: Task, options: ReportOptions, ended: Mapping[Task, Outcome], pool: ProcessPool
+    task: Task, options: ReportOptions, ended: Mapping[Task, Outcome], idle: SimpleQueue[int], stop: Event
 ) -> Outcome:
     folder = options.folder(task.stage, task.scene, task.method)
     folder.mkdir(parents=True, exist_ok=True)
@@ -148,13 +132,23 @@ def _run_task(
         arguments.append(task.method)
     # Outside the task folder, which the task may empty.
     log = folder.with_name(f"{folder.name}.log")
-    process = pool.run(arguments, log=log, limit_s=options.limit_s)
+    command, core = [sys.executable, "-m", "validation.runs.report", *arguments], idle.get()
+    loaded = _loaded_file(folder)
+    limits: dict[str, Any] = {"limit_s": options.limit_s, "stop": stop, "loaded": loaded}
+    try:
+        process = run_process(command, log=log, cores=[core], environment=ENVIRONMENT, **limits)
+    finally:
+        idle.put(core)
     failure = failure_of(process, last_line(log), options.limit_s)
-    return Outcome(folder, failure, process.wall_s, process.cpu_s, process.peak_mb)
+    imports_s = float(loaded.read_text(encoding="utf-8")) if loaded.is_file() else 0.0
+    return Outcome(folder, failure, process.wall_s, process.cpu_s - imports_s, process.peak_mb)
+
+
+def _loaded_file(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.loaded")
 
 
 def _outcomes(task: Task, ended: Mapping[Task, Outcome]) -> dict[str, Outcome]:
-    """Return the outcomes of the methods of this judgement, in task order."""
     return {
         t.method: outcome
         for t, outcome in ended.items()
@@ -168,18 +162,11 @@ def _judgement(outcome: Outcome) -> Judgement:
     record: dict[str, Any] = json.loads((outcome.folder / JUDGEMENT).read_text(encoding="utf-8"))
     return Judgement(
         [Metric(**metric) for metric in record["metrics"]],
-        [Plot(**plot) for plot in record["plots"]],
-        [Picture(**picture) for picture in record["pictures"]],
         record["notes"],
     )
 
 
-def _progress_line(task: Task, outcome: Outcome) -> str:
-    name = f"{task.scene}: {task.stage}, {task.method or 'judged'}"
-    return f"{name}: {outcome.failure or f'{outcome.wall_s:.1f} s'}"
-
-
-# ---------------------------------------------------------------- one task, in a process of the pool
+# ---------------------------------------------------------------- one task, in a process of its own
 
 
 def main(arguments: list[str]) -> int:
@@ -187,6 +174,7 @@ def main(arguments: list[str]) -> int:
     options_file, stage, scene, *method = arguments
     options = ReportOptions.from_json(json.loads(Path(options_file).read_text(encoding="utf-8")))
     stages: dict[str, Stage] = importlib.import_module(options.stages_from).STAGES
+    write_text(_loaded_file(options.folder(stage, scene, *method)), f"{time.process_time()}")
     try:
         if method:
             options.folder(stage, scene, method[0]).mkdir(parents=True, exist_ok=True)
@@ -200,7 +188,6 @@ def main(arguments: list[str]) -> int:
 
 
 def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
-    """Store the judgement with the messages of the methods that failed."""
     folder = options.folder(stage.name, scene)
     outcomes = read_outcomes(folder)
     judgement = stage.judge(scene, outcomes, options)
@@ -216,7 +203,6 @@ def read_outcomes(folder: Path) -> dict[str, Outcome]:
 
 
 def _plain_number(value: Any) -> Any:
-    """Convert NumPy numbers and arrays for JSON."""
     if hasattr(value, "tolist"):
         return value.tolist()
     raise TypeError(f"{type(value)} cannot be stored in a judgement")
@@ -226,10 +212,7 @@ def _plain_number(value: Any) -> Any:
 
 
 def earlier_run(options: ReportOptions) -> ReportOptions | None:
-    """Return the options of the run to start from, None if there is none to start from.
-
-    Raises ``ValueError`` if the folder holds no run, or one with different options.
-    """
+    """Return the options of the run to start from, None if there is none to start from."""
     if not options.resume:
         return None
     other = _options_of(Path(options.resume))
@@ -293,3 +276,7 @@ def _copy_inputs(
         folder = other.folder(stage, task.scene, method)
         if stage not in options.stages and folder.is_dir():
             shutil.copytree(folder, options.folder(stage, task.scene, method), dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,56 @@ import numpy as np
 
 from thesisrecon.io._files import read_bytes, write_text
 from validation.references.libraries import PACKAGES
-from validation.runs.gates import Gate
 from validation.runs.records import Judgement, Outcome, ReportOptions, key_of
-from validation.runs.tables import Metric, write_csv
-from validation.stamp import commit
+from validation.runs.tables import Metric, commit, machine, write_csv
 
-OWN_PACKAGES = ("thesisrecon", "numpy", "scipy", "numba")
+GATES_FILE = Path(__file__).resolve().parents[1] / "gates.toml"
+
+
+@dataclass(frozen=True)
+class Gate:
+    """``key`` of the number ("stage/scene/name"), ``limit``, its direction and the ``reason``."""
+
+    key: str
+    limit: float
+    at_most: bool
+    reason: str
+
+    def holds(self, value: float | None) -> bool:
+        """Return whether a number meets the limit; a missing number does not."""
+        if value is None or value != value:
+            return False
+        return value <= self.limit if self.at_most else value >= self.limit
+
+
+def camera_limit(scene: str, name: str) -> float | None:
+    """Return the limit of a number of the stage "cameras", None where nothing is promised."""
+    gate = _shipped_gates().get(f"cameras/{scene}/{name}")
+    return None if gate is None else gate.limit
+
+
+@cache
+def _shipped_gates() -> dict[str, Gate]:
+    return read_gates()
+
+
+def read_gates(path: Path = GATES_FILE) -> dict[str, Gate]:
+    """Read the gates by key."""
+    gates = {}
+    for key, entry in tomllib.loads(path.read_text(encoding="utf-8")).items():
+        limits = [name for name in ("at_most", "at_least") if name in entry]
+        unknown = sorted(set(entry) - {"at_most", "at_least", "reason"})
+        if len(limits) != 1 or unknown or not str(entry.get("reason", "")).strip():
+            raise ValueError(f"a gate has one of at_most and at_least, and a reason; {key} has {entry}")
+        if key.count("/") != 2:
+            raise ValueError(f"a gate is called stage/scene/number; got {key!r}")
+        gates[key] = Gate(key, float(entry[limits[0]]), limits[0] == "at_most", str(entry["reason"]))
+    return gates
 
 
 @dataclass(frozen=True)
 class Row:
-    """A reported number: ours (``value``) and the references; ``direction`` is the good side of the
-    ``limit``."""
+    """A number of ours (``value``) and the references; ``direction`` is the good side of the ``limit``."""
 
     key: str
     value: float | None
@@ -97,13 +136,12 @@ def collect(
 
 def environment(options: ReportOptions) -> dict[str, Any]:
     """Return the environment of the run."""
-    versions = {name: _version(name) for name in (*OWN_PACKAGES, *PACKAGES.values())}
+    versions = {
+        name: _version(name) for name in (*("thesisrecon", "numpy", "scipy", "numba"), *PACKAGES.values())
+    }
     return {
         "commit": commit(),
-        "machine": platform.machine(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.release()}",
+        "machine": machine(),
         "python": platform.python_version(),
         **versions,
         "threads": f"{options.threads} parallel tasks, one thread each",
@@ -135,10 +173,7 @@ def write_results(out: Path, results: Results) -> None:
 
 
 def read_results(out: Path) -> Results:
-    """Read the run in this folder.
-
-    Raises ``ValueError`` if there is none.
-    """
+    """Read the run in this folder."""
     try:
         record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
         return Results(**{**record, "rows": [Row(**row) for row in record["rows"]]})
@@ -148,12 +183,3 @@ def read_results(out: Path) -> Results:
 
 def _finite(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return named[0] if named else platform.processor()

@@ -10,8 +10,7 @@ from validation.scenes.real import (
     SUFFIXES,
     Scene,
     data_root,
-    load_fixture_scene,
-    load_real_scene,
+    load_scene,
     read_scene,
     real_folder,
     with_truth,
@@ -21,8 +20,7 @@ from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 IMAGE_SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 QUICK = ("courtyard", "boards", "cloud", "street", "Tsukuba")
 SYNTHETIC = ("boards", "cloud", "street")
-"""Synthetic scenes, generated on demand: images of a chessboard; points seen by a few
-cameras; a walk of cameras."""
+"""Synthetic scenes: images of a chessboard, points seen by a few cameras, a walk of cameras."""
 
 
 def available_scenes(*, quick: bool) -> tuple[str, ...]:
@@ -49,7 +47,7 @@ def load_images(name: str, options: ReportOptions) -> Scene:
     """
     if name in options.folders:
         return _own_scene(Path(options.folders[name]), name)
-    scene = load_fixture_scene(name) if name == "courtyard" else load_real_scene(name)
+    scene = load_scene(name)
     if scene is None:
         raise ValueError(f"the images of {name} are not on this machine")
     return scene

@@ -1,10 +1,10 @@
 """Run the studies: ``python -m validation study NAME [--option ...]``, ``python -m validation study --list``.
 ``python -m validation study all -o OUT`` runs them all, the ablations and the report, which takes hours.
 
-A study is a generator function ``NAME_study`` in a module of that name in ``validation/studies``. Its keyword
-parameters with their defaults and annotations are the options of the command, which :data:`HELP` explains. It
-yields parts: a list of :class:`Metric` rows (one table under the scene of the first row) or a string (printed
-as it is). The exit code is 1 if a bound is missed, 2 if an option or the data are missing.
+A study is a generator function ``NAME_study`` in ``validation/studies``. Its keyword parameters with their
+defaults and annotations are the options of the command, which ``studies.toml`` explains. It yields parts: a
+list of :class:`Metric` rows (one table under the scene of the first row) or a string (printed as it is). The
+exit code is 1 if a bound is missed, 2 if an option or the data are missing.
 
 A parameter ``out : Path`` is a folder that keeps what the study makes; without ``--out`` it is temporary.
 """
@@ -14,8 +14,10 @@ from __future__ import annotations
 import argparse
 import inspect
 import os
+import re
 import sys
 import tempfile
+import tomllib
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,88 +29,20 @@ from typing import Any
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import join_claim
-from validation.runs.tables import Metric, markdown_table, write_metrics
-from validation.stamp import stamp
+from validation.runs.tables import Metric, markdown_table, stamp, write_metrics
 
 FOLDER = Path(__file__).parents[1] / "studies"
-IN_ROBUSTNESS = ("full-disk", "kill-anywhere", "stop-anywhere")
-MODULES = {path.stem.replace("_", "-"): path.stem for path in sorted(FOLDER.glob("[a-z]*.py"))}
-del MODULES["robustness"]
-MODULES |= dict.fromkeys(IN_ROBUSTNESS, "robustness")
+FOUND = [
+    (name.replace("_", "-"), path.stem)
+    for path in FOLDER.glob("[a-z]*.py")
+    for name in re.findall(r"^def (\w+)_study\(", path.read_text(encoding="utf-8"), re.M)
+]
+MODULES = dict(sorted(FOUND))
 """Name of a study -> the module of ``validation/studies`` that holds its function."""
-FORMER = {"main-job": "against-colmap", "wide-steps": "wide-baseline"}
-"""Former names of studies."""
-OF_PAGES = {
-    "cluster-efficiency": [
-        ["--sizes", "48", "100"],
-        ["--sizes", "12", "--until", "dense"],
-        ["--scene", "street", "--sizes", "72", "--set", "images.part_views=30"],
-    ],
-    "coverage-real": [["--trials", "60"]],
-    "critical-motions": [["--trials", "200"]],
-    "epipolar": [["--trials", "2000"]],
-    "epipolar-methods": [["--trials", "500"]],
-    "growth-of-cost": [
-        ["--colmap", "--sizes", "100", "300"],
-        ["--sizes", "1000"],
-        ["--sizes", "100", "--set", "matching.many_images=1000"],
-        ["--scene", "street", "--sizes", "100", "--set", "matching.many_images=1000"],
-        ["--scene", "street", "--sizes", "100", "1000"],
-        ["--until", "model", "--sizes", "12", "48"],
-    ],
-    "harsh": [["--trials", "8"]],
-    "against-colmap": [["--repeats", "3"]],
-    "moving-cameras": [[], ["--trials", "8"], ["--rendered", "--trials", "3"]],
-    "record": [],
-    "subsets": [["--trials", "25"]],
-}
-"""Options of the studies that the documentation shows with other ones than their defaults, for each run; a
-record is of one machine and has no table."""
-HELP = {
-    "benchmark": "JSON file of pytest-benchmark (default: run the benchmarks)",
-    "cameras": "shared: one camera for all images; per-image: one for each",
-    "cold": "begin each run without compiled kernels",
-    "colmap": "COLMAP on the same images and pairs too",
-    "compare_with": "two records: before and after",
-    "core_views": "views reconstructed projectively; 0: all",
-    "every": "take every n-th one only",
-    "executor": "executor of the runs",
-    "formats": "names of file formats (default: all)",
-    "images": "folder of images",
-    "kills": "runs killed (SIGKILL) at moments spread over their time",
-    "kinds": "words; kinds of sets that contain one of them are taken",
-    "long_side": "long side of the images in px",
-    "max_size": "long side of the images in px",
-    "methods": "names of methods (default: all)",
-    "modes": "one camera or focal length for all images, or one for each",
-    "moments": "moments spread over the time of a run",
-    "motions": "names of motions (default: all)",
-    "noise": "standard deviations of image coordinates in px",
-    "parts": "parts of the study (default: all)",
-    "points": "numbers of points or matches",
-    "presets": "presets of the runs",
-    "ratios": "JSON file for the ratios",
-    "rendered": "images of rendered drives in place of tracks",
-    "repeats": "repetitions; the least or the median counts",
-    "scene": "place or street",
-    "scenes": "names of image sets (default: all on this machine)",
-    "seed": "random seed",
-    "seeds": "random seeds, or their number",
-    "set_": "settings STAGE.FIELD=VALUE of the runs",
-    "sets": "names of the recorded sets",
-    "signal_": "signal that the process group gets",
-    "sizes": "numbers of images",
-    "threads": "threads of a run",
-    "trials": "random trials of each setting",
-    "until": "last stage of the runs",
-    "views": "numbers of views, or fewest and most",
-    "workers": "processes that share the trials",
-    "write_to": "file of the record; earlier runs in it are kept",
-    "writes": "runs killed in the middle of a write",
-    "wrong": "shares of wrong matches",
-    "zoom": "whether focal lengths differ",
-}
-"""Help of the options of all studies."""
+_OPTIONS = tomllib.loads(FOLDER.with_suffix(".toml").read_text(encoding="utf-8"))
+HELP: dict[str, str] = _OPTIONS["help"]
+OF_PAGES: dict[str, list[list[str]]] = _OPTIONS["pages"]
+"""Options of each run of a study for the documentation, where they are not the defaults."""
 Part = Sequence[Metric] | str
 StudyFunction = Callable[..., Iterable[Part]]
 
@@ -120,7 +54,7 @@ def run_studies(arguments: Sequence[str]) -> int:
     parser.add_argument("name", nargs="?", choices=list(MODULES), metavar="NAME", help="name of the study")
     parser.add_argument("--list", action="store_true", help="list the studies and exit")
     names = [name.replace("_", "-") for name in arguments[:1]]
-    options = parser.parse_args([FORMER.get(name, name) for name in names])
+    options = parser.parse_args(names)
     if options.list:
         for name in MODULES:
             print(f"{name:22} {_summary(load_study(name))}")

@@ -6,6 +6,9 @@ import csv
 import io
 import json
 import math
+import os
+import platform
+import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,12 +22,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Metric:
-    """One row of a table: a number on a scene, by ours and the references, with its target.
-
-    ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
-    one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
-    Neither side of a number that is not ``ranked`` is better, such as a count of faces.
-    """
+    """One row of a table: a number on a scene, by ours and the references, with its target. ``values`` maps
+    methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper one with
+    ``at_most``; without it the row is only reported. ``definition`` states the number in one line. Neither
+    side of a number that is not ``ranked`` is better, such as a count of faces."""
 
     scene: str
     name: str
@@ -123,3 +124,23 @@ def write_metrics(path: Path, metrics: Sequence[Metric]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = [{**asdict(metric), "verdict": metric.verdict} for metric in metrics]
     write_text(path, json.dumps(rows, indent=1) + "\n")
+
+
+def commit() -> str:
+    """Return the commit of this clone, with ``-dirty`` if files have changed since; "unknown" without git."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        root = Path(__file__).parents[1]
+        return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def machine() -> str:
+    """Return processor, cores and system of this machine."""
+    return f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}"
+
+
+def stamp() -> str:
+    """Return the first line of a file of tables."""
+    return f"Commit {commit()}; {machine()}; Python {platform.python_version()}."

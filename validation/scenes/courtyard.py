@@ -6,6 +6,7 @@ World frame in metres: x right along the back wall, y into it (the wall at y = 0
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -67,7 +68,6 @@ def _back_wall() -> Material:
 
 
 def _left_wall() -> Material:
-    """Field stones with ivy that climbs from the ground."""
     shape = grid((10.0, WALL_HEIGHT), TEXEL)
     wall = rubble(shape, TEXEL, 400, cell_m=0.26, relief_m=0.055)
     z = (np.arange(shape[0], dtype=np.float32) * np.float32(TEXEL))[:, None]
@@ -77,7 +77,6 @@ def _left_wall() -> Material:
 
 
 def _right_wall() -> Material:
-    """Ashlar with blind arches and a fringe of ivy on top."""
     shape = grid((10.0, WALL_HEIGHT), TEXEL)
     wall = cut_stone(shape, TEXEL, 500, (0.55, 0.28))
     niche = rubble(grid((2.2, 3.4), TEXEL), TEXEL, 540, cell_m=0.15, relief_m=0.03)
@@ -90,7 +89,6 @@ def _right_wall() -> Material:
 
 
 def _ground() -> Material:
-    """Worn paving with earth, pebbles and fallen leaves."""
     shape = grid((12.6, 10.0), TEXEL)
     paving = rubble(shape, TEXEL, 600, cell_m=0.34, relief_m=0.022)
     earth_grain = fractal(shape, TEXEL, 640, wavelengths_m=(0.09, 2.5 * TEXEL), ratio=0.9)
@@ -109,8 +107,7 @@ def _turned(
     seed: int,
     colour: tuple[float, float, float],
 ) -> Material:
-    """A body of revolution for a cylinder chart: ``profile`` lists (v, height); grainy, stained stone closed
-    around."""
+    """A body of revolution of stained stone for a cylinder chart: ``profile`` lists (v, height)."""
     shape = grid(size, TEXEL)
     v = np.arange(shape[0], dtype=np.float64) * TEXEL
     curve = np.interp(v, [p[0] for p in profile], [p[1] for p in profile])[:, None]
@@ -125,7 +122,6 @@ def _turned(
 
 
 def _barrel() -> Material:
-    """Staves with two pairs of iron hoops on a bulging body."""
     size = (2 * PI * 0.3, 1.0)
     wood = planks(grid(size, TEXEL), TEXEL, 710, size[0] / 16)
     v = (np.arange(wood.shape[0], dtype=np.float32) * np.float32(TEXEL))[:, None]
@@ -143,8 +139,7 @@ def _barrel() -> Material:
 
 
 def _column(seed: int) -> Material:
-    """A drum of field stones whose ends are round, so that they stand well on their feet; no mason lays the
-    same stones twice, so each column has its own ``seed``."""
+    """A drum of field stones with round ends; each column has other stones."""
     stones = rubble(grid((2 * PI * 0.22, 2.6), TEXEL), TEXEL, seed, cell_m=0.2, relief_m=0.02, wrap=True)
     row = np.arange(stones.shape[0])
     calm = smooth((np.minimum(row, row[-1] - row) * TEXEL).astype(np.float32), 0.0, 0.03)[:, None]
@@ -152,7 +147,6 @@ def _column(seed: int) -> Material:
 
 
 def _basin() -> Material:
-    """Field stones under a moulded rim."""
     size = (2 * PI * 0.85, 0.7)
     rim = [(0.0, 0.0), (0.5, 0.0), (0.54, 0.1), (0.66, 0.1), (0.7, 0.07)]
     stones = rubble(grid(size, TEXEL), TEXEL, 730, cell_m=0.17, relief_m=0.03, wrap=True)
@@ -162,24 +156,17 @@ def _basin() -> Material:
 
 
 def _urn() -> Material:
-    """A stone urn turned on its pedestal."""
     foot = [(0.0, 0.16), (0.12, 0.16), (0.16, 0.08), (0.3, 0.05), (0.36, 0.1), (0.42, 0.06)]
     bowl = [(0.6, 0.2), (0.8, 0.25), (0.92, 0.21), (0.98, 0.12), (1.04, 0.12), (1.08, 0.2), (1.14, 0.2)]
     return _turned((2 * PI * 0.2, 1.14), foot + bowl, 750, (0.5, 0.47, 0.42))
 
 
-def _dressed_stone() -> Material:
-    return cut_stone(grid((7.5, 2.5), TEXEL), TEXEL, 760, (0.7, 0.36), (0.48, 0.44, 0.37))
-
-
-def _crate_wood() -> Material:
-    return planks(grid((2.4, 2.4), TEXEL), TEXEL, 770, 0.14)
-
-
 def build_materials(*, threads: int = 2) -> list[Material]:
     """The maps in the order of the constants above; the columns', one each, are the last."""
-    makers = [_back_wall, _left_wall, _right_wall, _ground]
-    makers += [_basin, _urn, _barrel, _dressed_stone, _crate_wood]
+    makers: list[Callable[[], Material]] = [_back_wall, _left_wall, _right_wall, _ground]
+    makers += [_basin, _urn, _barrel]
+    makers.append(partial(cut_stone, grid((7.5, 2.5), TEXEL), TEXEL, 760, (0.7, 0.36), (0.48, 0.44, 0.37)))
+    makers.append(partial(planks, grid((2.4, 2.4), TEXEL), TEXEL, 770, 0.14))
     makers += [partial(_column, seed) for seed in COLUMN_SEEDS]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(lambda make: make(), makers))

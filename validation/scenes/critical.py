@@ -42,8 +42,7 @@ class Motion(Enum):
 
 @dataclass(frozen=True)
 class Sequence:
-    """``K, R`` (V, 3, 3), ``C`` (V, 3), ``X`` (N, 3), ``tracks`` with noise ``sigma_px``, ``sizes`` (V,
-    2)."""
+    """True cameras and points, ``tracks`` with noise ``sigma_px``, and ``sizes`` (V, 2) of the images."""
 
     K: F64
     R: F64
@@ -96,10 +95,6 @@ def _rotation(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     return Rotation.from_rotvec(turns).as_matrix() @ R, np.tile(start, (w.views, 1))
 
 
-def _turntable(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    return turntable(rng, w.views, w.distance, highest_deg=45.0, widest_deg=360.0)
-
-
 def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64, F64]:
     """A tripod moved over the floor: another heading at each position, a constant tilt."""
     azimuth = rng.uniform(-0.6, 0.6, w.views)
@@ -114,11 +109,6 @@ def _planar(w: _Path, rng: np.random.Generator, axial: float = 0.0) -> tuple[F64
     return start @ turn.swapaxes(1, 2), C
 
 
-def _parallel_axes(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Planar motion with changes of height."""
-    return _planar(w, rng, axial=rng.uniform(0.2, 0.6))
-
-
 def _optical_axis(w: _Path, rng: np.random.Generator) -> tuple[F64, F64]:
     """Translation with roll about the optical axis, whose direction is constant."""
     R, C = _translation(w, rng)
@@ -130,9 +120,10 @@ _MOTIONS: dict[Motion, Callable[[_Path, np.random.Generator], tuple[F64, F64]]] 
     Motion.GENERAL: _general,
     Motion.TRANSLATION: _translation,
     Motion.ROTATION: _rotation,
-    Motion.TURNTABLE: _turntable,
+    Motion.TURNTABLE: lambda w, rng: turntable(rng, w.views, w.distance, highest_deg=45.0, widest_deg=360.0),
     Motion.PLANAR: _planar,
-    Motion.PARALLEL_AXES: _parallel_axes,
+    # Planar motion with changes of height.
+    Motion.PARALLEL_AXES: lambda w, rng: _planar(w, rng, axial=rng.uniform(0.2, 0.6)),
     Motion.OPTICAL_AXIS: _optical_axis,
     Motion.PLANE: _general,
 }
@@ -179,8 +170,7 @@ def _observe(K: F64, R: F64, C: F64, X: F64, sigma: float, rng: np.random.Genera
 
 
 def projective_estimate(scene: Sequence, rng: np.random.Generator) -> Reconstruction:
-    """The projective reconstruction of maximum likelihood: the truth moved by a random projective transform
-    and adjusted to the noisy observations."""
+    """Adjust the truth, in a random projective frame, to the noisy observations."""
     G = np.eye(4) + 0.2 * rng.normal(size=(4, 4))
     seen = np.bincount(scene.tracks.point_index, minlength=len(scene.X)) >= 2
     Xh = np.column_stack([scene.X, np.ones(len(scene.X))]) @ G.T

@@ -1,5 +1,4 @@
-"""The thesis' cube sequence (5.5, figure 5.7): points on three faces of a cube, 27 cameras, perfect
-projections."""
+"""The thesis' cube sequence (5.5, figure 5.7): points on three faces, 27 cameras, perfect projections."""
 
 from __future__ import annotations
 
@@ -24,8 +23,7 @@ AZIMUTHS_DEG, ELEVATIONS_DEG, DISTANCES = (-6.0, 45.0, 96.0), (4.0, 32.0, 58.0),
 
 @dataclass(frozen=True)
 class CubeSequence:
-    """``K`` (3, 3), ``R`` (27, 3, 3) world-to-camera, ``C`` (27, 3), ``X`` (N, 3), ``face`` (N,) 0 1 2 for x
-    y z, and ``xy`` (27, N, 2) px, NaN where the face is turned away or the point lies outside the image."""
+    """``face`` (N,): 0 1 2 for x y z; ``xy`` (27, N, 2) px, NaN where a point is turned away or outside."""
 
     K: F64
     R: F64
@@ -40,8 +38,7 @@ class CubeSequence:
         return ~np.isnan(self.xy[..., 0])
 
     def faces_seen(self) -> NDArray[np.int64]:
-        """(27,) number of faces that each view sees: 1 means a plane, which does not determine a projective
-        camera."""
+        """(27,) faces that each view sees: 1 does not determine a projective camera."""
         seen = [[bool(v[self.face == f].any()) for f in range(3)] for v in self.visible]
         return np.array([sum(faces) for faces in seen], dtype=np.int64)
 

@@ -1,5 +1,4 @@
-"""The dinosaur on its turntable (Oxford Visual Geometry Group): tracks without images, published
-cameras, and pairs of views made from the tracks."""
+"""The dinosaur on its turntable (Oxford Visual Geometry Group): tracks, published cameras, pairs of views."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ MIN_COMMON = 16
 
 @dataclass(frozen=True)
 class Dinosaur:
-    """The tracks, the published cameras ``P`` (36, 3, 4), good up to a projective transform, and ``sizes``
-    (36, 2) of the images."""
+    """The tracks, published cameras ``P`` (36, 3, 4) up to a projective transform, ``sizes`` (36, 2)."""
 
     tracks: Tracks
     P: F64

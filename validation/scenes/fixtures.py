@@ -63,9 +63,8 @@ def courtyard_poses() -> list[Pose]:
 
 def render_image(world: World, pose: Pose, view: int) -> tuple[bytes, U16]:
     """JPEG bytes and quantised depth (see README of the fixtures) of one view."""
-    red, green, blue = (0.82 * pose.exposure * g for g in GAINS[view % len(GAINS)])
     rng = np.random.Generator(np.random.PCG64([2000, view]))
-    rgb = take_image(world, pose, SIZE, gains=(red, green, blue), rng=rng)
+    rgb = take_image(world, pose, SIZE, rng, GAINS[view % len(GAINS)])
     depth = trace(world, pose, SIZE, shade=False)[1][::DEPTH_STRIDE, ::DEPTH_STRIDE]
     return encode_jpeg(rgb), np.asarray(np.floor(depth / DEPTH_UNIT_M + 0.5), dtype=np.uint16)
 

@@ -53,7 +53,6 @@ def _chart(s: F64, kind: int, px: float, py: float, pz: float) -> tuple[float, f
 
 @compiled
 def _gap(s: F64, kind: int, ray: F64, t: float, pool: Pool) -> float:
-    """Height of the ray above the relief at t."""
     u, v, h = _chart(s, kind, ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5])
     return h - _height(pool[0], pool[1], pool[2], pool[3], (u + s[20]) / s[19], (v + s[21]) / s[19])
 
@@ -69,8 +68,7 @@ def _clipped(span: tuple[float, float], at: float, speed: float, size: float) ->
 
 @compiled
 def _plane_interval(s: F64, ray: F64, any_side: bool) -> tuple[float, float, float]:
-    """Part of the ray inside the slab and the rectangle, and its bound on the closing speed; empty = (1, 0,
-    1)."""
+    """Part of the ray inside slab and rectangle, and a bound of the closing speed; empty = (1, 0, 1)."""
     dh = ray[3] * s[9] + ray[4] * s[10] + ray[5] * s[11]
     h0 = (ray[0] - s[0]) * s[9] + (ray[1] - s[1]) * s[10] + (ray[2] - s[2]) * s[11]
     if dh > -1e-9 and (not any_side or s[26] > 0.0 or h0 < s[16] or h0 > s[17] or dh < 1e-9):
@@ -138,8 +136,7 @@ def _cross(s: F64, kind: int, ray: F64, bracket: tuple[float, float, float, floa
 
 @compiled
 def _leap(s: F64, ray: F64, t: float, speeds: tuple[float, float, float], pool: Pool) -> float:
-    """Return the step of a ray above the highest point of its block; 0 if it may meet the
-    relief."""
+    """Return the step of a ray above the highest point of its block; 0 if it may meet the relief."""
     u, v, h = _chart(s, 0, ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5])
     x, y = (u + s[20]) / s[19], (v + s[21]) / s[19]
     c, r = int(max(x, 0.0)) // BLOCK, int(max(y, 0.0)) // BLOCK
@@ -276,8 +273,7 @@ def _normal(s: F64, kind: int, point: F64, slopes: tuple[float, float], out: F64
 
 @compiled
 def _sample(world: Packed, ray: F64, footprint: float, work: F64, jitter: tuple[float, float]) -> float:
-    """Colour of one ray into work[:3]; returns t (FAR = sky). ``footprint`` is the sample's width at unit
-    distance."""
+    """Colour of a ray into work[:3]; returns t (FAR = sky). ``footprint``: sample's width at distance 1."""
     kinds, numbers, _, layout, colours, _, _, sun = world
     t, index = _first(world, ray, False)
     if index < 0:

@@ -9,41 +9,33 @@ from __future__ import annotations
 import io
 import re
 import tempfile
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from math import cos, pi, sin, tan
 from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.arrays import F32, F64
+from thesisrecon.arrays import F32
 from thesisrecon.io._files import write_atomically, write_json
 from validation.scenes.courtyard import build_courtyard, build_yard
-from validation.scenes.image_files import write_png
 from validation.scenes.pose import Pose, look_at
-from validation.scenes.raycast import World, trace
-from validation.scenes.real import Scene, read_scene
-from validation.scenes.sensor import take_image
+from validation.scenes.raycast import trace
+from validation.scenes.real import Scene, read_scene, write_png
+from validation.scenes.sensor import take_image, write_images
 
 FOCAL_REL = 0.9
 """Focal length as a share of the long side."""
-HALF_ARC_DEG = 55.0
 
 
 def walk(count: int, size: tuple[int, int], *, seed: int = 0) -> list[Pose]:
-    """``count`` true cameras about the yard, of one calibration, for images of ``size`` (width, height).
-
-    The angles are those of van der Corput's sequence, so that the first n of any walk are spread evenly;
-    heights, distances, rolls and what is looked at are drawn.
-    """
+    """``count`` true cameras about the yard, of one calibration, for images of ``size`` (width, height)."""
     width, height = size
     focal = FOCAL_REL * max(size)
     K = np.array([[focal, 0.0, 0.51 * width], [0.0, focal, 0.48 * height], [0.0, 0.0, 1.0]])
     poses = []
     for k in range(count):
         rng = np.random.Generator(np.random.PCG64([seed, k]))
-        angle = (2.0 * _van_der_corput(k + 1) - 1.0) * HALF_ARC_DEG * pi / 180.0
+        angle = (2.0 * _van_der_corput(k + 1) - 1.0) * 55.0 * pi / 180.0
         distance, eye = rng.uniform(5.6, 6.8), rng.uniform(1.1, 2.4)
         C = np.array([distance * sin(angle), -1.4 - distance * cos(angle), eye])
         target = rng.uniform([-0.5, -1.4, 1.5], [0.5, -0.8, 1.9])
@@ -63,20 +55,10 @@ def _van_der_corput(k: int) -> float:
 
 def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
     """Images ``0000.png`` and so on of :func:`walk` in ``folder``; those that are there stay."""
-    folder.mkdir(parents=True, exist_ok=True)
-    missing = [k for k in range(count) if not (folder / f"{k:04d}.png").is_file()]
-    if not missing:
-        return
-    world, poses = build_courtyard(), walk(count, size)
-
-    def write(k: int) -> None:
-        pose = poses[k]
-        gain, rng = 0.82 * pose.exposure, np.random.default_rng([2001, k])
-        rgb = take_image(world, pose, size, gains=(gain, gain, gain), rng=rng)
-        write_png(folder / f"{k:04d}.png", rgb)
-
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(write, missing))
+    poses = enumerate(walk(count, size))
+    missing = {k: pose for k, pose in poses if not (folder / f"{k:04d}.png").is_file()}
+    if missing:
+        write_images(folder, build_courtyard(), missing, size, [2001], threads)
 
 
 _YARD = re.compile(r"yard-(\d{1,4})")
@@ -102,29 +84,15 @@ def write_yard(folder: Path, seed: int) -> None:
     """Images and ``cameras.json`` of another yard (:func:`build_yard`) and other cameras for each seed."""
     poses = walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
     zoom = float(np.random.default_rng([72, seed]).uniform(0.85, 1.25))
-    zoomed = [replace(pose, K=_zoomed(pose.K, zoom)) for pose in poses]
-    _write_scene(folder, build_yard(seed), zoomed, YARD_SIZE, (2003, seed))
-
-
-def _zoomed(K: F64, zoom: float) -> F64:
-    zoomed: F64 = K * np.array([[zoom], [zoom], [1.0]])
-    zoomed[:2, 2] = K[:2, 2]
-    return zoomed
-
-
-def _write_scene(
-    folder: Path, world: World, poses: Sequence[Pose], size: tuple[int, int], seed: tuple[int, int]
-) -> None:
-    entries = []
+    cameras = []
     for k, pose in enumerate(poses):
-        gain, rng = 0.82 * pose.exposure, np.random.default_rng([*seed, k])
-        rgb = take_image(world, pose, size, gains=(gain, gain, gain), rng=rng)
-        name = f"{k:04d}.png"
-        write_png(folder / "images" / name, rgb)
-        t = -pose.R @ pose.C
-        given = {"name": name, "width": size[0], "height": size[1], "K": pose.K, "R": pose.R, "t": t}
-        entries.append({**given, "distortion": [0.0, 0.0, 0.0]})
-    write_json(folder / "cameras.json", {"cameras": entries})
+        K = pose.K * np.array([[zoom], [zoom], [1.0]])
+        K[:2, 2] = pose.K[:2, 2]
+        poses[k] = replace(pose, K=K)
+        place = {"K": K, "R": pose.R, "t": -pose.R @ pose.C, "distortion": [0.0, 0.0, 0.0]}
+        cameras.append({"name": f"{k:04d}.png", "width": YARD_SIZE[0], "height": YARD_SIZE[1], **place})
+    write_images(folder / "images", build_yard(seed), dict(enumerate(poses)), YARD_SIZE, [2003, seed])
+    write_json(folder / "cameras.json", {"cameras": cameras})
 
 
 STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3
@@ -145,7 +113,7 @@ def write_stereo_yard(folder: Path, seed: int) -> None:
     disparities = list[F32]()
     for k, (name, seen) in enumerate(zip(("left", "right"), poses, strict=True)):
         rng = np.random.default_rng([2004, seed, k])
-        write_png(folder / f"{name}.png", take_image(world, seen, STEREO_SIZE, gains=(0.82,) * 3, rng=rng))
+        write_png(folder / f"{name}.png", take_image(world, seen, STEREO_SIZE, rng))
         depth = trace(world, seen, STEREO_SIZE, shade=False)[1]
         shift = seen.K[0, 0] * STEREO_BASELINE_M / np.where(depth > 0.0, depth, np.nan)
         disparities.append(shift.astype(np.float32))

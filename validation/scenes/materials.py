@@ -18,8 +18,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Material:
-    """``rgb`` (H, W, 3) float32 linear; ``height`` (H, W) float32 metres; sample (row, col) at (col, row)
-    texel_m."""
+    """Linear ``rgb`` (H, W, 3), ``height`` (H, W) in metres; sample (row, col) at (col, row) texel_m."""
 
     rgb: F32
     height: F32
@@ -155,8 +154,7 @@ def planks(shape: tuple[int, int], texel_m: float, seed: int, width_m: float) ->
 
 
 def border_distance(material: Material, box: Box, *, arch: bool = False) -> F32:
-    """Signed distance in metres to the border of (left, bottom, right, top), positive inside; ``arch`` rounds
-    the top."""
+    """Signed distance (m) to the border of (left, bottom, right, top); ``arch`` rounds the top."""
     shape, texel = material.shape, np.float32(material.texel_m)
     x = (np.arange(shape[1], dtype=np.float32) * texel)[None, :]
     y = (np.arange(shape[0], dtype=np.float32) * texel)[:, None]
@@ -179,8 +177,7 @@ def _region(material: Material, box: Box, margin: float) -> tuple[slice, slice, 
 
 
 def add_window(material: Material, box: Box, seed: int) -> None:
-    """Cut a window into a wall, in place: stone frame, recess, wooden bars, dark panes with dirt, and a
-    sill."""
+    """Cut a window into a wall, in place: stone frame, recess, bars, dark panes with dirt, and a sill."""
     rows, cols, local = _region(material, box, 0.3)
     part = Material(material.rgb[rows, cols], material.height[rows, cols], material.texel_m)
     shape, texel = part.shape, part.texel_m

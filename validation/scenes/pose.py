@@ -18,8 +18,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Pose:
-    """A true camera: ``K``, ``R`` (world-to-camera) (3, 3), ``C`` (3,) metres, and the ``exposure`` of its
-    image."""
+    """A true camera: ``K``, ``R`` (world-to-camera), ``C`` (m), and the ``exposure`` of its image."""
 
     K: F64
     R: F64
@@ -50,8 +49,7 @@ def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:
 def turntable(
     rng: np.random.Generator, views: int, distance: float, *, highest_deg: float, widest_deg: float
 ) -> tuple[F64, F64]:
-    """R (V, 3, 3) and C (V, 3) of a camera at any height and roll that circles about z, by 40 degrees at
-    least."""
+    """R (V, 3, 3), C (V, 3) of a camera of any height and roll that circles about z by 40 degrees or more."""
     height = np.radians(rng.uniform(-10.0, highest_deg))
     start = distance * np.array([np.cos(height), 0.0, np.sin(height)])
     R = look_at(start, 0.2 * rng.normal(size=3), rng.uniform(-0.3, 0.3))
@@ -70,10 +68,7 @@ def perturb(
     zoomed: float,
     points_moved: float | None = None,
 ) -> tuple[MetricCameras, F64]:
-    """Cameras turned about their centres (rad), moved and zoomed (a factor), and points (N, 3) moved.
-
-    ``turned``, ``moved`` and ``points_moved`` (default: like cameras) are standard deviations.
-    """
+    """Cameras turned about their centres (rad), moved and zoomed (a factor), and points (N, 3) moved."""
     turn = Rotation.from_rotvec(turned * rng.normal(size=cameras.t.shape)).as_matrix()
     t = np.einsum("vab,vb->va", turn, cameras.t) + moved * rng.normal(size=cameras.t.shape)
     rows = cameras.intrinsics * [zoomed, 1.0, 1.0, 1.0, 1.0, 1.0]

@@ -21,8 +21,7 @@ Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
 
 def compiled(function: Kernel) -> Kernel:
-    """numba's njit with a static type: cached, releasing the GIL, without fast-math (bytes must not depend on
-    it)."""
+    """numba's njit with a static type, without fast-math: bytes must not depend on it."""
     return cast(Kernel, njit(cache=True, nogil=True)(function))
 
 
@@ -121,8 +120,7 @@ def _fill_cells(edge: F32, label: F32, warp: F32, texel: float, cell: float, see
 def cells(
     shape: tuple[int, int], texel_m: float, seed: int, *, cell_m: float, wrap: bool = False
 ) -> tuple[F32, F32]:
-    """Irregular stones (Worley's cells): distance to the joint in metres and a label in [0, 1) of each
-    stone."""
+    """Irregular stones (Worley's cells): distance to the joint (m) and a label in [0, 1) of each stone."""
     edge, label = np.empty(shape, np.float32), np.empty(shape, np.float32)
     period = round(shape[1] * texel_m / cell_m) if wrap else 0
     cell = shape[1] * texel_m / period if wrap else cell_m
@@ -163,8 +161,7 @@ def courses(
     block_m: tuple[float, float],
     wobble_m: float = 0.003,
 ) -> tuple[F32, F32]:
-    """Bricks or cut stones (length, rise) in running bond: distance to the joint in metres and a label per
-    block."""
+    """Blocks (length, rise) in running bond: distance to the joint (m) and a label of each block."""
     edge, label = np.empty(shape, np.float32), np.empty(shape, np.float32)
     warp = fractal(shape, texel_m, seed + 11, wavelengths_m=(0.5 * block_m[0], 4.0 * texel_m))
     steps = np.array([texel_m, *block_m])
@@ -198,8 +195,7 @@ def _stamp_leaves(height: F32, tint: F32, leaves: F64, texel: float) -> None:
 def ivy(
     shape: tuple[int, int], texel_m: float, seed: int, *, density: F32, depth_m: float = 0.05
 ) -> tuple[F32, F32]:
-    """Overlapping leaves where ``density`` (H, W) in [0, 1] allows: height in metres (0 = none) and tint
-    about 0.5."""
+    """Overlapping leaves where ``density`` (H, W) allows: height (m, 0 = none) and tint about 0.5."""
     rng = np.random.Generator(np.random.PCG64(seed))
     n = int(shape[0] * shape[1] * texel_m**2 * 900)
     raw = rng.random((n, 7))

@@ -24,13 +24,10 @@ from validation.scenes.pose import Pose
 @dataclass(frozen=True)
 class Surface:
     """A chart in the world: ``origin`` (3,), unit ``u_axis`` and ``v_axis``, ``size`` (u, v) metres, its
-    ``material``.
-
-    A plane's normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs around it once
-    over the whole width of the map. ``disc`` > 0 keeps of a plane only what lies within that radius of its
-    middle. ``flat`` takes the relief for shading only (faces of boxes, so that their edges close). ``offset``
-    is where on the map (0, 0) lies.
-    """
+    ``material``. A plane's normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs
+    around it once over the whole width of the map. ``disc`` > 0 keeps of a plane only what lies within that
+    radius of its middle. ``flat`` takes the relief for shading only (faces of boxes, so that their edges
+    close). ``offset`` is where on the map (0, 0) lies."""
 
     origin: F64
     u_axis: F64
@@ -102,8 +99,7 @@ def _block_maxima(height: F32) -> F32:
 
 
 def _pack(materials: list[Material]) -> tuple[I64, F32, F32, F32]:
-    """Per material: height offset, block offset, blocks per row; texture offset and shape of each level; the
-    pools."""
+    """Offsets of heights, blocks and texture levels of each material, and the pools."""
     layout = np.zeros((len(materials), 3 + 3 * LEVELS), np.int64)
     colours: list[F32] = []
     heights: list[F32] = []

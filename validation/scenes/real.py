@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -11,8 +12,10 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from PIL import Image as PillowImage
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, U8
+from thesisrecon.io._files import write_atomically
 from thesisrecon.io._models import read_model
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,11 +34,8 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 @dataclass(frozen=True)
 class Scene:
-    """A set of images, sorted by name, and its truth where there is one.
-
-    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without
-    truth.
-    """
+    """A set of images, sorted by name, and its truth where there is one. ``K``, ``R`` (world-to-camera) (V,
+    3, 3) and ``C`` (V, 3) camera centres in metres, all None without truth."""
 
     name: str
     image_paths: tuple[Path, ...]
@@ -57,18 +57,14 @@ class Scene:
 
 
 def data_root() -> Path | None:
-    """The folder of real images: THESISRECON_DATA, else ../shared/data next to the repository, None when
-    absent."""
+    """The folder of real images: THESISRECON_DATA, else ../shared/data; None when absent."""
     named = os.environ.get("THESISRECON_DATA")
     folder = Path(named) if named else ROOT.parent / "shared" / "data"
     return folder if folder.is_dir() else None
 
 
 def read_scene(folder: Path, name: str) -> Scene:
-    """A folder with images/ and perhaps cameras.json.
-
-    Raises ``ValueError`` if there are no images, or cameras.json lacks one of them or is damaged.
-    """
+    """A folder with images/ and perhaps cameras.json."""
     images = folder / "images"
     found = sorted(images.iterdir(), key=lambda p: p.name) if images.is_dir() else []
     paths = tuple(p for p in found if p.suffix.lower() in SUFFIXES)
@@ -98,10 +94,7 @@ def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
 
 
 def real_folder(name: str) -> Path | None:
-    """Return the folder of one of ``FOLDERS``, or None if missing.
-
-    Raises ``ValueError`` for a name that is none of them.
-    """
+    """Return the folder of one of ``FOLDERS``, or None if missing."""
     if name not in FOLDERS:
         raise ValueError(f"a real scene is one of {sorted(FOLDERS)}; got {name!r}")
     root = data_root()
@@ -159,3 +152,16 @@ def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     # Every caller gets the same array.
     depth.flags.writeable = False
     return depth, int(record["stride"])
+
+
+def read_rgb(path: Path) -> U8:
+    """Read an image (H, W, 3)."""
+    with PillowImage.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def write_png(path: Path, rgb: U8) -> None:
+    """Write an image at once or not at all."""
+    sink = io.BytesIO()
+    PillowImage.fromarray(rgb).save(sink, "PNG", compress_level=1)
+    write_atomically(path, sink.getvalue())

@@ -37,8 +37,7 @@ SCENES_WITH_CAMERAS = ("fountain-P11", "Herz-Jesus-P8")
 
 @dataclass(frozen=True)
 class RealPair:
-    """Matches ``xy1``, ``xy2`` (N, 2) px, and what is known: ``truth`` (M, 4) right correspondences that no
-    method is given, ``F`` (3, 3) of the true cameras."""
+    """Matches (N, 2) px; ``truth`` (M, 4): right correspondences; ``F`` of the true cameras."""
 
     name: str
     xy1: F64
@@ -48,8 +47,7 @@ class RealPair:
 
 
 def match_images(paths: tuple[Path, Path], cache: Path, *, ratio: float, mutual: bool) -> tuple[F64, F64]:
-    """OpenCV's SIFT matches (N, 2), (N, 2) with the nearest descriptor below ``ratio`` times the second;
-    with ``mutual`` each must be the other's nearest. The ``cache`` is of the contents of the images."""
+    """OpenCV's SIFT matches (N, 2), (N, 2) by the ratio test, kept in ``cache`` by image contents."""
     content = hashlib.sha256(repr((SETTINGS, ratio, mutual)).encode())
     for path in paths:
         content.update(path.read_bytes())
@@ -74,10 +72,7 @@ def _sift(path: Path) -> SiftKeypoints:
 
 
 def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator[RealPair]:
-    """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``.
-
-    Empty if the images are not on this machine; ``names`` picks some.
-    """
+    """The pairs of Lebeda, Matas and Chum (BMVC 2012) with their hand-made correspondences as ``truth``."""
     root = data_root()
     for folder in sorted((root / "kusvod2").iterdir()) if root and (root / "kusvod2").is_dir() else []:
         if folder.is_dir() and (names is None or folder.name in names):
@@ -87,11 +82,7 @@ def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator
 
 
 def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2)) -> Iterator[RealPair]:
-    """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise.
-
-    Its points are the matches that agree with the cameras, moved to where they agree exactly, so they lie
-    where the scene has texture. Empty if the images are not on this machine.
-    """
+    """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise."""
     if scene is None or scene.K is None or scene.R is None or scene.C is None:
         return
     cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(scene.K, scene.R, scene.C, strict=True)]

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.strata import Group
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube
 from validation.scenes.pose import look_at
-from validation.scenes.transforms import random_transform
 
 
 @dataclass(frozen=True)
@@ -82,19 +85,14 @@ def noisy_tracks(rig: Rig, sigma_px: float, rng: np.random.Generator) -> Tracks:
 
 
 def observe(xy: F64, seen: B8, sigma_px: float, rng: np.random.Generator) -> Tracks:
-    """Observations of pixels (V, N, 2) where ``seen`` (V, N), of points that two views or more see, with
-    Gaussian noise of ``sigma_px``."""
+    """Noisy observations of pixels (V, N, 2) where ``seen`` (V, N), of points of two views or more."""
     point, view = np.nonzero((seen & (seen.sum(axis=0) >= 2)).T)
     noisy = xy[view, point] + sigma_px * rng.normal(size=(len(view), 2))
     return Tracks(view, point, noisy, *seen.shape)
 
 
 def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) -> Reconstruction:
-    """The minimum of the projective bundle adjustment nearest to the truth, in a random projective frame.
-
-    The output of a perfect projective stage, as input of self-calibration studies. Flat views are
-    left out, as the gate of the projective stage does.
-    """
+    """The minimum of the projective bundle adjustment nearest to the truth, in a random projective frame."""
     n = len(rig.K)
     registered = np.ones(n, dtype=bool) if rig.flat is None else ~rig.flat
     P = compose_camera(rig.K, rig.R, -np.einsum("vab,vb->va", rig.R, rig.C))
@@ -128,10 +126,8 @@ SEEN = 0.75
 
 
 def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Rig:
-    """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40 degrees.
-
-    The principal point is off the image's middle by a normal deviate of half a percent of the long side.
-    """
+    """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40
+    degrees."""
     X = rng.uniform([-2.0, -1.5, -1.6], [2.0, 1.5, 1.6], (points, 3))
     angles = rng.uniform([-0.7, -0.35], [0.7, 0.35], (views, 2))
     azimuth, height = angles.T
@@ -144,3 +140,101 @@ def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Ri
     K = np.array([[FOCAL_PX, 0.0, 767.5 + shift[0]], [0.0, FOCAL_PX, 511.5 + shift[1]], [0.0, 0.0, 1.0]])
     seen = rng.random((views, points)) < SEEN
     return Rig(np.tile(K, (views, 1, 1)), R, C, X, seen, CLOUD_SIZE)
+
+
+CAP_PX = 1000.0
+"""Image distances are capped here: a point in a focal plane projects to infinity."""
+
+
+def beside(rng: np.random.Generator, views: int, points: int) -> Rig:
+    """Draw cameras on a cap around a point cloud that all of them see."""
+    rig = make_cloud(views, rng, points=points)
+    return replace(rig, seen=np.ones_like(rig.seen))
+
+
+def ahead(rng: np.random.Generator, views: int, points: int) -> Rig:
+    """Draw cameras one behind the other, with the epipoles in the middle of the images."""
+    rig = beside(rng, views, points)
+    steps = np.column_stack([rng.normal(0.0, 0.05, (views, 2)), np.arange(views)])
+    return replace(rig, R=np.repeat(rig.R[:1], views, axis=0), C=rig.C[0] + 0.5 * steps @ rig.R[0])
+
+
+SCENES: dict[str, tuple[Callable[[np.random.Generator, int, int], Rig], int]] = {
+    "two views beside each other": (beside, 2),
+    "two views one ahead of the other": (ahead, 2),
+    "five views": (beside, 5),
+}
+
+
+def frame_of(group: Group, rng: np.random.Generator) -> F64:
+    """Draw a transform (4, 4) of space into a frame of this stratum."""
+    G = random_transform("metric" if group == "projective" else group, rng)
+    if group != "projective":
+        return G
+    normal = rng.normal(size=3)
+    plane = np.eye(4)
+    plane[3] = np.append(normal / np.linalg.norm(normal), rng.uniform(-8.0, 8.0))
+    return G @ plane
+
+
+def cameras_of(rig: Rig) -> F64:
+    """Return P (V, 3, 4) of the rig."""
+    return compose_camera(rig.K, rig.R, -np.einsum("vab,vb->va", rig.R, rig.C))
+
+
+def squared_distances(P: F64, X: F64, xy: F64) -> F64:
+    """Return the sum (N,) over views of squared projection distances, each capped at ``CAP_PX``."""
+    xh = np.einsum("vab,nb->vna", P, X)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squared = np.sum((xh[..., :2] / xh[..., 2:] - xy) ** 2, axis=2)
+    return np.asarray(np.minimum(np.nan_to_num(squared, nan=np.inf), CAP_PX**2).sum(axis=0))
+
+
+@dataclass(frozen=True)
+class DrawnRig:
+    """``G`` (4, 4): transform of space; ``P`` (V, 3, 4): cameras in the transformed frame; ``xy`` (V, N, 2):
+    noisy pixels; ``X`` (N, 3): true points before the transform; ``centre`` (3,): centre of the first
+    camera."""
+
+    G: F64
+    P: F64
+    xy: F64
+    X: F64
+    centre: F64
+
+    def errors_pct(self, X: F64) -> F64:
+        """Return distances (N,) of X (N, 4) from the true points, in % of theirs from the first camera."""
+        off = np.linalg.norm(dehomogenize(X @ np.linalg.inv(self.G).T) - self.X, axis=1)
+        share = off / np.linalg.norm(self.X - self.centre, axis=1)
+        return np.asarray(np.nan_to_num(100.0 * share, nan=np.inf), dtype=np.float64)
+
+
+def draw_rig(scene: str, sigma_px: float, frame: Group, rng: np.random.Generator, points: int) -> DrawnRig:
+    """Draw a rig, its noise and its frame; the pixels do not depend on the frame."""
+    make, views = SCENES[scene]
+    rig = make(rng, views, points)
+    exact = rig.pixels()
+    seen = np.isfinite(exact).all(axis=(0, 2))
+    xy = exact[:, seen] + sigma_px * rng.normal(size=(views, int(seen.sum()), 2))
+    G = frame_of(frame, rng)
+    return DrawnRig(G, cameras_of(rig) @ np.linalg.inv(G), xy, rig.X[seen], rig.C[0])
+
+
+def random_transform(group: Group, rng: np.random.Generator) -> F64:
+    """Draw a well-conditioned transform (4, 4) that belongs to no smaller group."""
+    if group == "projective":
+        return np.eye(4) + _shift_of_norm(rng, (4, 4), 0.5)
+    G = np.eye(4)
+    G[:3, 3], scale = rng.normal(size=3), float(np.exp(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 1.0)))
+    if group == "affine":
+        G[:3, :3] = scale * (np.eye(3) + _shift_of_norm(rng, (3, 3), 0.5))
+    else:
+        R = Rotation.random(random_state=rng).as_matrix()
+        G[:3, :3] = scale * R if group == "metric" else R
+    return G
+
+
+def _shift_of_norm(rng: np.random.Generator, shape: tuple[int, int], norm: float) -> F64:
+    """Noise whose norm below 1 keeps the identity plus it invertible."""
+    noise = rng.normal(size=shape)
+    return np.asarray(norm * noise / np.linalg.norm(noise))

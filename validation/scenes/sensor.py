@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +15,8 @@ from PIL import Image as PillowImage
 from thesisrecon.arrays import F32, U8
 from validation.scenes.pose import Pose
 from validation.scenes.raycast import World, trace
+from validation.scenes.real import write_png
 
-JPEG_QUALITY = 91
 PER_PIXEL = 2
 
 
@@ -68,19 +71,36 @@ def take_image(
     world: World,
     pose: Pose,
     size: tuple[int, int],
-    *,
-    gains: tuple[float, float, float],
     rng: np.random.Generator,
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> U8:
     """Return the image (H, W, 3) of one camera, ``PER_PIXEL`` samples a pixel along each axis."""
-    sensor = Sensor()
+    sensor, (red, green, blue) = Sensor(), (0.82 * pose.exposure * gain for gain in balance)
     light = integrate_pixels(trace(world, pose, size, per_pixel=PER_PIXEL)[0], PER_PIXEL, sensor.blur_px)
-    return expose(light, sensor, gains=gains, rng=rng)
+    return expose(light, sensor, gains=(red, green, blue), rng=rng)
+
+
+def write_images(
+    folder: Path,
+    world: World,
+    poses: Mapping[int, Pose],
+    size: tuple[int, int],
+    seed: Sequence[int],
+    threads: int = 2,
+) -> None:
+    """Write the images ``0000.png`` and so on of cameras by their number; each has its own noise."""
+
+    def write(k: int) -> None:
+        rgb = take_image(world, poses[k], size, np.random.default_rng([*seed, k]))
+        write_png(folder / f"{k:04d}.png", rgb)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(write, poses))
 
 
 def _develop(linear: NDArray[np.float64]) -> U8:
-    """A tone curve like sRGB with a soft shoulder, from a table (scalar powers: the same on every
-    machine)."""
+    """A tone curve like sRGB with a soft shoulder, from a table: the same on every machine."""
     knots = np.linspace(0.0, 1.6, 4097)
     bent = [v if v < 0.6 else 0.6 + 0.4 * (1.0 - 1.0 / (1.0 + (v - 0.6) / 0.4)) * 1.3 for v in knots.tolist()]
     curve = [
@@ -93,5 +113,5 @@ def _develop(linear: NDArray[np.float64]) -> U8:
 def encode_jpeg(rgb: U8) -> bytes:
     """The file's bytes, without metadata; fixed settings."""
     buffer = io.BytesIO()
-    PillowImage.fromarray(rgb).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=2, optimize=True)
+    PillowImage.fromarray(rgb).save(buffer, "JPEG", quality=91, subsampling=2, optimize=True)
     return buffer.getvalue()

@@ -10,9 +10,8 @@ import numpy as np
 from PIL import Image
 
 from thesisrecon.arrays import B8, F32, U8
-from validation.scenes.image_files import read_rgb
 from validation.scenes.many_views import stereo_yard_folder, yard_number
-from validation.scenes.real import data_root
+from validation.scenes.real import data_root, read_rgb
 
 STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
 
@@ -32,10 +31,7 @@ class StereoPair:
 
 
 def stereo_folder(name: str) -> Path | None:
-    """Return the folder of one of ``STEREO_PAIRS``, or None if missing.
-
-    The motorcycle comes with scikit-image, whose files are read without importing it.
-    """
+    """Return the folder of one of ``STEREO_PAIRS``, or None if missing."""
     if name == "Motorcycle":
         found = importlib.util.find_spec("skimage")
         place = None if found is None or found.origin is None else Path(found.origin).parent / "data"
@@ -65,11 +61,7 @@ def load_stereo_pair(name: str) -> StereoPair | None:
 
 
 def seen_by_both(truth: F32, other: F32 | None) -> B8:
-    """(H, W) pixels whose partner has the same disparity, to a pixel.
-
-    ``other`` is the truth of the right image; without it the truth of the left one is warped there, the
-    nearest surface in front.
-    """
+    """(H, W) pixels whose partner has the same disparity, to a pixel."""
     height, width = truth.shape
     rows, columns = np.mgrid[0:height, 0:width]
     known = np.isfinite(truth)

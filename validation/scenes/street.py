@@ -5,7 +5,6 @@ Only the houses near a camera are built to render its image, so that memory does
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from validation.scenes.courtyard import SUN, WALL_HEIGHT
-from validation.scenes.image_files import write_png
 from validation.scenes.many_views import FOCAL_REL
 from validation.scenes.materials import (
     Material,
@@ -30,7 +28,7 @@ from validation.scenes.materials import (
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.procedural import fractal
 from validation.scenes.raycast import Surface, World, build_world
-from validation.scenes.sensor import take_image
+from validation.scenes.sensor import write_images
 
 TEXEL, WIDTH, DISTANCE = 0.01, 8.0, 5.5
 """Side of a texel, width of a house and distance of the camera from the walls, in metres."""
@@ -94,17 +92,13 @@ def build_near(house: int) -> World:
 
 @lru_cache(maxsize=1)
 def _plain_houses(count: int, texel: float = 0.02) -> list[Material]:
-    """Walls of houses, then the ground before them."""
     shape = grid((WIDTH, 8.0), texel)
     ground = [rubble(shape, texel, 900 + 1000 * h, cell_m=0.14, relief_m=0.015) for h in range(count)]
     return [_front(h) for h in range(count)] + ground
 
 
 def build_corner(C: F64, ahead: F64) -> World:
-    """Houses on both sides of two streets, along the first and the last direction ``ahead`` of a drive.
-
-    Walls within 4 m of a camera centre ``C`` (V, 3) are left out.
-    """
+    """Houses on both sides of two streets, along the first and the last direction ``ahead`` of a drive."""
     z, walls, ground = np.eye(3)[2], list[list[Surface]](), list[list[Surface]]()
     places = [(k, first + h, side) for k, first in ((0, -1), (-1, -3)) for h in range(9) for side in (1, -1)]
     for number, (k, h, side) in enumerate(places):
@@ -121,7 +115,6 @@ def build_corner(C: F64, ahead: F64) -> World:
 
 
 def _crate(place: np.ndarray, size: np.ndarray, angle: float, material: int) -> list[Surface]:
-    """Four sides and the top of a box on the ground, turned about z."""
     z, (w, d, h) = np.eye(3)[2], size.tolist()
     u, v = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
     faces = [
@@ -155,17 +148,9 @@ def walk_street(count: int, size: tuple[int, int]) -> list[Pose]:
 
 def write_street(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
     """Images ``0000.png`` and so on of :func:`walk_street`; those that are there stay."""
-    folder.mkdir(parents=True, exist_ok=True)
     poses = walk_street(count, size)
-    missing = [k for k in range(count) if not (folder / f"{k:04d}.png").is_file()]
-    houses = [int(pose.C[0] // WIDTH) for pose in poses]
-    for house in sorted({houses[k] for k in missing}):
-        world = build_near(house)
-
-        def write(k: int, world: World = world) -> None:
-            gain, rng = 0.82 * poses[k].exposure, np.random.default_rng([2006, k])
-            rgb = take_image(world, poses[k], size, gains=(gain, gain, gain), rng=rng)
-            write_png(folder / f"{k:04d}.png", rgb)
-
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(write, [k for k in missing if houses[k] == house]))
+    missing = {k: pose for k, pose in enumerate(poses) if not (folder / f"{k:04d}.png").is_file()}
+    houses = {k: int(pose.C[0] // WIDTH) for k, pose in missing.items()}
+    for house in sorted(set(houses.values())):
+        here = {k: pose for k, pose in missing.items() if houses[k] == house}
+        write_images(folder, build_near(house), here, size, [2006], threads)

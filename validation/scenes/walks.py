@@ -1,13 +1,11 @@
-"""Synthetic walks along a street or around a block, as large as wanted, for bundle adjustment alone.
+"""A synthetic walk along a street, as long as wanted, for bundle adjustment alone.
 
-One camera observes a facade every half metre; points are seen by 3 to 10 neighbouring images, so the
-pattern of which views share points is that of a street, or of a ring where the walk closes.
+One camera observes a facade every half metre; points are seen by 3 to 10 neighbouring images.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -16,7 +14,6 @@ from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from validation.scenes.pose import perturb
 
-Kind = Literal["street", "loop"]
 SIZE = (1000, 750)
 STEP, SHORTEST, LONGEST = 0.5, 3, 10
 INTRINSICS = (1000.0, 1.0, 0.0, 500.0, 375.0, 0.02)
@@ -35,12 +32,10 @@ class Walk:
         return perturb(self.cameras, self.X, rng, turned=size / 6.0, moved=size, zoomed=1.01)
 
 
-def make_walk(
-    n: int, kind: Kind, rng: np.random.Generator, *, sigma_px: float = 0.5, denser: int = 1
-) -> Walk:
+def make_walk(n: int, rng: np.random.Generator, *, sigma_px: float = 0.5, denser: int = 1) -> Walk:
     """n images with noise ``sigma_px`` in each coordinate, some 60 points for each, or ``denser``."""
-    R, t = _poses(n, kind, rng)
-    X = _facade(n, kind, denser * (200 * n // 3), rng)
+    R, t = _poses(n, rng)
+    X = _facade(n, denser * (200 * n // 3), rng)
     view, point = _tracks(R, t, X, rng)
     used, point = np.unique(point, return_inverse=True)
     X = X[used]
@@ -59,32 +54,19 @@ def project(cameras: MetricCameras, X: F64, view: I64, point: I64) -> F64:
     return np.asarray(ab * scale[:, None] + np.column_stack([cx, cy]))
 
 
-def _radius(n: int) -> float:
-    return max(n * STEP / (2.0 * np.pi), 3.0)
-
-
-def _poses(n: int, kind: Kind, rng: np.random.Generator) -> tuple[F64, F64]:
+def _poses(n: int, rng: np.random.Generator) -> tuple[F64, F64]:
     along = np.arange(n) * STEP
-    height = 0.1 * rng.normal(size=n)
-    if kind == "street":
-        centres = np.column_stack([along, 0.2 * np.sin(along), height])
-        heading = 0.3 * np.sin(along / 7.0)
-    else:
-        r = _radius(n)
-        centres = np.column_stack([r * np.cos(along / r), r * np.sin(along / r), height])
-        heading = along / r - np.pi / 2.0 + 0.3 * np.sin(3.0 * along / r)
+    centres = np.column_stack([along, 0.2 * np.sin(along), 0.1 * rng.normal(size=n)])
+    heading = 0.3 * np.sin(along / 7.0)
     forward = np.column_stack([-np.sin(heading), np.cos(heading), np.zeros(n)])
     down = np.tile([0.0, 0.0, -1.0], (n, 1))
     R = np.stack([np.cross(down, forward), down, forward], axis=1)
     return R, -np.einsum("vab,vb->va", R, centres)
 
 
-def _facade(n: int, kind: Kind, points: int, rng: np.random.Generator) -> F64:
+def _facade(n: int, points: int, rng: np.random.Generator) -> F64:
     away, height = rng.uniform(3.0, 8.0, points), rng.uniform(-2.0, 2.0, points)
-    if kind == "street":
-        return np.column_stack([rng.uniform(-3.0, n * STEP + 3.0, points), away, height])
-    angle, r = rng.uniform(0.0, 2.0 * np.pi, points), _radius(n)
-    return np.column_stack([(r + away) * np.cos(angle), (r + away) * np.sin(angle), height])
+    return np.column_stack([rng.uniform(-3.0, n * STEP + 3.0, points), away, height])
 
 
 def _tracks(R: F64, t: F64, X: F64, rng: np.random.Generator) -> tuple[I64, I64]:

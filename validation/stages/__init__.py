@@ -7,7 +7,6 @@ from validation.runs.scenes import available_scenes
 from validation.stages.boards import BoardsStage
 from validation.stages.bundle import BundleStage
 from validation.stages.cameras import CamerasStage
-from validation.stages.clouds import CloudsStage
 from validation.stages.depth import DepthStage
 from validation.stages.disparity import DisparityStage
 from validation.stages.features import FeaturesStage
@@ -27,7 +26,6 @@ STAGES: dict[str, Stage] = {
         FeaturesStage(),
         TriangulationStage(),
         CamerasStage(),
-        CloudsStage(),
         BundleStage(),
         DisparityStage(),
         ViewInterpolationStage(),

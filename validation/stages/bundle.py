@@ -13,8 +13,18 @@ from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.records import Reconstruction
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
-from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, each, ratio, read_arrays, row
+from validation.runs.records import (
+    OURS,
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    each,
+    ratio,
+    read_arrays,
+    row,
+)
 from validation.runs.scenes import has_images, load_images
 from validation.runs.tables import Metric
 from validation.scenes.pose import perturb
@@ -24,7 +34,6 @@ from validation.stages.cameras import our_model
 CERES = "Ceres"
 STREET = "street"
 FOCAL_K1 = np.array([True, False, False, False, False, True])
-WITH_CENTRE = np.array([True, False, False, True, True, True])
 LOSS_PX = 0.2
 """Scale of the robust losses: about twice the noise of the images, so that they take effect."""
 
@@ -86,7 +95,6 @@ Problem = tuple[MetricCameras, F64, Observations, tuple[int, int]]
 
 
 def _problem(scene: str, options: ReportOptions) -> Problem:
-    """Return the saved model, perturbed."""
     model, size = _saved(scene, options)
     return *perturbed_model(model, np.random.default_rng(options.seed)), size
 
@@ -94,14 +102,13 @@ def _problem(scene: str, options: ReportOptions) -> Problem:
 def _optimum(scene: str, options: ReportOptions) -> Problem:
     """Return the model of the covariances: the true street, or the saved model."""
     if scene == STREET:
-        walk = make_walk(12, "street", np.random.default_rng(4))
+        walk = make_walk(12, np.random.default_rng(4))
         return walk.cameras, walk.X, walk.seen, SIZE
     model, size = _saved(scene, options)
     return *model_as_bundle(model), size
 
 
 def _saved(scene: str, options: ReportOptions) -> tuple[Reconstruction, tuple[int, int]]:
-    """Return our model and the size of its images."""
     model = our_model(load_images(scene, options), options)
     if not model.registered.all():
         raise ValueError("an image has no camera, so this model is not adjusted")
@@ -142,7 +149,9 @@ def _covariances(
     """Return covariances of poses (V, 6, 6), in the inner gauge, and (f, cx, cy, k1) for 1 px noise."""
     options = BundleOptions(loss_px=np.inf, max_iterations=100, covariance=True)
     for _ in range(2):  # the second run ends closer to the optimum
-        fit = refine_metric_bundle(cameras, X, seen, free=WITH_CENTRE, options=options)
+        fit = refine_metric_bundle(
+            cameras, X, seen, free=np.array([True, False, False, True, True, True]), options=options
+        )
         cameras, X = fit.cameras, fit.X
     if method == CERES:
         return ceres_covariances(cameras, X, seen, size)

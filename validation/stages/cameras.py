@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,12 +17,20 @@ from thesisrecon.io._files import read_json
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
-from validation.metrics.cameras import CameraErrors, measure_cameras, measure_reprojection
+from validation.metrics.cameras import measure_cameras, measure_reprojection
 from validation.metrics.intervals import focal_errors_pct
-from validation.references.colmap import map_with_pycolmap, match_with_pycolmap
-from validation.references.colmap_reading import read_colmap_model
-from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, Values, each, plot, row, scatter
+from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_colmap_model
+from validation.runs.records import (
+    OURS,
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    Values,
+    each,
+    row,
+)
 from validation.runs.scenes import has_images, load_images, truth_of
 from validation.runs.tables import Metric
 from validation.scenes.real import Scene
@@ -30,8 +38,6 @@ from validation.scenes.real import Scene
 THESIS, PER_IMAGE = "ours (thesis)", "ours (a camera each)"
 COLMAP, COLMAP_PP, COLMAP_GLOBAL = "COLMAP", "COLMAP, pp refined", "COLMAP, global"
 MATCHES = "COLMAP, matches"
-FIXTURE = "courtyard"
-"""Scene of the gates of the thesis preset, always available."""
 SETTINGS: dict[str, PipelineConfig] = {
     OURS: preset("default"),
     THESIS: preset("thesis"),
@@ -62,7 +68,7 @@ class CamerasStage(Stage):
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
-            if scene == FIXTURE:
+            if scene == "courtyard":
                 return (OURS, THESIS)
             return (OURS, PER_IMAGE) if load_images(scene, options).has_truth else (OURS,)
         if options.quick:
@@ -95,7 +101,7 @@ class CamerasStage(Stage):
         metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
         metrics += _before_adjustment(images, outcomes.get(OURS))
         metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
-        return Judgement(metrics, plots=[_plot(images, models)])
+        return Judgement(metrics)
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
@@ -126,25 +132,24 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, folder: Path) 
     matched = options.folder(task.stage, task.scene, MATCHES)
     mapper: Literal["incremental", "global"] = "global" if task.method == COLMAP_GLOBAL else "incremental"
     refined = task.method == COLMAP_PP
-    map_with_pycolmap(images, matched, folder, refine_principal_point=refined, threads=1, mapper=mapper)
+    given: dict[str, Any] = {"matched": matched, "refine_principal_point": refined, "mapper": mapper}
+    map_with_pycolmap(images, folder, threads=1, **given)
 
 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    """Compare the cameras with the true ones, if known."""
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
     rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
     truth = truth_of(scene)
     if truth is None:
         return rows
     errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
-    numbers: tuple[tuple[str, str, Callable[[CameraErrors], float | None], str], ...] = (
-        ("focal error", "%", lambda e: e.focal_error_pct, FOCAL),
-        ("principal point error", "px", lambda e: e.principal_point_error_px, PRINCIPAL_POINT),
-        ("centre error", "mm", lambda e: e.centre_error_mm, CENTRE),
-        ("rotation error", "deg", lambda e: e.rotation_error_deg, ROTATION),
-    )
-    for name, unit, read, text in numbers:
-        values: Values = {n: None if e is None else read(e) for n, e in errors.items()}
+    for name, unit, field, text in (
+        ("focal error", "%", "focal_error_pct", FOCAL),
+        ("principal point error", "px", "principal_point_error_px", PRINCIPAL_POINT),
+        ("centre error", "mm", "centre_error_mm", CENTRE),
+        ("rotation error", "deg", "rotation_error_deg", ROTATION),
+    ):
+        values: Values = {n: None if e is None else getattr(e, field) for n, e in errors.items()}
         rows.append(row(scene.name, name, unit, values, text))
         if THESIS in values:
             rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], text))
@@ -152,7 +157,6 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
 
 
 def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    """Return reprojection errors and numbers of points."""
     residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
     points = each(models, lambda m: m.valid.sum())
     seen: Values = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}
@@ -184,17 +188,13 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
 
 
 def _last_record(outcome: Outcome, stage: str) -> Any:
-    """Return the last record of a stage of the run."""
     folder = RunDirectory(outcome.folder / "run").stage(FOLDERS[stage])
     *_, (item, key) = read_json(folder.path / MANIFEST_FILE)["keys"].items()
     return folder.load(item, key)
 
 
 def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """Return processor seconds and memory; COLMAP's mappers include the shared matching.
-
-    Our run with one camera per image continues a finished run, so its time is not reported.
-    """
+    """Return processor seconds and memory; COLMAP's mappers include the shared matching."""
     done = {n: o if o.ok else None for n, o in outcomes.items() if n not in (MATCHES, PER_IMAGE)}
     shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0
     times: Values = {n: None if o is None else o.cpu_s + shared * (n in MAPPERS) for n, o in done.items()}
@@ -205,7 +205,6 @@ def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
 
 
 def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
-    """Return errors of focal lengths with independent cameras."""
     if scene.K is None or model is None or model.K is None or not model.registered.any():
         return []
     errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
@@ -217,7 +216,6 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
 
 
 def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """Return self-check results and the coverage of the stated intervals."""
     records: dict[str, Any] = {
         name: read_json(outcomes[name].folder / "run" / "summary.json")
         for name in SETTINGS
@@ -258,21 +256,3 @@ def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float
             truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if entry is None else true_K[entry]
             held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
     return 100.0 * float(np.mean(held)) if held else None
-
-
-def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
-    """Plot the focal length of every image by each method, and the true one."""
-    focals = {name: _focals(model) for name, model in models.items() if model is not None}
-    images = range(1, len(scene.image_paths) + 1)
-    traces = [scatter(name, images, focal) for name, focal in focals.items()]
-    if scene.K is not None:
-        true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
-        marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
-        traces.append(scatter("truth", images, true, marker=marker))
-    return plot("Focal lengths", traces, "image", "focal length (px)")
-
-
-def _focals(model: Reconstruction) -> list[float | None]:
-    assert model.K is not None
-    found = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
-    return [float(f) if seen else None for f, seen in zip(found, model.registered, strict=True)]

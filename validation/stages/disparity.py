@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
-import PIL.Image
 
-from thesisrecon.arrays import F32, U8
-from thesisrecon.records import DisparityMap
+from thesisrecon.arrays import F32
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
-from validation.metrics.depth import bad_pixels, error_colours
+from validation.metrics.depth import bad_pixels
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
-from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, each, ratio, read_arrays, row
+from validation.runs.records import (
+    OURS,
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    each,
+    ratio,
+    read_arrays,
+    row,
+)
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 THESIS, SEMI_GLOBAL = "ours (thesis)", "ours (semi-global)"
@@ -28,10 +36,6 @@ MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BAD, KNOWN = "off by more than 1 px", "share before holes are filled"
 DEFINITION = "share of the pixels visible in both images, holes filled along the row"
-OVER_BETTER = "off by more than 1 px, over the better mode of OpenCV"
-HIDDEN = "share of the pixels hidden in the other image that have a disparity"
-ON_SURFACES = "mean over the pixels visible in both images that are off by less than 1 px"
-OVER_HH = "processor time, a ratio of two runs on the same machine"
 
 
 class DisparityStage(Stage):
@@ -69,7 +73,8 @@ class DisparityStage(Stage):
         maps: dict[str, F32 | None] = {n: None if f is None else f["disparity"] for n, f in found.items()}
         wrong = each(maps, lambda d: bad_pixels(d, pair, 1.0))
         worse = each(maps, lambda d: bad_pixels(d, pair, 2.0))
-        hidden = each(maps, lambda d: _known_though_hidden(d, pair))
+        unseen = np.isfinite(pair.truth) & ~pair.judged
+        hidden = each(maps, lambda d: 100.0 * np.isfinite(d)[unseen].mean())
         on_surfaces = each(maps, lambda d: _surface_error(d, pair))
         known = each(maps, lambda d: 100.0 * np.isfinite(d)[pair.judged].mean())
         spent = each(found, lambda f: 1e3 * float(f["seconds"]))
@@ -79,32 +84,26 @@ class DisparityStage(Stage):
             row(scene, "off by more than 2 px", "%", worse, DEFINITION),
             row(scene, "known", "%", known, KNOWN, more=True),
             row(scene, "time", "ms", spent, "processor time, minimum of all runs"),
-            row(scene, "bad pixels over the better reference", "", ratio(wrong[OURS], better), OVER_BETTER),
         ]
+        text = "off by more than 1 px, over the better mode of OpenCV"
+        over = ratio(wrong[OURS], better)
+        metrics.append(row(scene, "bad pixels over the better reference", "", over, text))
         for name in (THESIS, SEMI_GLOBAL):
             metrics.append(row(scene, f"{name}: {BAD}", "%", wrong[name], DEFINITION))
             metrics.append(row(scene, f"{name}: known", "%", known[name], KNOWN, more=True))
-        metrics += [
-            row(scene, "known though hidden", "%", hidden, HIDDEN),
-            row(scene, "error on surfaces", "px", on_surfaces, ON_SURFACES),
-            row(scene, "time over SGBM HH", "s / s", ratio(spent[OURS], spent[HH]), OVER_HH),
-        ]
-        drawn = {name: d for name, d in maps.items() if d is not None}
-        shown = [name for name in (THESIS, OURS, THREE_WAY) if name in drawn]
-        PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.folder(self.name, scene) / "maps.png")
-        text = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
-        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", text)])
+        text = "share of the pixels hidden in the other image that have a disparity"
+        metrics.append(row(scene, "known though hidden", "%", hidden, text))
+        text = "mean over the pixels visible in both images that are off by less than 1 px"
+        metrics.append(row(scene, "error on surfaces", "px", on_surfaces, text))
+        text = "processor time, a ratio of two runs on the same machine"
+        metrics.append(row(scene, "time over SGBM HH", "s / s", ratio(spent[OURS], spent[HH]), text))
+        return Judgement(metrics)
 
 
 def _surface_error(disparity: F32, pair: StereoPair) -> float:
     with np.errstate(invalid="ignore"):
         off = np.abs(disparity - pair.truth)[pair.judged]
         return float(off[off < 1.0].mean())
-
-
-def _known_though_hidden(disparity: F32, pair: StereoPair) -> float:
-    hidden = np.isfinite(pair.truth) & ~pair.judged
-    return float(100.0 * np.isfinite(disparity)[hidden].mean())
 
 
 def _pair(scene: str) -> StereoPair:
@@ -120,19 +119,3 @@ def _match(method: str, pair: StereoPair, *, widened: bool = True) -> F32:
         return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
     one_thread()
     return OpenCVSemiGlobal(method, widened).match(pair.left, pair.right, pair.disparities)
-
-
-def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:
-    """Draw truth and maps in colours; below each map the errors above 1 px (yellow) and 2 px (red)."""
-    top = [pair.left, error_colours(pair.truth / np.float64(pair.disparities))]
-    dark = (pair.left // 3 + 50).astype(np.uint8)
-    low = [dark, np.where(pair.judged[..., None], np.uint8(200), dark)]
-    for name in names:
-        top.append(error_colours(maps[name] / np.float64(pair.disparities)))
-        shown = dark.copy()
-        filled = DisparityMap(maps[name], np.zeros_like(maps[name]), 0.0).filled()
-        error = np.nan_to_num(np.abs(filled - pair.truth), nan=np.inf)
-        shown[pair.judged & (error > 1.0)] = (255, 255, 0)
-        shown[pair.judged & (error > 2.0)] = (255, 0, 0)
-        low.append(shown)
-    return np.concatenate([np.concatenate(top, axis=1), np.concatenate(low, axis=1)])

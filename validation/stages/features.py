@@ -17,12 +17,22 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io._images import read_images
 from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image, TwoView
-from validation.metrics.epipolar import RIGHT_PX, rms_epipolar_distance
+from validation.metrics.fundamental_precision import RIGHT_PX, rms_epipolar_distance
 from validation.references.libraries import NoReference
 from validation.references.opencv import harris_corners, sift_corners
 from validation.references.sift import sift_front_end
-from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, Values, each, read_arrays, row
+from validation.runs.records import (
+    OURS,
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    Values,
+    each,
+    read_arrays,
+    row,
+)
 from validation.runs.scenes import has_images, load_images
 from validation.runs.tables import Metric
 from validation.scenes.real import Scene, load_fixture_depth
@@ -32,7 +42,6 @@ from validation.stages.fundamental import MATCHES
 THESIS, SIFT, HARRIS = "ours (thesis)", "SIFT", "cv2.cornerHarris"
 FRONT_ENDS = (OURS, THESIS, SIFT)
 CORNERS = 1000
-REPEATED_PX = 1.5
 VERIFIED = "mean over the pairs; none if F is wrong"
 NOISE = "median over the pairs of the noise of the verified matches"
 MAX_SIZE_PX = 1600
@@ -112,7 +121,6 @@ def _front_end(method: str) -> PipelineConfig:
 
 
 def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
-    """Return F in original pixels, number of inliers and sigma of every pair."""
     config = _front_end(method)
     prepared = [config.matching.prepare(image, config.features.detect(image)) for image in images]
     arrays: dict[str, Any] = {}
@@ -168,13 +176,12 @@ def _repeatability(scene: Scene, outcomes: Mapping[str, Outcome]) -> Metric:
 
 
 def _share_repeated(scene: Scene, corners: list[F64]) -> float:
-    """Return the mean over all neighbouring images."""
     again, asked = 0, 0
     transfer = _transfer(scene)
     for i in range(len(corners) - 1):
         there = transfer(i, i + 1, corners[i])
         distance, _ = cKDTree(corners[i + 1]).query(there)
-        again, asked = again + int((distance <= REPEATED_PX).sum()), asked + len(there)
+        again, asked = again + int((distance <= 1.5).sum()), asked + len(there)
     return again / max(asked, 1)
 
 

@@ -9,11 +9,20 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.two_view import epipoles
-from validation.metrics.epipolar import NONE_PX, rms_epipolar_distance
+from validation.metrics.fundamental_precision import rms_epipolar_distance
 from validation.references.fundamental import estimate_with
 from validation.references.libraries import NoReference
-from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, each, plot, read_arrays, row, scatter
+from validation.runs.records import (
+    OURS,
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    each,
+    read_arrays,
+    row,
+)
 from validation.runs.scenes import has_images, load_images
 from validation.runs.tables import Metric
 from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
@@ -78,7 +87,7 @@ class FundamentalStage(Stage):
         answers = {m: read_arrays(o, "answers.npz") for m, o in outcomes.items() if m != MATCHES}
         errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
         notes = [f"{len(pairs)} pairs, {_seeds(options)} seeds each."]
-        return Judgement(_metrics(scene, pairs, answers, errors), plots=[_plot(errors)], notes=notes)
+        return Judgement(_metrics(scene, pairs, answers, errors), notes=notes)
 
 
 def _seeds(options: ReportOptions) -> int:
@@ -86,10 +95,6 @@ def _seeds(options: ReportOptions) -> int:
 
 
 def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
-    """Return the pairs of a scene, with the matches of the matching task.
-
-    Raises :class:`NoReference` if SIFT is unavailable.
-    """
     cache = options.folder("fundamental", scene, MATCHES)
     try:
         if scene == "kusvod2":
@@ -144,8 +149,7 @@ def _third_singular_value(answers: Answers) -> float:
 
 
 def _epipole_angles(answers: Answers, pairs: list[RealPair]) -> F64:
-    """Return the angles (deg) between estimated and true epipoles of image 1, as directions from the centre
-    of the matches at the distance of their spread; 90 without F."""
+    """Angles (deg) of epipoles in image 1, seen from the middle of the matches; 90 without F."""
     angles = []
     for pair, found in zip(pairs, answers["F"], strict=True):
         assert pair.F is not None
@@ -161,15 +165,3 @@ def _direction(F: F64, middle: F64, spread: float) -> F64:
     e = epipoles(F)[0]
     moved = np.array([e[0] - middle[0] * e[2], e[1] - middle[1] * e[2], spread * e[2]])
     return np.asarray(moved / np.linalg.norm(moved))
-
-
-def _plot(errors: Mapping[str, F64 | None]) -> Plot:
-    """Plot the sorted errors of every method."""
-    traces = []
-    for name, found in errors.items():
-        if found is not None:
-            x = np.sort(np.minimum(found.ravel(), NONE_PX))
-            share = 100.0 * np.arange(1, len(x) + 1) / len(x)
-            traces.append(scatter(name, x.tolist(), share.tolist(), "lines"))
-    log, whole, text = {"type": "log"}, {"range": [0, 100]}, "To the left is better."
-    return plot("Errors of all runs", traces, "error (px)", "runs below (%)", text, xaxis=log, yaxis=whole)

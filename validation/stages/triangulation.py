@@ -18,10 +18,18 @@ from thesisrecon.geometry.strata import Group
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-from validation.runs.records import Judgement, Outcome, Plot, ReportOptions, Stage, Task
-from validation.runs.rows import each, plot, read_arrays, row, scatter
+from validation.runs.records import (
+    Judgement,
+    Outcome,
+    ReportOptions,
+    Stage,
+    Task,
+    each,
+    read_arrays,
+    row,
+)
 from validation.runs.tables import Metric
-from validation.scenes.triangulation import SCENES, DrawnRig, draw_rig, squared_distances
+from validation.scenes.rigs import SCENES, DrawnRig, draw_rig, squared_distances
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40
@@ -32,7 +40,6 @@ ADJUSTED = "ours (cameras too)"
 MOVED = 1e-3
 """Relative perturbation of camera entries before the adjustment, about a pixel."""
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
-NOISES_PX = (0.5, 1.0, 2.0)
 POINTS = 400
 Method = Callable[[F64, F64], F64]
 
@@ -93,11 +100,10 @@ class TriangulationStage(Stage):
         spent = each(found, lambda f: 1e6 * float(np.median(f["seconds"])))
         text = "two views, one processor, median"
         metrics.append(row(scene, "time a point", "us", spent, text, judged=OURS))
-        return Judgement(metrics, plots=[_plot(problems, found)])
+        return Judgement(metrics)
 
 
 def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
-    """Adjust cameras and points, from slightly perturbed cameras."""
     rng, (views, points) = np.random.default_rng(seed), problem.xy.shape[:2]
     P = problem.P * (1.0 + MOVED * rng.normal(size=problem.P.shape))
     view, point = np.tile(np.arange(views), points), np.repeat(np.arange(points), views)
@@ -110,7 +116,6 @@ def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
 
 
 def _adjustment(scene: str, problems: list[Problem], found: Mapping[str, F64] | None) -> Metric:
-    """Return the maximum over the problems."""
     over = []
     for n, p in enumerate(problems if found is not None else []):
         if found is not None and f"P{n}" in found:
@@ -135,7 +140,7 @@ def _solver(method: str, views: int) -> Method | None:
 
 def _problems(options: ReportOptions) -> Iterator[Problem]:
     trials = 1 if options.quick else 4
-    for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(trials)):
+    for scene, sigma, projective, trial in product(SCENES, (0.5, 1.0, 2.0), (False, True), range(trials)):
         rng = np.random.default_rng([options.seed, trial])
         frame: Group = "projective" if projective else "metric"
         drawn = draw_rig(scene, sigma, frame, rng, POINTS)
@@ -145,7 +150,12 @@ def _problems(options: ReportOptions) -> Iterator[Problem]:
 def _metrics(
     scene: str, where: str, problems: Mapping[int, Problem], found: Mapping[str, Mapping[str, F64] | None]
 ) -> list[Metric]:
-    best = {n: _least_squared_distances(n, p, found) for n, p in problems.items()}
+    best = {}
+    for n, p in problems.items():
+        # The minimum of all answers and of a descent from the truth.
+        solved = [a[f"{n}"] for a in found.values() if a is not None and f"{n}" in a]
+        costs = [squared_distances(p.P, X, p.xy) for X in (*solved, _least_near_truth(p))]
+        best[n] = np.min(costs, axis=0)
     above: dict[str, float | None] = {}
     apart: dict[str, float | None] = {}
     for name, answers in found.items():
@@ -178,18 +188,8 @@ def _median_space_error(problems: Mapping[int, Problem], answers: Mapping[int, F
     return float(np.median(np.concatenate([problems[n].errors_pct(X) for n, X in answers.items()])))
 
 
-def _least_squared_distances(n: int, problem: Problem, kept: Mapping[str, Mapping[str, F64] | None]) -> F64:
-    """Return the optimal residuals (N,): the minimum of all answers and of a descent from the truth."""
-    answers = [a[f"{n}"] for a in kept.values() if a is not None and f"{n}" in a]
-    found = [squared_distances(problem.P, X, problem.xy) for X in (*answers, _least_near_truth(problem))]
-    return np.asarray(np.min(found, axis=0))
-
-
 def _least_near_truth(problem: Problem) -> F64:
-    """Return points (N, 4) of minimum reprojection error, iterated from the true ones.
-
-    Levenberg-Marquardt in the metric frame, with a separate damping for every point.
-    """
+    """Return points (N, 4) of minimum reprojection error, iterated from the true ones."""
     P, X = problem.P @ problem.G, problem.X
     cost, damping = np.full(len(X), np.inf), np.full(len(X), 1e-3)
     trial = X
@@ -207,22 +207,3 @@ def _least_near_truth(problem: Problem) -> F64:
         N = N + damping[:, None, None] * np.einsum("naa->na", N)[:, :, None] * np.eye(3)
         trial = X - np.linalg.solve(N, g[:, :, None])[..., 0]
     return np.asarray(homogenize(X) @ problem.G.T)
-
-
-def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]) -> Plot:
-    """Plot the error in space over noise: two views, metric frame."""
-    traces = []
-    for name, answers in found.items():
-        if answers is None:
-            continue
-        y = []
-        for sigma in NOISES_PX:
-            errors = [
-                p.errors_pct(answers[f"{n}"])
-                for n, p in enumerate(problems)
-                if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
-            ]
-            y.append(float(np.median(np.concatenate(errors))))
-        traces.append(scatter(name, NOISES_PX, y, "lines+markers"))
-    zero = {"rangemode": "tozero"}
-    return plot("Two views, metric frame", traces, "noise (px)", "median error in space (%)", yaxis=zero)

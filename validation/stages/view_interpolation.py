@@ -3,34 +3,96 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import PIL.Image
+from numpy.typing import NDArray
 
 from thesisrecon.api.views import prepare_rectified_pair
 from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.views.tensor import camera_at
-from validation.metrics.image_similarity import psnr_db, ssim
+from thesisrecon.stereo._postprocessing import match_both_sides
+from thesisrecon.stereo.semi_global import SemiGlobalMatching
+from thesisrecon.views import _image_similarity as similarity
+from thesisrecon.views.tensor import CalibratedPair, camera_at, default_intrinsics
+from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
-from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
-from validation.runs.rows import OURS, Values, row
+from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task, Values, row
 from validation.runs.tables import Metric
-from validation.scenes.image_files import read_rgb
-from validation.scenes.nine_views import (
-    BETWEEN,
-    BEYOND,
-    DISPARITIES,
-    ENDS,
-    NineViews,
-    both_ways,
-    dissolved,
-    load_cones,
-    our_disparities,
-    synthesis_of_disparities,
-)
+from validation.scenes.real import read_rgb
+from validation.scenes.stereo import read_disparity, stereo_folder
+
+SSIM_BORDER_PX = 5
+"""Radius of the SSIM windows."""
+
+
+def psnr_db(image: NDArray[Any], truth: NDArray[Any], *, where: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio of images (H, W, 3) over the pixels ``where`` (H, W), or all."""
+    compared = np.ones(truth.shape[:2], dtype=bool) if where is None else where
+    return similarity.psnr_db(truth, image, compared)
+
+
+def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
+    """Mean structural similarity of images (H, W, 3), 1 for equal ones, where whole windows fit."""
+    found = similarity._ssim_map(truth, image, np.ones(truth.shape[:2], dtype=bool))
+    return float(found[SSIM_BORDER_PX:-SSIM_BORDER_PX, SSIM_BORDER_PX:-SSIM_BORDER_PX].mean())
+
+
+ENDS = (2, 6)
+BETWEEN = (3, 4, 5)
+BEYOND = (1, 7)
+DISPARITIES = 64
+"""Between the ends; their disparities are less than this."""
+
+
+@dataclass(frozen=True)
+class NineViews:
+    """``images`` (H, W, 3) by their number, and the true disparities (H, W) of both ends, NaN = unknown."""
+
+    images: dict[int, U8]
+    disparities: tuple[F32, F32]
+
+    def share(self, view: int) -> float:
+        """Return the position of a view between the ends, 0 to 1."""
+        return (view - ENDS[0]) / (ENDS[1] - ENDS[0])
+
+
+def load_cones() -> NineViews | None:
+    """The Cones of Scharstein and Szeliski (CVPR 2003); None if they are not on this machine."""
+    folder = stereo_folder("Cones")
+    if folder is None:
+        return None
+    numbers = sorted({*ENDS, *BETWEEN, *BEYOND})
+    images = {k: read_rgb(folder / f"im{k}.png") for k in numbers}
+    first, second = (read_disparity(folder / f"disp{k}.png", 4.0) for k in ENDS)
+    return NineViews(images, (first, second))
+
+
+def synthesis_of_disparities(
+    left: U8, right: U8, of_left: F32, of_right: F32, *, agree_px: float = AGREE_PX
+) -> TensorSynthesis:
+    """A rectified pair of parallel cameras as a pair for the tensor, unknown pixels treated as background."""
+    height, width = of_left.shape
+    places = []
+    for d, sign in ((of_left, -1.0), (of_right, 1.0)):
+        y, x = np.indices(d.shape, dtype=np.float32)
+        filled = DisparityMap(d, np.zeros_like(d), 0.0).filled()
+        places.append(np.stack([x + np.float32(sign) * filled, y], axis=-1))
+    K = default_intrinsics((width, height))
+    pair = CalibratedPair(K, K, np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    return prepare_synthesis(pair, (left, right), (places[0], places[1]), agree_px=agree_px)
+
+
+def dissolved(first: U8, second: U8, share: float) -> U8:
+    """Cross-dissolve of both images, the baseline of interpolation."""
+    mixed = (1.0 - share) * first.astype(np.float64) + share * second
+    return np.asarray(np.rint(mixed), dtype=np.uint8)
+
 
 TRUE, DISSOLVE = "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
@@ -90,11 +152,10 @@ class ViewInterpolationStage(Stage):
                 difference = "difference of the means"
                 metrics.append(row(scene, f"{what}PSNR over {name}", "dB", over, difference, more=True))
         metrics += [_of_view(scene, k, cones, made) for k in (*BETWEEN, *BEYOND)]
-        return Judgement(metrics, pictures=_beside(options.folder(self.name, scene), cones, made))
+        return Judgement(metrics)
 
 
 def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> Metric:
-    """Return the row of one view."""
     beyond = k in BEYOND
     shown = slice(BORDER_PX, -BORDER_PX) if beyond else slice(None)
     wanted = cones.images[k][:, shown]
@@ -105,21 +166,6 @@ def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[in
     }
     text = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
     return row(scene, f"PSNR, view {k}", "dB", values, text, more=True, judged=TENSOR if beyond else OURS)
-
-
-def _beside(folder: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
-    shown = []
-    for k, picture in made[OURS].items():
-        row = np.concatenate([cones.images[k], picture, _difference(picture, cones.images[k])], axis=1)
-        PIL.Image.fromarray(row).save(_file(folder, k))
-        text = "The image, ours, and four times the difference from middle grey."
-        shown.append(Picture(_file(folder, k).name, f"View {k}", text))
-    return shown
-
-
-def _difference(picture: U8, wanted: U8) -> U8:
-    apart = 4.0 * (picture.astype(np.float32) - wanted)
-    return np.asarray(np.clip(128.0 + apart, 0.0, 255.0), dtype=np.uint8)
 
 
 def _cones() -> NineViews:
@@ -152,10 +198,14 @@ def _disparities(
     if source == TRUE:
         return cones.disparities
     if source == OURS:
-        return our_disparities(left, right)
+        match = partial(SemiGlobalMatching().match, disparity_range=(0, DISPARITIES - 1))
+        return match_both_sides(match, left, right)
     one_thread()
     reference = OpenCVSemiGlobal(source)
-    return both_ways(lambda a, b: reference.match(a, b, DISPARITIES), left, right)
+    # Seen in a mirror, the right image is a left one.
+    mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
+    back = reference.match(mirrored[0], mirrored[1], DISPARITIES)
+    return reference.match(left, right, DISPARITIES), np.ascontiguousarray(back[:, ::-1])
 
 
 def _file(folder: Path, view: int) -> Path:

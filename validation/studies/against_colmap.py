@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 import platform
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,38 +24,29 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._outputs import clear_folder
 from thesisrecon.records import Reconstruction
 from validation.metrics.cameras import (
-    CameraErrors,
     Reprojection,
     TrueCameras,
     measure_cameras,
     measure_reprojection,
 )
-from validation.references.colmap import read_run
-from validation.references.colmap_reading import read_colmap_model
-from validation.runs.gates import camera_limit
+from validation.references.colmap import read_colmap_model, read_run
 from validation.runs.processes import Process, own_cores, run_process
+from validation.runs.results import camera_limit
 from validation.runs.scenes import truth_of
 from validation.runs.study import Part, report_progress
-from validation.runs.tables import Metric, Rows
+from validation.runs.tables import Metric, Rows, machine
 from validation.scenes.real import REAL_SCENES, Scene, scenes_here
-from validation.stamp import machine
 
 OURS, THESIS = "ours (default)", "ours (thesis)"
 COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
 
-CLAIM_TOLERANCE_PCT = 1.0
-TIMED_SCENES = ("fountain-P11", "Herz-Jesus-P8")
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one method on one scene.
-
-    ``reconstruction``: none after a failure; ``wall_s``, ``seconds``: the time that counts, and its parts;
-    ``cpu_s``: processor time of the whole process; ``failure``: message of the failure; ``reasons``:
-    unregistered image -> reason that the method gives; ``claimed_rms_px``: reprojection error that the
-    method states.
-    """
+    """Result of one method on one scene. ``reconstruction``: none after a failure; ``wall_s``, ``seconds``:
+    the time that counts, and its parts; ``cpu_s``: processor time of the whole process; ``failure``: message
+    of the failure; ``reasons``: unregistered image -> reason that the method gives; ``claimed_rms_px``:
+    reprojection error that the method states."""
 
     reconstruction: Reconstruction | None
     wall_s: float
@@ -69,10 +61,7 @@ class Outcome:
 def check_reconstruction(
     scene: str, n_views: int, truth: TrueCameras | None, outcomes: Mapping[str, Outcome]
 ) -> list[Metric]:
-    """Return all rows of one scene, bounded by the gates of the report; truth may be None.
-
-    ``outcomes`` maps methods to their results.
-    """
+    """Return all rows of one scene, bounded by the gates of the report; truth may be None."""
     models = {name: outcome.reconstruction for name, outcome in outcomes.items()}
     limit = partial(camera_limit, scene)
     residuals = {name: None if m is None else measure_reprojection(m) for name, m in models.items()}
@@ -84,21 +73,22 @@ def check_reconstruction(
     rows.add(f"cameras registered of {n_views}", registered, at_least=least)
     if truth is not None:
         errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
-        read: dict[str, tuple[str, str, Callable[[CameraErrors], float | None]]] = {
-            "focal error": ("%", "focal-error", lambda e: e.focal_error_pct),
-            "principal point error": ("px", "principal-point-error", lambda e: e.principal_point_error_px),
-            "mean camera-centre error": ("mm", "centre-error", lambda e: e.centre_error_mm),
-            "median rotation error": ("deg", "rotation-error", lambda e: e.rotation_error_deg),
-        }
-        for name, (unit, gate, number) in read.items():
-            rows.each(name, errors, number, unit, at_most=limit(gate))
+        for name, unit, gate, field in (
+            ("focal error", "%", "focal-error", "focal_error_pct"),
+            ("principal point error", "px", "principal-point-error", "principal_point_error_px"),
+            ("mean camera-centre error", "mm", "centre-error", "centre_error_mm"),
+            ("median rotation error", "deg", "rotation-error", "rotation_error_deg"),
+        ):
+            rows.each(name, errors, attrgetter(field), unit, at_most=limit(gate))
     rows.each("median reprojection", residuals, lambda r: r.median_px, "px", at_most=limit("reprojection"))
     rows.each("mean reprojection", residuals, lambda r: r.mean_px, "px")
     rows.each("points", models, lambda m: float(m.valid.sum()))
     rows.each("observations", residuals, lambda r: float(r.observations))
-    colmap_s = outcomes[COLMAP].wall_s if COLMAP in outcomes and scene in TIMED_SCENES else None
+    colmap_s = (
+        outcomes[COLMAP].wall_s if COLMAP in outcomes and scene in ("fountain-P11", "Herz-Jesus-P8") else None
+    )
     rows.each("wall time", outcomes, lambda o: o.wall_s, "s", at_most=colmap_s)
-    rows.add("rms it claims off by", _claims(outcomes, residuals), "%", at_most=CLAIM_TOLERANCE_PCT)
+    rows.add("rms it claims off by", _claims(outcomes, residuals), "%", at_most=1.0)
     rows.each("processor time", outcomes, lambda o: o.cpu_s, "s")
     rows.each("peak memory", outcomes, lambda o: o.peak_mb, "MB")
     return rows
@@ -107,12 +97,11 @@ def check_reconstruction(
 def _claims(
     outcomes: Mapping[str, Outcome], residuals: Mapping[str, Reprojection | None]
 ) -> dict[str, float | None]:
-    differences: dict[str, float | None] = {}
-    for name, outcome in outcomes.items():
-        measured, claimed = residuals[name], outcome.claimed_rms_px
-        if measured is not None and claimed is not None:
-            differences[name] = 100.0 * abs(claimed / measured.rms_px - 1.0)
-    return differences
+    return {
+        name: 100.0 * abs(outcome.claimed_rms_px / measured.rms_px - 1.0)
+        for name, outcome in outcomes.items()
+        if (measured := residuals[name]) is not None and outcome.claimed_rms_px is not None
+    }
 
 
 METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
@@ -122,12 +111,8 @@ def run_method(method: str, scene: Scene, out: Path, *, threads: int, environmen
     """Run one method on one scene in the emptied folder ``out`` and read its result."""
     images = scene.image_paths[0].parent
     clear_folder(out)
-    process = run_process(
-        _command(method, images, out, threads),
-        log=out.with_suffix(".log"),
-        cores=own_cores()[:threads],
-        environment=environment,
-    )
+    command, cores = _command(method, images, out, threads), own_cores()[:threads]
+    process = run_process(command, log=out.with_suffix(".log"), cores=cores, environment=environment)
     read = _read_colmap if method in (COLMAP, COLMAP_PP) else _read_ours
     try:
         return read(scene, out, process)
@@ -157,21 +142,9 @@ def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
         model = read_colmap_model(out / "sparse" / "0", names)
     except UsageError as missing:
         failure = str(summary.get("failure") or f"exit code {process.code}: {missing}")
-    return Outcome(
-        model,
-        process.wall_s,
-        process.peak_mb,
-        process.cpu_s,
-        seconds=_stage_seconds(summary),
-        failure=failure,
-        reasons=reasons,
-        claimed_rms_px=summary.get("reprojection_rms_px"),
-    )
-
-
-def _stage_seconds(summary: dict[str, Any]) -> dict[str, float]:
-    seconds = summary.get("seconds")
-    return {k: float(v) for k, v in seconds.items()} if isinstance(seconds, dict) else {}
+    seconds = {stage: float(spent) for stage, spent in (summary.get("seconds") or {}).items()}
+    used, claimed = (process.wall_s, process.peak_mb, process.cpu_s), summary.get("reprojection_rms_px")
+    return Outcome(model, *used, seconds, failure, reasons, claimed)
 
 
 def _read_colmap(scene: Scene, out: Path, process: Process) -> Outcome:
@@ -219,10 +192,7 @@ def _notes(outcomes: dict[str, Outcome]) -> str:
 
 
 def against_colmap_study(
-    out: Path,
-    scenes: Sequence[str] = ("courtyard", *REAL_SCENES),
-    repeats: int = 1,
-    threads: int = 2,
+    out: Path, scenes: Sequence[str] = ("courtyard", *REAL_SCENES), repeats: int = 1, threads: int = 2
 ) -> Iterator[Part]:
     """Run both presets and COLMAP on the same images and compare them with the truth."""
     found = scenes_here(scenes)
@@ -231,14 +201,9 @@ def against_colmap_study(
     environment = {"NUMBA_CACHE_DIR": str(out / "numba_cache")}
     first = min(found, key=lambda scene: len(scene.image_paths))
     seconds = warm_up(first, out, threads=threads, environment=environment)
-    facts: dict[str, Any] = {
-        "machine": machine(),
-        "threads": threads,
-        "python": platform.python_version(),
-        "pycolmap": version("pycolmap"),
-        "first run, kernels compiling": f"{seconds:.1f} s on {first.name}",
-    }
-    yield "; ".join(f"{name}: {value}" for name, value in facts.items())
+    versions = f"python: {platform.python_version()}; pycolmap: {version('pycolmap')}"
+    cold = f"first run, kernels compiling: {seconds:.1f} s on {first.name}"
+    yield f"machine: {machine()}; threads: {threads}; {versions}; {cold}"
     for scene in found:
         rows, outcomes = measure_scene(scene, out, threads=threads, repeats=repeats, environment=environment)
         yield rows

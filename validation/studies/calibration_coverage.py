@@ -38,14 +38,10 @@ def one_camera(scores: IntervalScores, cameras: Cameras) -> IntervalScores:
 
 COVERAGE = 0.92, 0.98
 ZOOM = 0.3
-COLUMNS = {"focal": (0,), "principal point": (1, 2)}
 
 
 def run_trial(cameras: Cameras, number: int) -> tuple[IntervalScores, MetricResult] | None:
-    """Solve one synthetic scene; None if calibration fails.
-
-    With one camera per image the focal lengths vary by factors of up to e^0.3.
-    """
+    """Solve one synthetic scene; None if calibration fails."""
     rng = np.random.default_rng([number, 5])
     scene = make_sequence(Motion.GENERAL, rng, zoom=0.0 if cameras == "shared" else ZOOM)
     projective = projective_estimate(scene, rng)
@@ -74,7 +70,7 @@ def check_coverage(cameras: Cameras, numbers: Iterable[int]) -> list[Metric]:
         return rows
     scores = [part[0] for part in trusted]
     joined = join_scores(scores)
-    for label, columns in COLUMNS.items():
+    for label, columns in {"focal": (0,), "principal point": (1, 2)}.items():
         z, share = joined.z[:, columns], joined.holding(columns)
         name = f"95 % intervals of the {label} that hold the truth"
         rows.add(name, share, at_least=COVERAGE[0])

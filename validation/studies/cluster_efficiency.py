@@ -40,7 +40,6 @@ STAGES: Mapping[Callable[..., Any], str] = {
 """Function of a task -> stage."""
 PREPARATIONS = {"prepare": "matches", "prepare_oblique": "oblique matches"}
 """Function that prepares the views of a batch -> stage."""
-WORKERS = (1, 2, 4, 8, 16)
 LINE = 125e6
 """Bytes per second of a gigabit line."""
 
@@ -56,10 +55,8 @@ class Task:
 
 @dataclass
 class Matching:
-    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair.
-
-    ``corners``: their number in each view, which bounds the batches.
-    """
+    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair. ``corners``:
+    their number in each view, which bounds the batches."""
 
     views: dict[int, Task] = field(default_factory=dict)
     pairs: dict[tuple[int, int], Task] = field(default_factory=dict)
@@ -146,10 +143,7 @@ def critical_path(tasks: Sequence[Task], workers: int, bytes_per_s: float = math
 
 
 def measure_tasks(images: str, count: int, until: Until, settings: Sequence[str]) -> dict[str, Any]:
-    """Reconstruct with one worker in this process, its kernels loaded before.
-
-    Return the serial seconds, and by number of workers and stage the fields of the tasks.
-    """
+    """Reconstruct with one worker in this process, its kernels loaded before."""
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
         reconstruct(paths[:4], Path(place) / "warm", until=until, threads=1)
@@ -158,7 +152,7 @@ def measure_tasks(images: str, count: int, until: Until, settings: Sequence[str]
         reconstruct(paths, Path(place) / "run", executor=meter, **options)  # type: ignore[arg-type]
         serial_s = time.process_time() - start - meter.used_s
     found: dict[str, Any] = {}
-    for workers in WORKERS:
+    for workers in (1, 2, 4, 8, 16):
         found[str(workers)] = {
             stage: [asdict(task) for task in tasks] for stage, tasks in meter.tasks(workers).items()
         }

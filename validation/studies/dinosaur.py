@@ -27,7 +27,6 @@ from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_track
 
 OURS, PUBLISHED = "thesisrecon", "published cameras"
 LOSS_PX, WRONG_PX = 1.0, 3.0
-ADJUSTMENT_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, R
     k = np.isfinite(before.px)
     result = refine_projective_bundle(
         P, X, Observations(tracks.view_index[k], tracks.point_index[k], tracks.xy[k]),
-        loss_px=LOSS_PX, max_iterations=ADJUSTMENT_STEPS,
+        loss_px=LOSS_PX, max_iterations=50,
     )  # fmt: skip
     return before, judge_cameras(result.P, registered, tracks)[1]
 

@@ -74,13 +74,10 @@ class Meter:
 
 @dataclass(frozen=True)
 class Cost:
-    """One number of images.
-
-    ``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
+    """``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
     matches, cameras and points; ``focal_error_rel``, ``centre_error_rel``: of the true focal length and of
     the extent of the true centres; ``failure``: message of a run without cameras; ``colmap``: the same of
-    COLMAP.
-    """
+    COLMAP."""
 
     images: int
     cpu_s: Mapping[str, float]
@@ -101,17 +98,9 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def measure_cost(
-    images: str,
-    count: int,
-    threads: int,
-    scene: str,
-    until: Until = "metric",
-    settings: Sequence[str] = (),
+    images: str, count: int, threads: int, scene: str, until: Until = "metric", settings: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`.
-
-    The matched pairs are listed in ``pairs-COUNT.txt`` in the folder of the images.
-    """
+    """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`."""
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
         reconstruct(paths[:4], Path(place) / "warm", until=until, threads=threads)
@@ -146,7 +135,6 @@ def _size(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[float, float]:
-    """Errors of the focal length and, of the extent, of the centres."""
     poses = WALKS[scene][0](len(found.P), size)
     K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
     errors = measure_cameras(found, TrueCameras(K, R, C))
@@ -154,10 +142,7 @@ def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[f
 
 
 def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[str, float]:
-    """COLMAP on the first ``count`` images and the pairs that :func:`measure_cost` listed.
-
-    It refines the principal point, which is not at the centre of these images.
-    """
+    """COLMAP on the first ``count`` images and the pairs that :func:`measure_cost` listed."""
     paths = sorted(images.glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
         folder, out = Path(place) / "images", Path(place) / "out"

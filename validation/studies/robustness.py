@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import NOT_MADE, REMEDIES
@@ -38,8 +38,6 @@ from validation.scenes.real import ROOT
 COURTYARD = ROOT / "fixtures" / "courtyard"
 CLEAN = ("seconds", "elapsed_seconds", "resumed", "peak_memory_mb", "threads", "executor")
 """Fields of the summary that may differ between equal runs."""
-TRIES = 3
-"""Attempts at one kill, if the run ends before it."""
 TORN = """
 import os, signal, sys
 left = int(sys.argv.pop(1))
@@ -61,8 +59,7 @@ sys.exit(run_command(sys.argv[1:]))
 # ---------------------------------------------------------------- killed runs
 
 
-@dataclass(frozen=True)
-class Kill:
+class Kill(NamedTuple):
     """A killed run: when, whether it died, finished stage files, outputs that differ after the resume."""
 
     when: str
@@ -100,11 +97,9 @@ class Runs:
         self.place, self.options, self.images = place, options, images
         self.environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
-    def arguments(self, out: Path) -> list[str]:
-        return ["reconstruct", str(self.images), "-o", str(out), *self.options]
-
-    def program(self, out: Path) -> list[str]:
-        return [sys.executable, "-m", "thesisrecon", *self.arguments(out)]
+    def program(self, out: Path, *start: str) -> list[str]:
+        arguments = ["reconstruct", str(self.images), "-o", str(out), *self.options]
+        return [sys.executable, *(start or ("-m", "thesisrecon")), *arguments]
 
     def whole(self, out: Path) -> float:
         start = time.perf_counter()
@@ -124,12 +119,9 @@ class Runs:
     def torn(self, name: str, write: int) -> tuple[Path, bool]:
         """Run a program that dies while it writes its ``write``-th file."""
         out = self.place / name
-        program = [sys.executable, "-c", TORN, str(write), *self.arguments(out)]
+        program = self.program(out, "-c", TORN, str(write))
         ended = subprocess.run(program, env=self.environment, check=False, stdout=subprocess.DEVNULL)
         return out, ended.returncode == -signal.SIGKILL
-
-    def resumed(self, when: str, out: Path, died: bool, wanted: dict[str, bytes]) -> Kill:
-        return Kill(when, died, *self.compared(out, wanted))
 
     def compared(self, out: Path, wanted: dict[str, bytes]) -> tuple[int, tuple[str, ...]]:
         """Resume a run; return the stage files that it had, and its outputs that differ."""
@@ -145,43 +137,37 @@ def kill_runs(runs: Runs, kills: int, writes: int) -> Iterator[Kill]:
     yield Kill("two undisturbed runs", False, 0, different(outputs(runs.place / "first"), wanted))
     for k in range(kills):
         share = (k + 0.5) / kills
-        for again in range(TRIES):
+        # The run may end before it is killed.
+        for again in range(3):
             begun = time.perf_counter()
             out, died = runs.killed(f"kill-{k}-{again}", share * seconds)
             if died:
                 break
             # The whole run was slower, because of other load.
             seconds = time.perf_counter() - begun
-        yield runs.resumed(f"after {100 * share:.0f} % of the time", out, died, wanted)
+        yield Kill(f"after {100 * share:.0f} % of the time", died, *runs.compared(out, wanted))
     for k in range(writes):
         write = 1 + k * (len(wanted) - 1) // max(writes - 1, 1)
         out, died = runs.torn(f"write-{k}", write)
-        yield runs.resumed(f"in the middle of file {write}", out, died, wanted)
+        yield Kill(f"in the middle of file {write}", died, *runs.compared(out, wanted))
 
 
 def kill_table(rows: Sequence[Kill]) -> str:
-    cells = []
-    for row in rows:
-        late = "" if row.died or not row.kept else " (had ended)"
-        cells.append([row.when + late, row.kept, ", ".join(row.different) or "none"])
+    late = ["" if row.died or not row.kept else " (had ended)" for row in rows]
+    cells = [
+        [r.when + end, r.kept, ", ".join(r.different) or "none"] for r, end in zip(rows, late, strict=True)
+    ]
     return text_table(["killed", "stage files kept", "outputs that differ after the resume"], cells)
 
 
 # ---------------------------------------------------------------- interrupted runs
 
-LIMIT_S, POLL_S = 2.0, 0.005
-GRACE_S = 0.5
-"""Seconds for a process to end after its parent."""
-
 
 @dataclass(frozen=True)
 class Stop:
-    """An interrupted run.
-
-    ``seconds``: from the signal to the end; ``code``, ``message``: exit code and error stream; ``left``:
+    """``seconds``: from the signal to the end; ``code``, ``message``: exit code and error stream; ``left``:
     processes left behind; ``kept``: finished stage files; ``different``: outputs that differ after the
-    resume.
-    """
+    resume."""
 
     when: str
     seconds: float
@@ -194,19 +180,18 @@ class Stop:
     def wrong(self, asked: signal.Signals) -> str:
         if self.code == 0:
             return f"differs: {', '.join(self.different)}" if self.different else ""
-        found = {
-            f"took {self.seconds:.1f} s": self.seconds > LIMIT_S,
-            **_faults_of_end(self, CODES[asked]),
-            f"{self.left} processes left": self.left > 0,
-            f"differs: {', '.join(self.different)}": bool(self.different),
-        }
-        return "; ".join(fault for fault, present in found.items() if present)
+        slow = [f"took {self.seconds:.1f} s"] * (self.seconds > 2.0)
+        more = _faults(self, CODES[asked], {f"{self.left} processes left": self.left > 0})
+        return "; ".join([*slow, *([more] if more else [])])
 
 
-def _faults_of_end(ended: Stop | Refusal, code: int) -> dict[str, bool]:
-    """Return the faults that the exit code and the error stream may have, and whether they are there."""
+def _faults(ended: Stop | Refusal, code: int | None, more: dict[str, bool]) -> str:
+    """Name the faults of exit code (if one is given) and error stream, ``more``, and outputs that differ."""
     sentence = ended.message.count("\n") == 1 and "Traceback" not in ended.message
-    return {f"exit code {ended.code}": ended.code != code, "not one sentence": not sentence}
+    end = {f"exit code {ended.code}": ended.code != code, "not one sentence": not sentence}
+    found = {} if code is None else end
+    found |= more | {f"differs: {', '.join(ended.different)}": bool(ended.different)}
+    return "; ".join(fault for fault, present in found.items() if present)
 
 
 def stopped(
@@ -228,7 +213,7 @@ def stopped(
     )
     assert process.stderr is not None
     while process.poll() is None and not ready():
-        time.sleep(POLL_S)
+        time.sleep(0.005)
     start = time.perf_counter()
     if process.poll() is None:
         os.killpg(process.pid, asked)
@@ -237,7 +222,7 @@ def stopped(
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
     seconds = time.perf_counter() - start
-    time.sleep(GRACE_S)
+    time.sleep(0.5)  # for processes to end after their parent
     left = _of_session(process.pid)
     for number in left:
         os.kill(number, signal.SIGKILL)
@@ -287,27 +272,21 @@ def stop_runs(runs: Runs, moments: int, asked: signal.Signals, *, cold: bool) ->
 
 
 def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
-    cells = []
-    for row in rows:
-        wrong = row.wrong(asked) or ("nothing" if row.code else "nothing (had ended)")
-        cells.append([row.when, f"{row.seconds:.2f}", row.code, row.kept, wrong])
+    none = {True: "nothing (had ended)", False: "nothing"}
+    cells = [
+        [row.when, f"{row.seconds:.2f}", row.code, row.kept, row.wrong(asked) or none[row.code == 0]]
+        for row in rows
+    ]
     return text_table(["stopped at", "seconds to stop", "exit code", "stage files kept", "wrong"], cells)
 
 
 # ---------------------------------------------------------------- full and read-only disks
 
-REFUSED = 2
-SMALL_MODEL = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
-"""Coarse depth maps: every stage writes its files quickly."""
-
 
 @dataclass(frozen=True)
 class Refusal:
-    """A run that could not write.
-
-    ``when``: where the disk was full or read-only; ``code``, ``message``: exit code and error stream;
-    ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume.
-    """
+    """``when``: where the disk was full or read-only; ``code``, ``message``: exit code and error stream;
+    ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume."""
 
     when: str
     code: int
@@ -319,22 +298,17 @@ class Refusal:
     def wrong(self) -> str:
         # Once cameras and summary are there, the run ends well, with warnings.
         complete = self.code == 0 and NOT_MADE in self.message
-        found = {
-            **({} if complete else _faults_of_end(self, REFUSED)),
+        more = {
             "names no place": " cannot be written: " not in self.message,
             "does not say what to do": not any(words in self.message for words in REMEDIES.values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
-            f"differs: {', '.join(self.different)}": bool(self.different),
         }
-        return "; ".join(fault for fault, present in found.items() if present)
+        return _faults(self, None if complete else 2, more)
 
 
 @contextlib.contextmanager
 def disk_ends(first: int, number: int) -> Iterator[list[int]]:
-    """Let the ``first``-th file (from 1) and all later ones fail with the error ``number``.
-
-    No file fails if ``first`` is 0. The list holds the number of files that were written.
-    """
+    """Let the ``first``-th file (from 1) and all later ones fail with the error ``number``."""
     written, sync = [0], os.fsync
 
     def synced(descriptor: int) -> None:
@@ -359,7 +333,9 @@ class SmallRuns:
         self.images.mkdir()
         for path in sorted((COURTYARD / "images").iterdir())[:views]:
             (self.images / path.name).symlink_to(path)
-        self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *SMALL_MODEL]
+        # Coarse depth maps: every stage writes its files quickly.
+        coarse = ["--set", "dense.max_side=160", "--set", "dense.match_side=160"]
+        self.options = ["--max-size", str(size_px), "--until", until, "--threads", "1", *coarse]
 
     def run(self, out: Path) -> tuple[int, str]:
         errors, printed = io.StringIO(), io.StringIO()
@@ -410,9 +386,9 @@ def _printed(rows: Iterable[Any]) -> list[Any]:
     return found
 
 
-def _count(scene: str, name: str, wrong: int, total: int) -> Rows:
+def _count(scene: str, name: str, wrong: Sequence[object]) -> Rows:
     rows = Rows(scene, "ours")
-    rows.add(f"{name}, of {total}", wrong, at_most=0.0)
+    rows.add(f"{name}, of {len(wrong)}", sum(map(bool, wrong)), at_most=0.0)
     return rows
 
 
@@ -430,7 +406,7 @@ def kill_anywhere_study(
         runs = Runs(Path(place), options, images)
         rows = _printed(kill_runs(runs, kills, writes))
     yield kill_table(rows)
-    yield _count("killed runs", "runs that differ", sum(bool(r.different) for r in rows), len(rows))
+    yield _count("killed runs", "runs that differ", [r.different for r in rows])
 
 
 def stop_anywhere_study(
@@ -451,7 +427,7 @@ def stop_anywhere_study(
     with TemporaryDirectory() as place:
         rows = _printed(stop_runs(Runs(Path(place), options, images), moments, asked, cold=cold))
     yield stop_table(rows, asked)
-    yield _count("interrupted runs", "runs with faults", sum(bool(r.wrong(asked)) for r in rows), len(rows))
+    yield _count("interrupted runs", "runs with faults", [r.wrong(asked) for r in rows])
 
 
 def full_disk_study(
@@ -462,4 +438,4 @@ def full_disk_study(
         runs = SmallRuns(Path(place), views, max_size, until)
         rows = _printed(refuse_runs(runs, every))
     yield refusal_table(rows)
-    yield _count("runs without room", "runs with faults", sum(bool(r.wrong) for r in rows), len(rows))
+    yield _count("runs without room", "runs with faults", [r.wrong for r in rows])

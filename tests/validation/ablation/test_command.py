@@ -64,17 +64,6 @@ def test_an_interrupted_study_states_how_to_resume(tmp_path):
     assert (stop.code, stop.message, stop.left) == (130, f"validation: interrupted; {kept}\n", 0)
 
 
-def test_an_interrupt_in_a_program_is_reported(tmp_path, monkeypatch, capsys):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("validation.ablation.command.ablate", interrupt)
-    assert main(["ablate", str(write_study(tmp_path)), "-o", str(tmp_path / "out")]) == 130
-    assert capsys.readouterr().err.startswith(
-        "ablate: interrupted; run the same command to continue from the finished rows"
-    )
-
-
 def test_failed_rows_and_wrong_options_have_their_exit_codes(tmp_path, capsys):
     out = ["-o", str(tmp_path / "out"), "--executor", "local", "--threads", "1"]
     some = write_study(tmp_path, "refuses")

@@ -11,10 +11,8 @@ from tests.validation.ablation.toy import Darts
 from thesisrecon.errors import UsageError
 from thesisrecon.records import FundamentalFit
 from validation.ablation import Study, ablate, analyse
-from validation.ablation.own import load_own
-from validation.ablation.plan import plan_study
-from validation.ablation.toml import read_study, study_from_table
-from validation.ablation.workers import pack
+from validation.ablation.changes import load_own
+from validation.ablation.plan import plan_study, read_study, study_from_table
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "development" / "ablations.md"
 
@@ -43,25 +41,6 @@ def test_the_first_lines_of_the_documentation_plan_a_study():
     plan = plan_study(names["study"])
     assert [v.name for v in plan.variants][1:] == ["threshold_px = 0.5", "threshold_px = 2"]
     assert len(plan.rows) > len(plan.variants)  # the whole scene and its windows
-
-
-def test_an_edited_variant_has_new_rows(tmp_path):
-    path = write_examples(tmp_path)
-    before = {r.variant: r.key for r in plan_study(read_study(path)).rows}
-    file = tmp_path / "every_match.py"
-    file.write_text(file.read_text() + "\n# another thought\n")
-    after = {r.variant: r.key for r in plan_study(read_study(path)).rows}
-    assert before["default"] == after["default"]
-    assert before["EveryMatch"] != after["EveryMatch"]
-
-
-def test_the_source_of_a_variant_travels_with_its_rows(tmp_path):
-    plan = plan_study(read_study(write_examples(tmp_path)))
-    own = next(r for r in plan.rows if r.variant == "EveryMatch")
-    _, sources = pack(own.setting)
-    assert [Path(s.path).name for s in sources] == ["every_match.py"]
-    assert "class EveryMatch" in sources[0].text
-    assert pack(plan.rows[0].setting)[1] == ()
 
 
 @dataclass(frozen=True)

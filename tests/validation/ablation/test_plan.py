@@ -1,6 +1,5 @@
 """What a study says of itself before anything runs."""
 
-import ast
 from dataclasses import replace
 
 import pytest
@@ -13,9 +12,8 @@ from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from validation.ablation import Measure, Study
 from validation.ablation.command import STUDIES, plan_summary
-from validation.ablation.plan import ROOT, RUN_BY_ROWS, plan_study, versions
+from validation.ablation.plan import plan_study, read_study, study_from_table, versions
 from validation.ablation.run import parts_of
-from validation.ablation.toml import read_study, study_from_table
 
 
 def darts(axes, **more):
@@ -35,10 +33,6 @@ def test_one_thing_changes_at_a_time():
     assert isinstance(settings["thesis-ransac"].config.epipolar, ThesisRansac)
     assert settings["thesis-ransac"].task == Darts()
     assert plan.baseline == "as it is"
-
-
-def test_an_ineffective_value_is_not_a_second_variant():
-    assert names(darts({"task.aim": [0.0, 1.0]})) == ["unchanged", "aim = 1"]
 
 
 def test_a_grid_takes_every_combination_and_no_start():
@@ -63,15 +57,6 @@ def test_a_ladder_keeps_its_steps_and_a_whole_stage_replaces_what_was_set_in_it(
     assert found["new"].task.aim == 2.0
 
 
-def test_conditions_multiply_rows_but_not_variants():
-    plan = plan_study(darts({"task.aim": [1.0]}, conditions={"task.spread": [0.5, 2.0, 4.0]}))
-    assert len(plan.variants) == 2
-    assert [c.name for c in plan.conditions] == ["spread = 0.5", "spread = 2", "spread = 4"]
-    assert len(plan.rows) == 2 * 3 * 2 * 2
-    assert len({r.key for r in plan.rows}) == len(plan.rows)
-    assert [r.seed for r in plan.rows] == sorted(r.seed for r in plan.rows), "a stopped study has whole seeds"
-
-
 def test_values_may_be_objects_tables_words_or_preset_values():
     values = [
         HarrisCorners(max_corners=77),
@@ -91,16 +76,6 @@ def test_values_may_be_objects_tables_words_or_preset_values():
     assert rows[1].setting.config.features == preset("thesis").features
 
 
-def test_an_object_may_stand_deep_in_a_stage():
-    from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-    from thesisrecon.stereo.semi_global import SemiGlobalMatching
-
-    rows = plan_study(darts({"dense.pairs.matcher": [SemiGlobalMatching(truncation=99.0)]})).rows
-    assert rows[1].setting.config.dense.pairs.matcher == SemiGlobalMatching(truncation=99.0)
-    words = plan_study(darts({"dense.pairs.matcher": ["maximum-likelihood-scanline"]})).rows
-    assert words[1].setting.config.dense.pairs.matcher == MaximumLikelihoodScanline()
-
-
 def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch):
     study = darts({"task.aim": [1.0]})
     keys = {(r.variant, r.scene, r.seed): r.key for r in plan_study(study).rows}
@@ -109,16 +84,6 @@ def test_rows_are_named_by_setting_scene_seed_and_versions(monkeypatch):
     assert len(same) == 2, "a study that grows keeps its rows"
     monkeypatch.setattr("validation.ablation.plan.versions", lambda: {**versions(), "numpy": "0"})
     assert not {r.key for r in plan_study(study).rows} & set(keys.values())
-
-
-def test_the_code_that_rows_run_names_them():
-    assert all((ROOT / part).is_dir() for part in RUN_BY_ROWS)
-    used = set()
-    for path in (ROOT / "ablation" / "tasks").glob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        used |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    own = {module.split(".")[1] for module in used if module.startswith("validation.")}
-    assert own <= {part.split("/")[0] for part in RUN_BY_ROWS}
 
 
 def test_a_function_that_declares_its_metrics_is_a_task():

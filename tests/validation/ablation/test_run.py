@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.validation.ablation.toy import Darts, Steps, area, marks
+from tests.validation.ablation.toy import Darts, Steps, marks
 from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
 
@@ -55,15 +55,6 @@ def test_a_row_on_disk_stands_on_its_own(tmp_path):
     assert reported["seconds"] > 0.0
 
 
-def test_a_damaged_row_is_computed_again(tmp_path):
-    log, out = tmp_path / "log", tmp_path / "out"
-    rows = ablate(study(log, seeds=1), out, executor="local")
-    (out / "rows" / f"{rows[0].key}.json").write_text("{", encoding="utf-8")
-    assert len(read_rows(study(log, seeds=1), out)) == 5
-    assert len(ablate(study(log, seeds=1), out, executor="local")) == 6
-    assert len(marks(log)) == 7
-
-
 def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
     log = tmp_path / "log"
     failing = study(log, scenes=["a", "refuses", "breaks", "empty"], seeds=1)
@@ -81,14 +72,6 @@ def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
     assert any("every row of refuses failed: no board" in w for w in warnings)
 
 
-def test_an_unreported_metric_is_named(tmp_path):
-    planned = Study({"images.max_size_px": [800]}, ["a"], seeds=1, task=area, metrics=["size", "wieght"])
-    rows = ablate(planned, tmp_path, executor="local")
-    assert {r.failure for r in rows} == {"the task returned no wieght"}
-    assert rows[1].metrics["size"] == 800.0
-    assert "no row has the metric wieght" in analyse(rows).warnings
-
-
 def test_common_first_stages_of_rows_are_computed_once(tmp_path):
     log = tmp_path / "log"
     axes = {"epipolar.threshold_px": [2.0], "dense.max_side": [512], "images.max_size_px": [800]}
@@ -103,15 +86,6 @@ def test_common_first_stages_of_rows_are_computed_once(tmp_path):
     for row in rows:
         assert row.cost_s >= own[row.key]["cpu_s"]
     assert sum(bool(reported["steps"]) for reported in own.values()) == len(rows)
-
-
-def test_the_same_rows_from_any_executor(tmp_path):
-    planned = study(tmp_path / "log", scenes=["a"], seeds=1)
-    here, there = (
-        [(r.key, r.metrics) for r in ablate(planned, tmp_path / kind, executor=kind, threads=1)]
-        for kind in ("local", "processes")
-    )
-    assert here == there
 
 
 def test_a_wrong_executor_or_folder_is_reported(tmp_path):
@@ -187,12 +161,3 @@ def test_a_row_on_a_full_disk_has_not_failed(executor, tmp_path):
     (tmp_path / "log.room").touch()
     rows = ablate(crowded, out, executor="local")
     assert [r.failure for r in rows] == [""] * 3
-
-
-def test_progress_reports_every_row(tmp_path):
-    seen = []
-    ablate(
-        study(tmp_path / "log"), tmp_path / "out", executor="local", on_progress=lambda s: seen.append(s.done)
-    )
-    assert seen[0] == 0
-    assert seen[-1] == 12

@@ -22,8 +22,7 @@ from validation.ablation.tasks.pairs import ImagePairs, numbers_of_pair, read_pa
 from validation.ablation.tasks.stereo import RectifiedPairs, matched_pair
 from validation.ablation.tasks.triangulation import TriangulationOverNoise
 from validation.scenes import stereo as stereo_scenes
-from validation.scenes.image_files import write_png
-from validation.scenes.real import ROOT, data_root
+from validation.scenes.real import ROOT, write_png
 
 CONFIG = PipelineConfig()
 NOWHERE = Place(Path(), Path())
@@ -36,23 +35,6 @@ def test_exact_points_have_an_exact_fundamental_matrix():
         assert found["distance_px"] < 1e-6
         assert found["within_pct"] == 100.0
         assert "over_bound" not in found, "without noise there is no bound"
-
-
-def test_pairs_without_a_fundamental_matrix_have_no_direction_of_epipoles(monkeypatch):
-    answers = iter([None, None, np.ones((3, 3))])
-    monkeypatch.setattr(FundamentalOfCube, "_fundamental", lambda *_: next(answers))
-    found = FundamentalOfCube(noise_px=0.5, pairs=3).run(CONFIG, "cube", 0, NOWHERE)
-    assert found["epipole_deg"] == 90.0
-    assert found["distance_px"] == np.inf
-
-
-def test_wrong_matches_hurt_estimators_without_outlier_tests():
-    linear, robust = (
-        FundamentalOfCube(method=method, noise_px=0.5, outliers=0.3, pairs=3).run(CONFIG, "cube", 1, NOWHERE)
-        for method in ("eight-point, normalised", "default")
-    )
-    assert robust["distance_px"] < 0.5
-    assert linear["distance_px"] > 5.0
 
 
 def test_the_polynomial_method_does_not_depend_on_the_frame():
@@ -106,14 +88,6 @@ def test_a_missing_scene_is_reported(task, scene, words):
 def test_parameters_that_make_no_sense_are_refused(kind, fields):
     with pytest.raises(ValueError, match=r"unknown|at least|between"):
         TASKS[kind](**fields)
-
-
-@pytest.mark.real
-@pytest.mark.skipif(data_root() is None, reason="the photographs are not on this machine (THESISRECON_DATA)")
-def test_a_rectified_pair_has_few_bad_pixels():
-    found = RectifiedPairs().run(CONFIG, "Tsukuba", 0, NOWHERE)
-    assert found["bad1_pct"] < 5.0
-    assert found["bad2_pct"] < found["bad1_pct"]
 
 
 def test_a_yard_is_matched_whole_and_in_windows_of_its_rows(tmp_path, monkeypatch):

@@ -9,8 +9,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from validation.references.ceres import cameras_from_colmap, colmap_model
-from validation.references.colmap import match_with_pycolmap
-from validation.references.colmap_reading import read_colmap_model
+from validation.references.colmap import match_with_pycolmap, read_colmap_model
 from validation.references.libraries import pycolmap
 from validation.references.triangulation import colmap_points
 
@@ -79,20 +78,6 @@ def test_files_that_colmap_writes_mean_the_same_to_us(looked, tmp_path, text):
             read.tracks.xy[here], xy[v, read.tracks.point_index[here]], atol=1e-9 if not text else 1e-3
         )
     np.testing.assert_allclose(dehomogenize(read.X), looked.X, atol=1e-9)
-
-
-def test_quaternions_are_xyzw_in_memory_and_wxyz_in_text(looked, tmp_path):
-    cameras, seen = problem(looked)
-    model = colmap_model(cameras, looked.X, seen, SIZE)
-    model.write_text(tmp_path)
-    rows = [r.split() for r in (tmp_path / "images.txt").read_text().splitlines() if r.endswith("1.png")]
-    wxyz = np.array(rows[0][1:5], dtype=float)
-    xyzw = model.images[2].cam_from_world().rotation.quat
-    np.testing.assert_allclose(wxyz, np.roll(xyzw, 1), atol=1e-12)
-    # The turn of the fixture by 0.59 rad: its cosine of half the angle comes first in the text.
-    angle = np.linalg.norm([0.1, -0.3, 0.5])
-    np.testing.assert_allclose(np.abs(wxyz[0]), np.cos(angle / 2.0), atol=1e-12)
-    np.testing.assert_allclose(wxyz[1:] / np.sin(angle / 2.0), np.array([0.1, -0.3, 0.5]) / angle, atol=1e-9)
 
 
 def test_sift_keypoints_are_shifted_by_half_a_pixel(tmp_path):

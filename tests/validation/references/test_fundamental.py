@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.validation.references.conftest import skip_without
-from validation.metrics.epipolar import rms_epipolar_distance
+from validation.metrics.fundamental_precision import rms_epipolar_distance
 from validation.references.fundamental import SOLVERS, estimate_with, opencv_eight_point
 
 skip_without("cv2", "pycolmap", "poselib")

@@ -1,8 +1,5 @@
 """Conventions between our records and Open3D's, at their border."""
 
-import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +8,11 @@ import pytest
 from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
 from tests.validation.references.conftest import skip_without
 from thesisrecon.api.export import write_mesh
-from thesisrecon.api.views import render
-from thesisrecon.camera import Camera
-from thesisrecon.io._meshes import read_mesh
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from validation.references import open3d_geometry
 from validation.references.libraries import open3d
-from validation.references.open3d_geometry import refine_by_icp
 
 # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
 skip_without("open3d")
@@ -76,13 +69,6 @@ def test_meshes_lie_on_the_sphere_and_distances_are_right():
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
 
 
-def test_skew_is_refused():
-    skew = K.copy()
-    skew[0, 1] = 1.0
-    with pytest.raises(ValueError, match="skew"):
-        open3d_geometry.camera_of(np.column_stack([skew, np.zeros(3)]))
-
-
 @pytest.fixture(scope="module")
 def model():
     surface = VolumetricFusion().fuse(ring_of())
@@ -119,77 +105,9 @@ def test_a_glb_opens_in_open3d_with_its_texture(model, tmp_path):
     assert np.quantile(errors, 0.9) < 20.0
 
 
-def test_a_glb_opens_in_trimesh_with_its_texture(model, tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    write_mesh(tmp_path / "model.glb", model)
-    loaded = trimesh.load(tmp_path / "model.glb", process=False, force="mesh")
-    texture = np.asarray(loaded.visual.material.baseColorTexture.convert("RGB"))
-    points = places()
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    corners = np.asarray(loaded.visual.uv)[loaded.faces]
-    vertices = np.asarray(loaded.vertices) * [1.0, -1.0, -1.0]
-    errors = color_errors(points, vertices, np.asarray(loaded.faces), corners, texture)
-    assert np.median(errors) < 6.0
-    again = read_mesh(tmp_path / "model.glb")
-    camera = Camera.from_matrix(ring_of()[0].P, (SHAPE[1], SHAPE[0]))
-    apart = render(again, camera).color.astype(float) - render(model, camera).color
-    assert np.sqrt(np.mean(apart**2)) < 4.0
-
-
-DRAW = """
-import pickle, sys
-import numpy as np
-from validation.references.open3d_geometry import render_open3d
-mesh, camera = pickle.load(open(sys.argv[1], "rb"))
-np.save(sys.argv[2], render_open3d(mesh, camera))
-"""
-
-
-def drawn_apart(mesh, camera, folder):
-    """The picture that Open3D draws in a process of its own: software rendering has hung beside threads."""
-    (folder / "given").write_bytes(pickle.dumps((mesh, camera)))
-    command = [sys.executable, "-c", DRAW, str(folder / "given"), str(folder / "drawn.npy")]
-    reason = "it did not end"
-    for _ in range(2):
-        try:
-            ended = subprocess.run(
-                command, cwd=ROOT, capture_output=True, timeout=120, text=True, check=False
-            )
-        except subprocess.TimeoutExpired:
-            continue
-        if ended.returncode == 0:
-            return np.load(folder / "drawn.npy")
-        reason = ended.stderr.strip().rpartition("\n")[2]
-        assert "RuntimeError" in reason, ended.stderr
-    pytest.skip(f"Open3D cannot draw here: {reason}")
-
-
-def test_images_rendered_by_open3d_agree_with_ours(tmp_path):
-    maps = ring_of()
-    mesh = open3d_geometry.OpenTsdf(voxel_px=1.0).fuse(maps, [photograph(m) for m in maps])
-    camera = Camera.from_matrix(maps[0].P, (SHAPE[1], SHAPE[0])).scaled(2)
-    theirs = drawn_apart(mesh, camera, tmp_path)
-    ours = render(mesh, camera)
-    inner = ours.valid & (ours.depth < 3.0)
-    best = {}
-    for dx in (-1, 0, 1):
-        for dy in (-1, 0, 1):
-            moved = np.roll(theirs, (dy, dx), axis=(0, 1)).astype(float)
-            best[dx, dy] = float(np.mean(np.abs(moved - ours.color)[inner]))
-    assert min(best, key=lambda shift: best[shift]) == (0, 0)
-    assert best[0, 0] < 8.0
-
-
 def test_the_matrix_of_a_camera_takes_the_world_to_it(looked):
     for P, true_K, Rt in zip(looked.P, looked.K, looked.P_normalised, strict=True):
         found, world = open3d_geometry.camera_of(P, shift=0.5)
         np.testing.assert_allclose(world[:3], Rt, atol=1e-9)
         np.testing.assert_allclose(found[:2, 2] - 0.5, true_K[:2, 2], atol=1e-6)
         np.testing.assert_allclose(found[0, 0], true_K[0, 0], atol=1e-6)
-
-
-def test_icp_moves_the_first_cloud_onto_the_second(looked):
-    shift = np.array([0.02, -0.01, 0.03])
-    found = refine_by_icp(looked.X, looked.X + shift, 0.2)
-    np.testing.assert_allclose(found[:3, 3], shift, atol=1e-6)
-    np.testing.assert_allclose(found[:3, :3], np.eye(3), atol=1e-6)

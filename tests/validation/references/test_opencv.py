@@ -8,13 +8,11 @@ from tests.synthetic import texture
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
-from thesisrecon.stereo._planar import PlanarRectification
 from validation.references.opencv import (
     MODES,
     OpenCVSemiGlobal,
     harris_corners,
     sift_corners,
-    warp_perspective,
 )
 from validation.references.triangulation import opencv_linear, opencv_polynomial
 from validation.scenes.real_pairs import match_images
@@ -62,16 +60,6 @@ def test_the_middle_of_a_pixel_is_a_whole_number():
     fields[:28, :32], fields[28:, 32:] = 200, 200
     found = harris_corners(Image("fields", fields, (72, 64)), 50)
     np.testing.assert_allclose(found[np.argmin(np.abs(found - 30).sum(axis=1))], [31.5, 27.5], atol=0.1)
-
-
-def test_images_move_the_way_their_maps_say():
-    image = spot(2.0)
-    H = np.array([[1.0, 0.0, 5.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
-    ours = PlanarRectification(np.stack([H, np.eye(3)]), (72, 64)).warp(image.astype(np.float32), 0)
-    theirs = warp_perspective(image.astype(np.float32), H, (72, 64))
-    assert np.unravel_index(theirs[..., 0].argmax(), (64, 72)) == (AT[1] - 3, AT[0] + 5)
-    inner = np.s_[6:-6, 8:-8]
-    np.testing.assert_allclose(ours[inner], theirs[inner], atol=1e-2)
 
 
 @pytest.mark.parametrize("mode", MODES)

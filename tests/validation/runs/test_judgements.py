@@ -4,7 +4,6 @@ import numpy as np
 
 from thesisrecon.records import Image
 from validation.scenes.real_pairs import RealPair
-from validation.stages import depth
 from validation.stages.features import in_original_pixels
 from validation.stages.fundamental import MINIMAL, OURS, VARIANTS, _metrics
 
@@ -23,15 +22,6 @@ def test_a_method_without_any_fundamental_matrix_has_the_largest_errors_and_no_r
     rank = rows[f"{MINIMAL}: rank"].values[OURS]
     assert rank is not None
     assert np.isnan(rank)
-
-
-def test_the_true_map_is_that_of_the_pixels_of_the_image(monkeypatch):
-    true = np.add.outer(100.0 * np.arange(3), np.arange(4.0))
-    monkeypatch.setattr(depth, "load_fixture_depth", lambda _: (true, 3))
-    whole = depth._true_map(0, (9, 12))
-    # Sample k is pixel 3 k, so that pixels 3 k - 1 to 3 k + 1 are nearest to it.
-    assert whole[0].tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3]
-    assert (whole[:, 0] / 100.0).tolist() == [0, 0, 1, 1, 1, 2, 2, 2, 2]
 
 
 def test_matrices_of_reduced_images_are_judged_in_original_pixels():

@@ -45,12 +45,6 @@ def test_the_worst_stage_is_drawn_on_top():
     assert "no earlier run" in section["notes"][1]
 
 
-def test_a_number_that_only_a_reference_has_is_stated():
-    rows = [row("a/yard/x", None, {"COLMAP": 2.0}), row("a/yard/y", 1.0, {"COLMAP": 2.0})]
-    notes = overview(Results(rows, [], {}, {}, {}), None)["notes"]
-    assert notes[1] == "1 number of a reference without one of ours: not in the plot."
-
-
 def test_changes_since_the_last_run_are_stated():
     held = row("a/yard/x", 1.0, {}, limit=2.0, verdict="reached")
     same = row("a/yard/y", 1.0, {}, limit=2.0, verdict="reached")

@@ -77,8 +77,6 @@ PRINCIPAL_STD = 0.01
 """Prior standard deviation of the principal point over the long side."""
 ZOOM = 0.3
 """Focal lengths are multiplied by e^u with u uniform in +-ZOOM."""
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of |x| for standard normal x."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +92,8 @@ class Cell:
 @dataclass(frozen=True)
 class CalibrationOverNoise(Task):
     """``views`` cameras of the cube or of a cloud with Gaussian noise of ``noise_px``, handed to the
-    self-calibration as the minimum of the projective bundle adjustment in a random frame.
-
-    ``mode`` is "constant" (one focal length) or "zooming". With ``bundle`` the metric stage follows.
-    """
+    self-calibration as the minimum of the projective bundle adjustment in a random frame. ``mode`` is
+    "constant" (one focal length) or "zooming". With ``bundle`` the metric stage follows."""
 
     noise_px: float = 1.0
     views: int = 9
@@ -148,11 +144,7 @@ class CalibrationOverNoise(Task):
 
 
 def make_rig(cell: Cell, rng: np.random.Generator) -> Rig:
-    """Draw the cameras.
-
-    Subsets of the cube leave out the six cameras that see one face only, and all their cameras are tied
-    together by pairs with common points on more than one face; others have no projective reconstruction.
-    """
+    """Draw the cameras."""
     if cell.scene == "cloud":
         rig = make_cloud(cell.views, rng)
     else:
@@ -177,10 +169,7 @@ def assumptions(rig: Rig, mode: str) -> IntrinsicsPrior:
 
 @lru_cache(maxsize=4)
 def draw_cell(cell: Cell, seed: int) -> tuple[Rig, Reconstruction]:
-    """Return the true cameras and the projective reconstruction of noisy observations.
-
-    The rows of one draw are consecutive.
-    """
+    """Return the true cameras and the projective reconstruction of noisy observations."""
     place = (seed, SCENES.index(cell.scene), MODES.index(cell.mode), cell.views, round(100 * cell.sigma_px))
     rng = np.random.default_rng(place)
     rig = make_rig(cell, rng)
@@ -195,4 +184,5 @@ def _bound_pct(cell: Cell, seed: int) -> float:
     rig, projective = draw_cell(cell, seed)
     principal_px = PRINCIPAL_STD * max(rig.size)
     std = focal_bound(rig, cell.sigma_px, zooming=cell.mode == "zooming", principal_std_px=principal_px)
-    return MEDIAN_OF_NORMAL * float(np.median(std[projective.registered]))
+    # Median of |x| for standard normal x.
+    return 0.6745 * float(np.median(std[projective.registered]))

@@ -22,18 +22,14 @@ from validation.studies.epipolar_methods import MATCHED_SIGMAS, METHODS, THRESHO
 
 BY_METHOD = {m.name: m for m in METHODS}
 OF_CONFIG = "epipolar of the configuration"
-NO_DIRECTION_DEG = 90.0
-"""Error of an epipole without F, the largest that a direction of either sign can have."""
 
 
 @dataclass(frozen=True)
 class FundamentalOfCube(Task):
     """``pairs`` pairs of the 27 cameras, drawn by the seed, with Gaussian noise of ``noise_px`` and a share
-    ``outliers`` of matches thrown anywhere.
-
-    ``method`` is one of the catalogue of methods of F; "epipolar of the configuration" is the variant of that
-    stage, whose threshold is its own. ``iterations`` and the like are then paths of that stage.
-    """
+    ``outliers`` of matches thrown anywhere. ``method`` is one of the catalogue of methods of F; "epipolar of
+    the configuration" is the variant of that stage, whose threshold is its own. ``iterations`` and the like
+    are then paths of that stage."""
 
     method: str = OF_CONFIG
     noise_px: float = 1.0
@@ -79,7 +75,8 @@ class FundamentalOfCube(Task):
             raise StageFailure("no pair has an F")
         bound = np.array([self._bound(_pairs()[k]) for k in chosen])
         distance = np.where(np.isnan(distance), np.inf, distance)
-        angle = np.where(np.isnan(angle), NO_DIRECTION_DEG, angle)
+        # Error of an epipole without F, the largest that a direction of either sign can have.
+        angle = np.where(np.isnan(angle), 90.0, angle)
         numbers = {
             "distance_px": float(np.median(distance)),
             "epipole_deg": float(np.median(angle)),
@@ -117,8 +114,7 @@ def _pairs() -> list[TwoViews]:
 
 
 def measure_pair(F: F64 | None, pair: TwoViews) -> tuple[float, float]:
-    """Return the RMS distance (px) of the exact points to their epipolar lines and the larger epipole error
-    (degrees), NaN without F."""
+    """RMS distance (px) of exact points to their lines, larger epipole error (degrees); NaN without F."""
     if F is None:
         return float("nan"), float("nan")
     distance = float(np.sqrt(np.mean(symmetric_residuals(F, pair.xy1, pair.xy2) ** 2) / 2.0))

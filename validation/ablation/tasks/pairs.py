@@ -16,24 +16,21 @@ from thesisrecon.io._images import read_images
 from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from validation.ablation.study import Measure, Place, Task
-from validation.metrics.epipolar import RIGHT_PX, rms_epipolar_distance
+from validation.metrics.fundamental_precision import RIGHT_PX, rms_epipolar_distance
 from validation.scenes.many_views import load_yard, yard_number
-from validation.scenes.real import Scene, load_fixture_scene, load_real_scene
+from validation.scenes.real import Scene, load_scene
 from validation.scenes.real_pairs import CACHE, SCENES_WITH_CAMERAS, camera_pairs
 
-_COURTYARD = "courtyard"
 MAX_SIZE_PX = 1536
-_SCENES = (*SCENES_WITH_CAMERAS, _COURTYARD)
+_SCENES = (*SCENES_WITH_CAMERAS, "courtyard")
 
 
 @dataclass(frozen=True)
 class ImagePairs(Task):
     """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side at most 1536: corners,
     matches, F and verification of the configuration, judged by correspondences of the true cameras. A row
-    whose F is wrong (error of 1 px and more) fails.
-
-    The pairs of a scene are subsets of it. A yard (yard-1/0) has its images in the order of their cameras.
-    """
+    whose F is wrong (error of 1 px and more) fails. The pairs of a scene are subsets of it. A yard (yard-1/0)
+    has its images in the order of their cameras."""
 
     gap: int = 2
 
@@ -79,11 +76,9 @@ def numbers_of_pair(
 
 @lru_cache(maxsize=8)
 def _load(name: str) -> Scene | None:
-    if name == _COURTYARD:
-        return load_fixture_scene(name)
     yard = yard_number(name)
     if yard is None:
-        return load_real_scene(name)
+        return load_scene(name)
     scene = load_yard(yard)
     K, R, C = scene.cameras
     order = np.argsort(C[:, 0])

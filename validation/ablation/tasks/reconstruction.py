@@ -18,8 +18,7 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
-from validation.ablation.study import Measure, Place, Task
-from validation.ablation.tasks.windows import window_names, window_parts, window_slice
+from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
 from validation.runs.records import ReportOptions
 from validation.runs.scenes import IMAGE_SCENES, load_images, truth_of
@@ -46,13 +45,11 @@ AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Reconstruction(Task):
-    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
-
-    A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
-    if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
-    windows of two thirds of the images, in the order of their names, spread over the scene. "yard-N" is
-    a rendered yard with true cameras, another one for each number.
-    """
+    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread. A scene is one with a name, or
+    a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth if there is one; without truth the
+    errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n windows of two thirds of the images,
+    in the order of their names, spread over the scene. "yard-N" is a rendered yard with true cameras, another
+    one for each number."""
 
     until: str = "metric"
 
@@ -132,7 +129,6 @@ class Reconstruction(Task):
 
 
 def _images(scene: str) -> tuple[Path, ...]:
-    """The images of a scene or of one of its subsets."""
     paths = _load(scene).image_paths
     return paths[window_slice(scene, len(paths))]
 
@@ -154,7 +150,6 @@ def _load(scene: str) -> Scene:
 
 
 def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
-    """The numbers that this result has."""
     accepted = [pair for pair in result.pairs if pair.accepted]
     found = {"verified": float(sum(pair.inliers for pair in accepted))} if result.pairs else {}
     if accepted:
@@ -179,7 +174,6 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
 
 
 def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
-    """The true cameras of the images that were read, in their pixels."""
     truth = truth_of(scene)
     if truth is None:
         return None

@@ -12,8 +12,7 @@ import numpy as np
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.stereo.depth import MultiViewStereo
-from validation.ablation.study import Measure, Place, Task
-from validation.ablation.tasks.windows import window_names, window_parts, window_slice
+from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.metrics.depth import bad_pixels
 from validation.scenes.many_views import yard_number
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
@@ -21,10 +20,8 @@ from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 @dataclass(frozen=True)
 class RectifiedPairs(Task):
-    """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see.
-
-    "yard-N" is a rendered pair, another one for each number. A subset is a window of two thirds of the rows.
-    """
+    """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see. "yard-N" is a
+    rendered pair, another one for each number. A subset is a window of two thirds of the rows."""
 
     measures: ClassVar[Sequence[Measure]] = (
         Measure("bad1_pct", "%", "less", True, "pixels off by more than 1 px, holes filled along the row"),

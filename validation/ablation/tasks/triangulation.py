@@ -18,7 +18,7 @@ from thesisrecon.geometry.strata import Group
 from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-from validation.scenes.triangulation import SCENES, draw_rig, squared_distances
+from validation.scenes.rigs import SCENES, draw_rig, squared_distances
 
 POLYNOMIAL = "polynomial"
 METHODS: dict[str, Callable[[F64, F64], F64]] = {
@@ -35,10 +35,8 @@ METHODS: dict[str, Callable[[F64, F64], F64]] = {
 @dataclass(frozen=True)
 class TriangulationOverNoise(Task):
     """``points`` points of a rig drawn by the seed, seen with Gaussian noise of ``noise_px``, triangulated by
-    ``method`` in a ``frame`` of space that is "metric", "affine" or "projective".
-
-    Every method meets the same rig, noise and frame.
-    """
+    ``method`` in a ``frame`` of space that is "metric", "affine" or "projective". Every method meets the same
+    rig, noise and frame."""
 
     method: str = POLYNOMIAL
     noise_px: float = 1.0
