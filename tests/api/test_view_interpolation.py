@@ -1,7 +1,6 @@
 """Views between photographs: the front door, what is refused, and the command."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ from tests.synthetic import texture
 from thesisrecon.api import views as between
 from thesisrecon.cli import view_files as sequences
 from thesisrecon.cli.main import run_command
-from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
@@ -144,24 +143,6 @@ def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeyp
         return
     words = f"rolled against each other; by {degrees:.0f} degrees"
     refuses(StageFailure, words, between.prepare_pair, photograph(0), photograph(1))
-
-
-def test_records_are_matched_at_their_own_size_and_without_masked_pixels():
-    """``max_size_px`` is for files and arrays."""
-    images = [photograph_of_courtyard(k) for k in (6, 7)]
-    large, small = (
-        between.prepare_pair(*images, config=PipelineConfig(images=ImageOptions(max_size_px=side)))
-        for side in (320, 128)
-    )
-    np.testing.assert_array_equal(small.view(0.5), large.view(0.5))
-    nothing = np.zeros((240, 320), dtype=bool)
-    masked = [replace(image, mask=nothing) for image in images]
-    refuses(StageFailure, "do not match", between.prepare_pair, *masked)
-
-
-def photograph_of_courtyard(k):
-    with PIL.Image.open(COURTYARD / f"000{k}.jpg") as picture:
-        return Image(f"{k}.jpg", np.asarray(picture.resize((320, 240))), (320, 240))
 
 
 @pytest.fixture
