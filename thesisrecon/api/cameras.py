@@ -179,15 +179,10 @@ def bundle_adjust(
     K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
     rows, unseen = fit.cameras.intrinsics, np.isin(np.arange(len(views)), observed.view_index, invert=True)
     poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
+    stds = [dict(zip(STD_NAMES, row, strict=True)) for row in std.tolist()]
+    R, t = fit.cameras.R, fit.cameras.t
     refined = tuple(
-        replace(
-            view,
-            K=K[i],
-            R=fit.cameras.R[i],
-            t=fit.cameras.t[i],
-            distortion=rows[i, 5:],
-            std=dict(zip(STD_NAMES, std[i].tolist(), strict=True)),
-        )
+        replace(view, K=K[i], R=R[i], t=t[i], distortion=rows[i, 5:], std=stds[i])
         for i, view in enumerate(views)
     )
     return BundleAdjustment(
