@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import unit_norm
@@ -122,61 +121,31 @@ def check_start(F: F64, frame: PairFrame) -> F64:
     return f
 
 
-# Standard deviation of the noise's tail, and lower bound of that of wrong residuals, relative to the noise.
-TAIL, _SEPARATION = 4.0, 12.0
-# Prior counts of each component.
-_CORE_COUNT, _TAIL_COUNT, _WRONG_COUNT = 1.0, 0.5, 1.0
-_MEDIAN_RATIO, _MAX_WIDENINGS = 0.22, 6
-# Trimming point in standard deviations, variance of a normal variable trimmed there, and rounds.
-_TRIM, _TRIMMED_VARIANCE, _TRIM_ROUNDS = 2.5, 0.91125, 5
-# EM rounds of a mixture, and maximum number of residuals, evenly spaced in order, that it is fitted to.
-_EM_ROUNDS, _QUANTILES = 6, 300
-_BISECTIONS = 20
-# Matches within a cell of this size, px, count as one place.
-_SAME_PX = 2.0
+# Standard deviation of the noise's tail relative to the noise.
+TAIL = 4.0
 
 
-@kernel
-def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
-    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
+def _fit_mixture(
+    residuals: F64, parameters: float, spread: float, rounds: int, widths: F64, fractions: F64
+) -> tuple[F64, F64, float]:
+    """Fit three zero-mean normals by expectation-maximisation, with a prior ``spread`` of wrong residuals.
 
-    ``mixture`` (5,), updated: sigma, standard deviation of wrong residuals (prior ``spread``), fractions of
-    noise, its tail and wrong residuals.
+    ``widths`` (3,) and ``fractions`` (3,) of noise, its tail and wrong residuals are returned, and the mean
+    log-likelihood.
     """
-    n = len(residuals)
-    likelihood = 0.0
-    for last in range(rounds - 1, -1, -1):
-        sigma, wide, core, tail, wrong = mixture
-        c0, c1, c2 = core / sigma, tail / (TAIL * sigma), wrong / wide
-        i1, i2 = 0.5 / (TAIL * TAIL * sigma * sigma), 0.5 / (wide * wide)
-        n0, n1, n2, s01, s2 = 0.0, 0.0, 0.0, 0.0, 0.0
-        likelihood = 0.0
-        for k in range(n):
-            q = residuals[k] * residuals[k]
-            # The core's exponential is that of the tail to the power TAIL^2 = 16.
-            e1 = np.exp(-i1 * q)
-            e0 = e1 * e1
-            e0 *= e0
-            e0 *= e0
-            e0 *= e0
-            p0, p1, p2 = c0 * e0, c1 * e1, c2 * np.exp(-i2 * q)
-            p = p0 + p1 + p2 + 1e-300
-            if last == 0:
-                likelihood += np.log(p)
-            p = 1.0 / p
-            n0 += p0 * p
-            n1 += p1 * p
-            n2 += p2 * p
-            s01 += (p0 + p1 / (TAIL * TAIL)) * p * q
-            s2 += p2 * p * q
-        total = n + _CORE_COUNT + _TAIL_COUNT + _WRONG_COUNT
-        mixture[0] = np.sqrt(s01 / max(n0 + n1 - parameters, 1.0)) + 1e-12 * spread
-        wide = np.sqrt((s2 + _WRONG_COUNT * spread * spread) / (n2 + _WRONG_COUNT))
-        mixture[1] = max(wide, _SEPARATION * mixture[0])
-        mixture[2] = (n0 + _CORE_COUNT) / total
-        mixture[3] = (n1 + _TAIL_COUNT) / total
-        mixture[4] = (n2 + _WRONG_COUNT) / total
-    return likelihood / n
+    q, counts = residuals**2, np.array([1.0, 0.5, 1.0])
+    for _ in range(rounds):
+        p = fractions / widths * np.exp(-0.5 * q[:, None] / widths**2)
+        likelihood = p.sum(axis=1) + 1e-300
+        posterior = p / likelihood[:, None]
+        n, squares = posterior.sum(axis=0), posterior.T @ q
+        noise = squares[0] + squares[1] / TAIL**2
+        sigma = np.sqrt(noise / max(n[0] + n[1] - parameters, 1.0)) + 1e-12 * spread
+        # Wrong residuals are at least twelve times as wide as the noise.
+        wide = max(np.sqrt((squares[2] + counts[2] * spread**2) / (n[2] + counts[2])), 12.0 * sigma)
+        widths = np.array([sigma, TAIL * sigma, wide])
+        fractions = (n + counts) / (len(q) + counts.sum())
+    return widths, fractions, float(np.mean(np.log(likelihood)))
 
 
 def _middle(ordered: F64) -> float:
@@ -201,11 +170,11 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
     ``threshold`` is returned.
     """
     width, ordered = threshold, np.sort(residuals)
-    for _ in range(_MAX_WIDENINGS + 1):
+    for _ in range(7):
         n = int(np.searchsorted(ordered, width))
         if n <= parameters:
             return threshold
-        if _middle(ordered[:n]) <= _MEDIAN_RATIO * width * np.sqrt(1.0 - parameters / n):
+        if _middle(ordered[:n]) <= 0.22 * width * np.sqrt(1.0 - parameters / n):
             return width
         width *= 1.5
     return threshold
@@ -214,11 +183,12 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
     """Standard deviation of residuals >= 0 within 2.5 standard deviations; ``start`` if these are too few."""
     sigma = start
-    for _ in range(_TRIM_ROUNDS):
-        kept = residuals[residuals <= _TRIM * sigma]
+    for _ in range(5):
+        kept = residuals[residuals <= 2.5 * sigma]
         if len(kept) <= 2 * parameters:
             return start
-        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / _TRIMMED_VARIANCE))
+        # The variance of a normal variable trimmed there is 0.911.
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / 0.91125))
     return sigma
 
 
@@ -240,19 +210,20 @@ class NoiseMixture:
     @classmethod
     def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
         """Fit to ascending residuals by expectation-maximisation; ``spread`` is the prior of wrong ones."""
-        step = max(len(residuals) // _QUANTILES, 1)
-        some = np.ascontiguousarray(residuals[step // 2 :: step])
+        # At most 600 of them, evenly spaced in order.
+        step = max(len(residuals) // 300, 1)
+        some = residuals[step // 2 :: step]
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
-        mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
-        likelihood = _fit_mixture(some, parameters / step, spread, _EM_ROUNDS, mixture)
-        sigma, spread, core, tail, wrong = mixture.tolist()
-        return cls(sigma, spread, core, tail, wrong, float(likelihood))
+        widths = np.array([sigma, TAIL * sigma, spread])
+        fractions = np.array([0.9 * share, 0.1 * share, 1.0 - share])
+        widths, fractions, likelihood = _fit_mixture(some, parameters / step, spread, 6, widths, fractions)
+        return cls(float(widths[0]), float(widths[2]), *fractions.tolist(), likelihood)
 
     @property
     def limit(self) -> float:
         """Residual at which noise, with its tail, and wrong matches are equally likely."""
         low, high = self.sigma, self.spread
-        for _ in range(_BISECTIONS):
+        for _ in range(20):
             # Functions of single numbers: those of NumPy take ten times as long.
             middle = math.sqrt(low * high)
             noise = self.core * math.exp(-0.5 * (middle / self.sigma) ** 2)
@@ -276,7 +247,7 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
     """
     numbers = np.zeros(len(xy1), dtype=np.int64)
     for xy in (xy1, xy2):
-        x, y = np.floor(xy / _SAME_PX).astype(np.int64).T
+        x, y = np.floor(xy / 2.0).astype(np.int64).T
         cell = x * 1_000_003 + y
         ordered = np.sort(cell)
         count = np.searchsorted(ordered, cell, "right") - np.searchsorted(ordered, cell, "left")
