@@ -33,40 +33,19 @@ Method = Literal[
     "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
 ]  # fmt: skip
 
-NEIGHBOURS = 5
-# Epipoles tried and matches off the plane that each is scored on.
-PAIRS, COMPETING_SUBSET = 300, 400
-# Distinct models refined per ranking, chosen among the first of the ranking.
-COMPETING, EXAMINED = 3, 100
-# Quantile of the tried epipoles that gives the agreement by chance: most epipoles are wrong.
-TYPICAL = 0.3
-# Fraction of common matches above which two models count as one.
-SAME_MODEL = 0.8
-GATES, KNEE, STEPS = (2.4, 1.8, 1.2), 0.4, 5
-# Bands of the first scoring: an F of two noisy matches and a local plane is inaccurate.
-WIDE = 2.0
-# Distances are truncated at this many bands, so that a single wrong match cannot dominate a comparison.
-FAR = 20.0
 MINIMUM = 8
-BAND_SIGMAS, BAND_FLOOR_PX, SIGMA_FLOOR_PX = 2.5, 0.3, 0.1
-# Maximum log10 of the false alarms of the matches off the plane.
-MAX_CHANCE = -2.0
 # Standard errors by which a competing model must be worse: right models of facades reach 7, wrong ones 2.
 # Not a probability, since matches of repeated structure are dependent.
 MIN_MARGIN = 3.0
-# Smallest change, relative to the matches off the plane, that makes another model a competing one.
-MIN_GAIN = 0.05
-# Distance from epipolar lines that is relevant, px, or 2 sigma if that is larger.
-MAX_ERROR_PX = 1.0
-# Fraction of neighbours that contradict a match, maximum fraction of contradicted matches, and sample size.
-CONTRADICTED, MAX_CONTRADICTED, SAMPLED = 0.3, 0.2, 60
+# Inliers of which the covariance and the contradictions are tested.
+SAMPLED = 60
 
 
 def _select_distinct(order: I64, agree: F64, weights: F64, chosen: list[int], most: int) -> None:
-    """Add models of ``order``, to ``most`` in all, that share little weight with any chosen before."""
+    """Add models of ``order``, to ``most`` in all, that share at most 80 % with any chosen before."""
     for s in order:
         own = weights * agree[s]
-        if all(own @ agree[c] <= SAME_MODEL * own.sum() for c in chosen):
+        if all(own @ agree[c] <= 0.8 * own.sum() for c in chosen):
             chosen.append(int(s))
         if len(chosen) >= most:
             break
@@ -81,7 +60,7 @@ def _contradicted_ratios(H: F64, points: F64, on_plane: B8, chosen: I64, near: f
     parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)
     apart = np.linalg.norm(points[chosen, None, :2] - points[:, :2], axis=2)
     apart[apart < near] = np.inf
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :5]
     distance = np.take_along_axis(apart, nearest, axis=1)
     differ = np.linalg.norm(parallax[nearest] - parallax[chosen, None], axis=2) > distance
     counted = np.maximum(np.isfinite(distance).sum(axis=1), 1)
@@ -125,36 +104,40 @@ def _competing_starts(
     off = np.flatnonzero(off_plane)
     if len(off) < 3:
         return np.empty((0, 9)), 0.0
-    off = off[rng.permutation(len(off))[:COMPETING_SUBSET]]
+    # An F of two noisy matches and a local plane is inaccurate: it is scored with a band twice as wide.
+    tried, distinct, wide = 300, 3, 2.0
+    off = off[rng.permutation(len(off))[:400]]
     w, own = weights[off], (np.asarray(sampson_distances(f, points)) < band)[off]
-    pairs = rng.integers(0, len(off), (PAIRS, 2))
+    pairs = rng.integers(0, len(off), (tried, 2))
     agreeing, others = np.flatnonzero(own), np.flatnonzero(~own)
     if len(agreeing) and len(others):
-        half = PAIRS // 2
+        half = tried // 2
         pairs[:half, 0] = agreeing[rng.integers(0, len(agreeing), half)]
         pairs[:half, 1] = others[rng.integers(0, len(others), half)]
-    F, agree, sums = fundamentals_of_plane(H, points[off], np.stack([w, w * ~own]), pairs, WIDE * band)
+    F, agree, sums = fundamentals_of_plane(H, points[off], np.stack([w, w * ~own]), pairs, wide * band)
     # The two matches that define a model always agree with it.
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
     chosen: list[int] = []
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
         order = np.argsort(-value, kind="stable")
-        _select_distinct(order[:EXAMINED], agree, w, chosen, (k + 1) * COMPETING)
-    return F[chosen], float(np.quantile(beyond, TYPICAL)) / WIDE
+        _select_distinct(order[:100], agree, w, chosen, (k + 1) * distinct)
+    # Most epipoles are wrong.
+    return F[chosen], float(np.quantile(beyond, 0.3)) / wide
 
 
 def _competing_model(start: F64, f: F64, points: F64, weights: F64, band: float) -> _CompetingModel:
     """A start (9,) refined on all points and compared with ``f``."""
     other = start.copy()
-    for gate in GATES:
-        refine(other, points, SAMPSON, gate * band, KNEE * gate * band, STEPS)
+    for gate in (2.4, 1.8, 1.2):
+        refine(other, points, SAMPSON, gate * band, 0.4 * gate * band, 5)
     distances, own = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
     inside, agreeing = distances < band, own < band
     lost, gained = float(weights[inside & ~agreeing].sum()), float(weights[agreeing & ~inside].sum())
     if not agreeing.any() or not inside.any():
         return _CompetingModel(other, lost, gained, np.inf, np.inf)
+    # Truncated, so that a single wrong match cannot dominate.
     error, back = (
-        float(np.sqrt(np.mean(np.minimum(d, FAR * band) ** 2))) for d in (distances[agreeing], own[inside])
+        float(np.sqrt(np.mean(np.minimum(d, 20.0 * band) ** 2))) for d in (distances[agreeing], own[inside])
     )
     return _CompetingModel(other, lost, gained, error, min(error, back))
 
@@ -174,8 +157,8 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
         raise ValueError(f"the fit has {fit.inliers.shape} inlier flags for {len(xy1)} matches")
     frame = PairFrame.of(xy1, xy2)
     points, f = frame.points(xy1, xy2), frame.matrix_in_frame(fit.F)
-    sigma_px = max(fit.sigma_px, SIGMA_FLOOR_PX)
-    band_px = max(BAND_SIGMAS * fit.sigma_px, BAND_FLOOR_PX)
+    sigma_px = max(fit.sigma_px, 0.1)
+    band_px = max(2.5 * fit.sigma_px, 0.3)
     plane = find_dominant_plane(f, points, fit.inliers, sigma=sigma_px * frame.scale, rng=rng)
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
@@ -192,10 +175,10 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     chance_of_match = chance_of_agreement(xy1, xy2, band_px)
     chance = max(chance_of_model, chance_of_match)
     false_alarms = log10_false_alarms(agreeing - contradicted, tried, chance=chance, free=2)
-    relevant_px = max(MAX_ERROR_PX, 2.0 * fit.sigma_px)
-    # A competing model must gain more than wrong matches agree by chance.
+    relevant_px = max(1.0, 2.0 * fit.sigma_px)
+    # A competing model must gain more than wrong matches agree by chance, and 5 % of the inliers off the plane.
     expected = 2.0 * chance_of_match * (tried - agreeing)
-    least = max(MIN_GAIN * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
+    least = max(0.05 * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
     different = [m for m in models if m.gained >= least and m.differs(relevant_px * frame.scale)]
     other = min(different, key=lambda m: m.margin, default=None)
     reasons = _reasons(agreeing, tried, contradicted, false_alarms, other)
@@ -221,9 +204,9 @@ def _reasons(
     """A sentence each if the matches off the plane, or another F, leave F undetermined."""
     off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
     found = []
-    if false_alarms > MAX_CHANCE:
+    if false_alarms > -2.0:
         found.append(f"{off}, no more than expected by chance")
-    if contradicted > MAX_CONTRADICTED * agreeing:
+    if contradicted > 0.2 * agreeing:
         found.append(
             f"{off}, but {contradicted:.0f} of them lie among matches of the plane, as matches "
             "between repeated structures do"
@@ -237,11 +220,11 @@ def _reasons(
 
 
 def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:
-    """Fraction of the inliers ``off`` the plane among contradicting matches of the plane, from a sample."""
+    """Fraction of a sample of the inliers ``off`` the plane that 30 % of their neighbours contradict."""
     chosen = np.flatnonzero(off)
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
     ratios, some = _contradicted_ratios(H, points, ~off, chosen, near), weights[chosen]
-    return float(some[ratios > CONTRADICTED].sum() / max(some.sum(), 1e-300))
+    return float(some[ratios > 0.3].sum() / max(some.sum(), 1e-300))
 
 
 def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:

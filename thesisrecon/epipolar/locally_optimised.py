@@ -15,44 +15,12 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.optimize.noise import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
 
-BATCH = 512
 MINIMUM = 8
 PARAMETERS = 7
-# Linear solves of a refinement inside a search, and its points.
-SEARCH_STEPS, SEARCH_POINTS = 4, 300
-# Linear solves of each refinement of a search and of its last, and the points of all but the last.
-START_STEPS, LAST_STEPS, START_POINTS = 5, 20, 500
-REFINEMENT_STEPS, NOISE_REFINEMENTS = 15, 2
-# Width of Huber's loss in gates: wrong matches within the gate are not rare.
-KNEE = 0.25
 # Prior of wrong matrices: of 100 points 5 lie within the gate.
 PRIOR = (100.0, 5.0)
-# Smallest width of the loss in units of the frame, for matches without noise.
-EXACT = 1e-9
-# Searches that share the minimum number of samples; one of them draws a sample without outliers.
-SEARCHES = 6
-# Two searches end at the same minimum if their sums of truncated squares of N matches differ by less than
-# this times sqrt(N).
-SAME_SCORE = 0.03
 # Prior spread of wrong matches in units of the frame.
 SPREAD = 1.0
-# The last loss is wider by 1 + 28 / (n - 7) for few matches, which pull the fit towards them.
-FEW_MATCHES = 28.0
-# Standard deviations that contain nearly all noise.
-COVERED = 3.0
-COMPETING = 3
-# Range of distances, in gates, in which noise decides whether a match is inside. Two searches that end at the
-# same minimum differ by about the square root of the number of such matches.
-NEAR_GATE = 0.7, 1.3
-# Distances are truncated at this many gates when two F are compared.
-FAR = 20.0
-# Samples in a round among the matches near an F, limit of these distances in gates, and maximum rounds.
-NEAR_SAMPLES, NEAR_INLIERS, MOST_ROUNDS = 256, 3.0, 10
-# Gate of the second search, and width of the ring beyond the noise that is examined, in gates.
-WIDER, RING = 4.0, 15.0
-# Fraction of the inliers by which the ring must exceed the expected count to repeat the search.
-EXCESS = 0.25
-FEW_WRONG = 0.2
 
 
 @dataclass(frozen=True)
@@ -119,7 +87,7 @@ class LocallyOptimisedRansac:
         gate = self.threshold_px * frame.scale
         found = self._best_of_searches(points, gate, rng)
         if found.noise is None or _noise_exceeds_gate(found.residuals, found.noise, gate):
-            wide = self._best_of_searches(points, WIDER * gate, rng)
+            wide = self._best_of_searches(points, 4.0 * gate, rng)
             samples = found.samples + wide.samples
             found = replace(wide if wide.explains_more_than(found) else found, samples=samples)
         return self._finish(frame, found, points)
@@ -157,33 +125,39 @@ class LocallyOptimisedRansac:
         return found, samples
 
     def _agree(self, found: list[tuple[float, F64]], points: F64, gate: float) -> bool:
-        """Whether enough searches end at the best score, within the effect of the matches near the gate."""
+        """Whether enough searches end at the best score, within the effect of the matches near the gate.
+
+        Two searches that end at the same minimum differ by about the root of the number of matches of which
+        noise decides whether they are inside.
+        """
         if len(found) < self.starts:
             return False
         best, f = min(found, key=lambda end: end[0])
         ratio = np.asarray(sampson_distances(f, points)) / gate
-        near = np.count_nonzero((ratio > NEAR_GATE[0]) & (ratio < NEAR_GATE[1]))
-        same = max(SAME_SCORE * len(points) ** 0.5, near**0.5)
+        near = np.count_nonzero((ratio > 0.7) & (ratio < 1.3))
+        same = max(0.03 * len(points) ** 0.5, near**0.5)
         agreeing = sum(score - best < same and _coincide(f, other, points, gate) for score, other in found)
         return bool(agreeing >= self.starts + (len(found) - agreeing) // 2)
 
     def _refine_start(self, f: F64, points: F64, columns: F64, gate: float) -> tuple[float, F64]:
         """Refine ``f`` in place; return its sum of truncated squares and itself."""
+        # Huber's loss is narrow: wrong matches within the gate are not rare.
         for width in self.gates[:-1]:
-            refine(f, points[:START_POINTS], SAMPSON, width * gate, KNEE * width * gate, START_STEPS)
+            refine(f, points[:500], SAMPSON, width * gate, 0.25 * width * gate, 5)
         width = self.gates[-1]
-        refine(f, points, SAMPSON, width * gate, KNEE * width * gate, LAST_STEPS)
+        refine(f, points, SAMPSON, width * gate, 0.25 * width * gate, 20)
         score, _, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
         return score * len(points), f
 
     def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
-        least, most = self.min_samples // SEARCHES, self.max_samples // self.max_starts
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / SEARCHES)
+        # Six searches share the minimum; one of them draws a sample without outliers.
+        least, most = self.min_samples // 6, self.max_samples // self.max_starts
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / 6.0)
         drawn, uniforms = 0, np.empty((0, 7))
         while drawn < most:
             if not len(uniforms):
-                uniforms = rng.random((min(BATCH, most - drawn), 7))
+                uniforms = rng.random((min(512, most - drawn), 7))
             score, before = state[0], drawn
             stop = (drawn, least, confidence)
             drawn = search_fundamental(points, columns, uniforms, gate, stop, state, f)
@@ -236,14 +210,14 @@ class _Candidate:
         explained = int(np.count_nonzero(self.residuals < self.noise.limit))
         more = explained - int(np.count_nonzero(other.residuals < other.noise.limit))
         left = len(self.residuals) - explained
-        few = left <= max(more, FEW_WRONG * len(self.residuals))
+        few = left <= max(more, 0.2 * len(self.residuals))
         return few and self.noise.log_likelihood > other.noise.log_likelihood
 
 
 def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> None:
     """Refine the best F of a search on few points with twice the gate and keep the better of the two."""
     trial = f.copy()
-    refine(trial, points[:SEARCH_POINTS], SAMPSON, 2.0 * gate, gate, SEARCH_STEPS)
+    refine(trial, points[:300], SAMPSON, 2.0 * gate, gate, 4)
     score, inliers, _ = truncated_score(trial, columns, gate, state[0], (0.0, 0.0))
     if score < state[0]:
         state[:2] = score, inliers / len(points)
@@ -254,13 +228,14 @@ def _search_among_inliers(f: F64, points: F64, columns: F64, gate: float, rng: G
     """Improve ``f`` in place by samples of the matches near it until a round finds no better one."""
     score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
     state = np.array([score, inliers / len(points), *PRIOR])
-    for _ in range(MOST_ROUNDS):
-        near = points[np.asarray(sampson_distances(f, points)) < NEAR_INLIERS * gate]
+    samples = 256
+    for _ in range(10):
+        near = points[np.asarray(sampson_distances(f, points)) < 3.0 * gate]
         if len(near) < MINIMUM:
             return
-        before, done, uniforms = state[0], 0, rng.random((NEAR_SAMPLES, 7))
-        while done < NEAR_SAMPLES:
-            score, stop = state[0], (done, NEAR_SAMPLES, 1.0)
+        before, done, uniforms = state[0], 0, rng.random((samples, 7))
+        while done < samples:
+            score, stop = state[0], (done, samples, 1.0)
             done = search_fundamental(near, columns, uniforms[done:], gate, stop, state, f)
             if state[0] < score:
                 _refine_best(points, columns, gate, state, f)
@@ -272,7 +247,8 @@ def _coincide(f: F64, other: F64, points: F64, gate: float) -> bool:
     """Whether the inliers of either F are near the other: their RMS distance is below the gate."""
     distances = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
     for mine, theirs in (distances, distances[::-1]):
-        far = np.minimum(theirs[mine < gate], FAR * gate)
+        # Truncated, so that a single wrong match cannot decide.
+        far = np.minimum(theirs[mine < gate], 20.0 * gate)
         if far @ far > gate**2 * len(far):
             return False
     return True
@@ -282,7 +258,7 @@ def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float)
     """The F with the lowest score (0 without any), and the next ones that coincide with none before."""
     chosen: list[F64] = []
     for _, f in sorted(ends, key=lambda end: end[0]):
-        if len(chosen) <= COMPETING and not any(_coincide(g, f, points, gate) for g in chosen):
+        if len(chosen) <= 3 and not any(_coincide(g, f, points, gate) for g in chosen):
             chosen.append(f)
     return (chosen[0], chosen[1:]) if chosen else (np.zeros(9), [])
 
@@ -292,36 +268,42 @@ def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | N
 
     The noise is None if too few residuals are within it.
     """
-    loss = (0.0, 0.0)
-    for k in range(NOISE_REFINEMENTS + 1):
+    loss, rounds = (0.0, 0.0), 2
+    # Smallest width of the loss in units of the frame, for matches without noise.
+    exact = 1e-9
+    for k in range(rounds + 1):
         r = np.sort(sampson_distances(f, points))
         near = r[: np.searchsorted(r, noise_width(r, gate))]
         if len(near) < MINIMUM:
             return None, loss
-        noise = NoiseMixture.fit(r, max(noise_scale(near), EXACT), spread=SPREAD)
-        if k == NOISE_REFINEMENTS:
+        noise = NoiseMixture.fit(r, max(noise_scale(near), exact), spread=SPREAD)
+        if k == rounds:
             break
         limit = noise.limit
         if k > 0:
-            few = 1.0 + FEW_MATCHES / max(noise.core * len(r) - PARAMETERS, 1.0)
+            # Few matches pull the fit towards them: the last loss is wider.
+            few = 1.0 + 28.0 / max(noise.core * len(r) - PARAMETERS, 1.0)
             limit = min(limit, few * noise.core_limit)
-        limit = max(limit, EXACT, 1.001 * float(r[MINIMUM - 1]))
+        limit = max(limit, exact, 1.001 * float(r[MINIMUM - 1]))
         near = r[: np.searchsorted(r, limit)]
         # The start fits few matches: heavy tails cannot be detected before the first refinement.
         width = best_huber_width(near, noise.sigma, parameters=PARAMETERS) if k > 0 else np.inf
-        width = min(max(width, EXACT), limit)
-        refine(f, points, SAMPSON, limit, width, REFINEMENT_STEPS)
+        width = min(max(width, exact), limit)
+        refine(f, points, SAMPSON, limit, width, 15)
         loss = (limit, width)
     return noise, loss
 
 
 def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
-    """Whether more residuals (N,) lie just beyond the noise than are expected of wrong matches."""
-    end = COVERED * noise.sigma
+    """Whether more residuals (N,) lie just beyond the noise than are expected of wrong matches.
+
+    In a ring of 15 gates beyond 3 sigma, by at least a quarter of the inliers (less if they are few).
+    """
+    end, width = 3.0 * noise.sigma, 15.0 * gate
     inside = int(np.count_nonzero(r < end))
     beyond = len(r) - inside
-    ring = int(np.count_nonzero(r < end + RING * gate)) - inside
+    ring = int(np.count_nonzero(r < end + width)) - inside
     # Wrong matches are roughly half-normal with unit spread.
-    expected = float(np.sqrt(2.0 / np.pi)) * beyond * RING * gate / SPREAD
-    needed = inside * max(0.05, EXCESS * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
+    expected = float(np.sqrt(2.0 / np.pi)) * beyond * width / SPREAD
+    needed = inside * max(0.05, 0.25 * (1.0 - 3.0 * PARAMETERS / max(inside, 1)))
     return ring - expected > max(2.0 * float(np.sqrt(expected)), needed)
