@@ -176,7 +176,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     chance = max(chance_of_model, chance_of_match)
     false_alarms = log10_false_alarms(agreeing - contradicted, tried, chance=chance, free=2)
     relevant_px = max(1.0, 2.0 * fit.sigma_px)
-    # A competing model must gain more than wrong matches agree by chance, and 5 % of the inliers off the plane.
+    # A competing model must gain more than wrong matches agree by chance, and 5 % of the inliers off it.
     expected = 2.0 * chance_of_match * (tried - agreeing)
     least = max(0.05 * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
     different = [m for m in models if m.gained >= least and m.differs(relevant_px * frame.scale)]
