@@ -217,7 +217,8 @@ class NoiseMixture:
         widths = np.array([sigma, TAIL * sigma, spread])
         fractions = np.array([0.9 * share, 0.1 * share, 1.0 - share])
         widths, fractions, likelihood = _fit_mixture(some, parameters / step, spread, 6, widths, fractions)
-        return cls(float(widths[0]), float(widths[2]), *fractions.tolist(), likelihood)
+        core, tail, wrong = fractions.tolist()
+        return cls(float(widths[0]), float(widths[2]), core, tail, wrong, likelihood)
 
     @property
     def limit(self) -> float:
