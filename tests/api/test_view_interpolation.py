@@ -18,7 +18,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
-from thesisrecon.stereo._planar import PlanarRectification
+from thesisrecon.stereo._frames import PlanarRectification
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.views.interpolation import InterpolatedPair
 

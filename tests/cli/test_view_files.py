@@ -18,7 +18,7 @@ from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.model import TextureAtlas
 
 SIZE = SHAPE[::-1]
 COUNT = 8

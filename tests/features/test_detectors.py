@@ -22,7 +22,7 @@ from thesisrecon.features.multiscale import (
     sample_patches,
     simulate_view,
 )
-from thesisrecon.imaging.filters import gaussian_taps
+from thesisrecon.imaging.resampling import gaussian_taps
 from thesisrecon.records import Image
 
 HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, colour=True)

@@ -8,8 +8,8 @@ from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.imaging.filters import cubic_weights, gaussian_taps, halve, resample, smooth
-from thesisrecon.imaging.raster import Raster, rasterize
+from thesisrecon.imaging.raster import Raster, image_corners, rasterize, rasterize_rows
+from thesisrecon.imaging.resampling import cubic_weights, gaussian_taps, halve, resample, smooth
 
 
 def test_smoothing_equals_its_numpy_twin():
@@ -141,12 +141,14 @@ def test_no_crack_opens_between_faces():
     assert (rasterize(vertices, faces, Camera(K, np.eye(3), np.zeros(3), SIZE)).face >= 0).all()
 
 
-def test_threads_change_nothing():
+def test_rows_are_those_of_the_whole():
     rng = np.random.default_rng(3)
     vertices, faces = soup(rng)
-    one, three = (rasterize(vertices, faces, camera_at(np.random.default_rng(1)), threads=n) for n in (1, 3))
+    camera = camera_at(np.random.default_rng(1))
+    whole = rasterize(vertices, faces, camera)
+    rows = rasterize_rows(*image_corners(vertices, faces, camera), (7, 30), camera.size[0])
     for name in Raster.__dataclass_fields__:
-        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+        np.testing.assert_array_equal(getattr(whole[7:30], name), getattr(rows, name))
 
 
 def keys_kernel(x):

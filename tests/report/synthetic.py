@@ -19,9 +19,9 @@ from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
 from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult, StageReport, Tracks, TwoView
 from thesisrecon.report._data import ReportData
-from thesisrecon.surface._mesh import simplify_mesh
+from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.texture_atlas import TextureAtlas
+from thesisrecon.surface.model import TextureAtlas
 
 SIZE = (480, 320)
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
@@ -201,7 +201,7 @@ SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 @cache
 def sphere_model():
     """The sphere in at most 6000 triangles with the texture of its photographs."""
-    mesh = simplify_mesh(VolumetricFusion().fuse(ring_of()), 6_000)
+    mesh = reduce_faces(VolumetricFusion().fuse(ring_of()), 6_000)
     return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
 
 

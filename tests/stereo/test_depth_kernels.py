@@ -3,7 +3,7 @@
 import numpy as np
 
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo import _depth_kernels as kernels
+from thesisrecon.stereo import _depth_fusion as kernels
 from thesisrecon.stereo._plane_kernels import fit_planes
 
 SHAPE = (23, 31)
@@ -88,48 +88,6 @@ def test_the_filter_ends_at_the_first_outlier():
     np.testing.assert_allclose(std[taken & ~first], np.sqrt(1.0 - gain) * 0.05, rtol=1e-5)
 
 
-def test_agreement_counts_consistent_and_contradicted_depths():
-    rng = np.random.default_rng(3)
-    to = np.column_stack([np.eye(3), [3.0, 1.0, 0.0]])
-    back = np.column_stack([np.eye(3), [-3.0, -1.0, 0.0]])
-    depth, other = holes(rng, np.full(SHAPE, 1.0)), holes(rng, np.full(SHAPE, 1.0))
-    depth[5:9, 5:9] = 0.9
-    other[12:16, 20:24] = 0.8
-    std = np.full(SHAPE, 1e-3, np.float32)
-    agree, contradict = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, np.uint8)
-    limits = np.array([1.0, 0.01, 2.0])
-    kernels.count_agreement((depth, std), to, (other, std), back, limits, agree, contradict)
-    v, u = np.mgrid[0 : SHAPE[0], 0 : SHAPE[1]]
-    x, y = u + 3.0 / depth, v + 1.0 / depth
-    inside = (x > -0.5) & (x < SHAPE[1] - 0.5) & (y > -0.5) & (y < SHAPE[0] - 0.5)
-    q, p = (np.where(inside, np.floor(c + 0.5), 0).astype(int) for c in (y, x))
-    found = np.where(inside, other[q, p], np.nan)
-    bound = 0.01 * depth + 2.0 * np.hypot(std, std)
-    assert (contradict == (found > depth + bound)).all()
-    assert (agree == (np.abs(found - depth) <= bound)).all()
-    assert contradict.sum() > 8
-    assert agree.sum() > 300
-
-
-def test_depths_land_on_the_nearest_pixels_of_another_view_the_nearer_before_the_farther():
-    rng = np.random.default_rng(5)
-    to = np.column_stack([np.diag([1.0, 1.0, 1.1]), [3.0, -1.0, 0.2]])
-    depth = holes(rng, rng.choice([0.5, 1.0], SHAPE))
-    out = np.full((19, 25), np.nan, np.float32)
-    out[4, 5], out[6, 7] = 0.1, 9.0
-    wanted = out.copy()
-    kernels.splat_depths(depth, to, out)
-    z = depth.astype(float)
-    w = 1.1 * z + 0.2
-    p, q = (
-        np.floor((z * c + d) / w + 0.5) for c, d in zip(pixels().transpose(2, 0, 1), (3.0, -1.0), strict=True)
-    )
-    good = (w > 0) & (p >= 0) & (q >= 0) & (p < 25) & (q < 19)
-    np.fmin.at(wanted, (q[good].astype(int), p[good].astype(int)), w[good].astype(np.float32))
-    np.testing.assert_allclose(out, wanted, rtol=1e-6)
-    assert np.isnan(out).any()
-
-
 def test_planes_are_fitted_to_similar_pixels():
     rng = np.random.default_rng(4)
     xy = pixels()
@@ -142,32 +100,3 @@ def test_planes_are_fitted_to_similar_pixels():
     assert (np.isfinite(gx) == known).all()
     np.testing.assert_allclose(gx[known], 1e-3, atol=2e-6)
     np.testing.assert_allclose(gy[known], -2e-3, atol=2e-6)
-
-
-def test_continued_surfaces_lie_on_the_plane_of_certain_pixels():
-    rng = np.random.default_rng(6)
-    y, x = np.indices(SHAPE)
-    rho = (1.0 + 2e-3 * x - 1e-3 * y + 1e-4 * rng.normal(size=SHAPE)).astype(np.float32)
-    rho[:, 22:] += 0.4
-    sure = (rng.random(SHAPE) < 0.6).astype(np.uint8)
-    sure[:, 26:] = 0
-    doubtful = (sure == 0) & (rng.random(SHAPE) < 0.5)
-    rho[doubtful] += rng.choice([0.0, 2e-3], int(doubtful.sum())).astype(np.float32)
-    rho = holes(rng, rho)
-    sure[np.isnan(rho)] = 0
-    std = np.full(SHAPE, 4e-4, np.float32)
-    joins = np.empty(SHAPE, np.uint8)
-    kernels.surface_continuation(rho, std, sure, 3, 0.05, 2.0, joins)
-    wanted = np.zeros(SHAPE, bool)
-    for v, u in np.argwhere((sure == 0) & np.isfinite(rho)):
-        near = (np.abs(x - u) <= 3) & (np.abs(y - v) <= 3) & (sure > 0)
-        near &= np.abs(rho - rho[v, u]) <= 0.05 * rho[v, u]
-        dx, dy = x[near] - u, y[near] - v
-        if near.sum() < 49 // 4 or dx.mean() ** 2 + dy.mean() ** 2 > 0.5 * (dx.var() + dy.var()):
-            continue
-        A = np.stack([np.ones(len(dx)), dx, dy], axis=1)
-        plane = np.linalg.lstsq(A, rho[near].astype(float), rcond=None)[0]
-        wanted[v, u] = abs(plane[0] - rho[v, u]) <= 2.0 * std[v, u]
-    assert (joins.astype(bool) == wanted).all()
-    assert wanted.sum() > 20
-    assert ((sure == 0) & np.isfinite(rho) & ~wanted).sum() > 20

@@ -13,16 +13,15 @@ from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap
 from thesisrecon.stereo._depth_fusion import _concatenated, _measured
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
-from thesisrecon.stereo._planar import common_orientation
-from thesisrecon.stereo._polar import polar
+from thesisrecon.stereo._frames import common_orientation, polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import (
     _complete_depths,
     _confirm_depths,
-    _region_sizes,
     _select_neighbours,
     _shared_projections,
     _sparse_points,
+    _without_small_regions,
 )
 
 
@@ -208,12 +207,11 @@ def test_seen_through_and_small_pieces_are_removed():
     assert (found.views == np.isfinite(found.depth)).all()
     alone = _confirm_depths(maps[0], [])
     assert np.isnan(alone.depth).all()
-    lonely = np.full((50, 60), np.nan, dtype=np.float32)
-    lonely[:20], lonely[30:32, 5:8] = 2.0, 3.0
-    sizes = _region_sizes(lonely, 0.02)
-    assert (sizes[:20] == 1200).all()
-    assert (sizes[30:32, 5:8] == 6).all()
-    assert sizes[25, 5] == 0
+    lonely = np.full((250, 300), np.nan, dtype=np.float32)
+    lonely[:100], lonely[150:152, 5:8] = 2.0, 3.0
+    kept = _without_small_regions(DepthMap(0, np.eye(3, 4), lonely, lonely, np.ones(lonely.shape, np.uint8)))
+    assert (kept.depth[:100] == 2.0).all()
+    assert np.isnan(kept.depth[100:]).all()
 
 
 def test_unconfirmed_depths_stay_if_they_continue_confirmed_ones():

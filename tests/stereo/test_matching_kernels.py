@@ -8,8 +8,8 @@ import pytest
 from tests.stereo import twins
 from thesisrecon.stereo import _postprocessing
 from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
-from thesisrecon.stereo._path_kernels import adaptive_P2, scratch_size, sum_paths
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, _solve_row
+from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
 
 
 def random_side(rng, height=13, width=21, channels=3):
@@ -105,24 +105,14 @@ def test_best_disparities_of_both_sides():
         assert right[y, x] == min(seen, key=lambda q: (seen[q], q)) - 2
 
 
-def test_the_sub_pixel_place_is_where_two_lines_meet():
-    sums = np.zeros((2, 1, 4, 1), np.uint8)
-    sums[0, 0, :, 0] = [90, 40, 20, 50]
-    out = tuple(np.empty((1, 1), np.float32) for _ in range(3))
-    _postprocessing.best_disparities(sums, 0, 0, out, 1.0)
-    # Slope 30: 40 = v + 30 (x - 1), 50 = v + 30 (3 - x).
-    assert out[0][0, 0] == pytest.approx(2.0 - 1.0 / 6.0)
-
-
 def test_sides_that_contradict_each_other():
     left = np.array([[2.0, 1.0, 1.0, 1.2, np.nan, 3.0]], np.float32)
     right = np.array([[1.0, 1.0, 3.0, 1.0, 1.0, np.nan]], np.float32)
     confidence = np.ones((1, 6), np.float32)
-    limits = np.array([1.0, 0.1], np.float32)
-    _postprocessing.check_left_right(left, right, confidence, limits)
+    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
     np.testing.assert_array_equal(left, np.array([[np.nan, 1, 1, np.nan, np.nan, 3]], np.float32))
     confidence[0, 1] = 0.05
-    _postprocessing.check_left_right(left, right, confidence, limits)
+    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
     assert np.isnan(left[0, 1])
     assert left[0, 2] == 1.0
 
@@ -141,52 +131,15 @@ def test_peaks_go_and_surfaces_stay_where_there_is_texture():
     assert np.isnan(disparity).all()
 
 
-def test_confidence_falls_with_texture_and_where_it_was_filled_in():
-    confidence = np.full((1, 4), 0.8, np.float32)
-    confirmed = np.array([[1.0, np.nan, np.nan, 2.0]], np.float32)
-    disparity = np.array([[1.0, 1.0, np.nan, 2.0]], np.float32)
-    _postprocessing.final_confidence(
-        confidence, confirmed, disparity, np.array([[4.0, 4.0, 4.0, 0.5]], np.float32)
-    )
-    assert confidence[0].tolist() == pytest.approx([0.6, 0.3, 0.0, 0.04])
-
-
 def test_pinholes_take_the_median_and_large_holes_stay():
     disparity = np.arange(30, dtype=np.float32).reshape(5, 6)
     disparity[2, 2] = np.nan
     disparity[:, 5] = np.nan
-    out = np.empty_like(disparity)
-    _postprocessing.fill_pinholes(disparity, 5, out)
+    out = _postprocessing.fill_pinholes(disparity, 5)
     assert out[2, 2] == np.nanmedian(disparity[1:4, 1:4])
     assert np.isnan(out[:, 5]).all()
     known = ~np.isnan(disparity)
     assert (out[known] == disparity[known]).all()
-
-
-def test_smoothing_averages_similar_pixels():
-    rng = np.random.default_rng(7)
-    disparity = np.where(np.arange(11) < 5, 3.0, 9.0) + rng.uniform(-0.4, 0.4, (8, 11))
-    disparity[3, 3] = np.nan
-    values, out = disparity.astype(np.float32), np.empty((8, 11), np.float32)
-    _postprocessing.edge_preserving_mean(values, np.float32(1.0), 2, out)
-    for y, x in np.ndindex(8, 11):
-        window = values[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
-        if np.isnan(values[y, x]):
-            assert np.isnan(out[y, x])
-        else:
-            alike = window[np.abs(window - values[y, x]) <= 1.0]
-            assert out[y, x] == pytest.approx(alike.mean(), rel=1e-5)
-
-
-def test_squared_gradients_over_windows():
-    channels = np.random.default_rng(8).integers(0, 1000, (2, 9, 12)).astype(np.int16)
-    out = np.empty((9, 12), np.float32)
-    _postprocessing._squared_gradient(channels, 2, out)
-    squares = np.zeros((9, 12))
-    squares[:, 1:-1] = ((channels[:, :, 2:].astype(float) - channels[:, :, :-2]) ** 2).mean(axis=0)
-    padded = np.pad(squares, 2)
-    for y, x in np.ndindex(9, 12):
-        assert out[y, x] == pytest.approx(padded[y : y + 5, x : x + 5].sum() / 25.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(6))

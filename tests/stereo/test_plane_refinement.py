@@ -92,24 +92,6 @@ def test_costs_equal_weighted_correlations(scene, spread):
     assert len(np.unique(support)) >= 3
 
 
-@pytest.mark.parametrize("backward", [False, True])
-def test_a_pass_equals_that_of_plain_numpy(scene, backward):
-    setting, given, places = scene
-    planes = planes_about(places, 0.5)
-    cost = np.empty(SHAPE, np.float32)
-    kernels.begin_planes(*given, planes, cost)
-    wanted, wanted_cost = planes.copy(), cost.copy()
-    setting.sweep(wanted, wanted_cost, step_px=0.4, converged_cost=0.02, backward=backward)
-    before, active = cost.copy(), np.ones(SHAPE, np.uint8)
-    kernels.sweep_planes(*given, 0.4, 0.02, backward, planes, cost, active)
-    visited = np.isfinite(setting.gray) & (before > 0.02)
-    np.testing.assert_array_equal(active > 0, visited & (before - cost >= kernels.MIN_GAIN))
-    # Sums in single precision may turn a choice between planes of one cost.
-    assert np.mean(np.isclose(cost, wanted_cost, atol=5e-4)) > 0.97
-    same = np.isclose(planes, wanted, atol=1e-4, equal_nan=True).all(axis=-1)
-    assert same.mean() > 0.95
-
-
 def test_converged_planes_rest_until_a_neighbour_changes(scene):
     _, given, places = scene
     planes = planes_about(places, 0.5)

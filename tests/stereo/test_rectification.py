@@ -10,8 +10,8 @@ from tests.stereo.rectification_scenes import MOTIONS, PLANAR, SIZE, make_pair
 from tests.synthetic import texture
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
-from thesisrecon.imaging.resampling import NOT_SHRUNK, STRIP_ROWS, _sample_image, warp_image
-from thesisrecon.stereo import _planar as planar
+from thesisrecon.imaging.resampling import STRIP_ROWS, _sample_image, warp_image
+from thesisrecon.stereo import _frames as planar
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_GROWTH,
@@ -20,11 +20,12 @@ from thesisrecon.stereo._epipolar_pair import (
     pair_of_cameras,
     pair_of_fundamental,
 )
-from thesisrecon.stereo._polar import PolarRectification, polar
-from thesisrecon.stereo._rectification_quality import jacobians, matches_in_frame, measure_quality
+from thesisrecon.stereo._frames import PolarRectification, matches_in_frame, polar
 from thesisrecon.stereo.rectification import (
     RectifiedImages,
     disparity_range,
+    jacobians,
+    measure_quality,
     rectify,
     rectify_cameras,
     rectify_pair,
@@ -264,52 +265,6 @@ def test_wrong_calls_are_value_errors(change):
 def planar_frame(H, size):
     """Both images mapped by one homography."""
     return planar.PlanarRectification(np.stack([H, H]), size)
-
-
-def cubic(x):
-    x = np.abs(x)
-    near, far = 1.5 * x**3 - 2.5 * x**2 + 1.0, -0.5 * x**3 + 2.5 * x**2 - 4.0 * x + 2.0
-    return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))
-
-
-def sample_plainly(image, xy, rows):
-    """Twin of ``_sample_image`` for lookups of at least two rows and columns, by one weight per pixel."""
-    height, width = image.shape[:2]
-    padded = np.pad(image.astype(np.float64), ((12, 12), (12, 12), (0, 0)), mode="edge")
-    down = np.concatenate([np.diff(xy, axis=0), xy[-2:-1] - xy[-1:]])
-    across = np.concatenate([np.diff(xy, axis=1), xy[:, -2:-1] - xy[:, -1:]], axis=1)
-    spread = np.hypot(across, down)
-    spread = np.where(spread > NOT_SHRUNK, spread, 1.0)
-    out = np.full((rows, xy.shape[1], image.shape[2]), np.nan)
-    for i, j in np.ndindex(rows, xy.shape[1]):
-        x, y = xy[i, j]
-        if not (0.0 <= x <= width - 1.0 and 0.0 <= y <= height - 1.0):
-            continue
-        u, v = np.arange(-12, width + 12), np.arange(-12, height + 12)
-        w = np.outer(cubic((v - y) / spread[i, j, 1]), cubic((u - x) / spread[i, j, 0]))
-        x0, y0 = int(x), int(y)
-        if np.isnan(image[y0 : y0 + 2, x0 : x0 + 2]).any():
-            continue
-        known = np.isfinite(padded[:, :, 0])
-        out[i, j] = np.sum(w[known][:, None] * padded[known], axis=0) / w[known].sum()
-    return out
-
-
-@pytest.mark.parametrize("scale", [0.6, 1.0, 2.3])
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_kernel_is_its_plain_twin(scale, channels):
-    rng = np.random.default_rng(0)
-    image = rng.uniform(0.0, 255.0, (70, 90, channels)).astype(np.float32)
-    image[30:33, 40:44] = np.nan
-    c, s = scale * np.cos(0.3), scale * np.sin(0.3)
-    H = np.linalg.inv(np.array([[c, -s, 20.0], [s, c, -4.0], [1e-4, 2e-4, 1.0]]))
-    xy = planar_frame(H / H[2, 2], (60, 50))._lookup(0, range(51))
-    out = np.empty((50, 60, channels), np.float32)
-    _sample_image(image, xy, out)
-    plain = sample_plainly(image, xy, 50)
-    np.testing.assert_array_equal(np.isnan(out), np.isnan(plain))
-    assert np.isfinite(out).mean() > 0.2
-    np.testing.assert_allclose(out, plain, atol=0.02, equal_nan=True)
 
 
 def test_strips_do_not_show_and_grey_is_one_channel():

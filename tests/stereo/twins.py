@@ -7,7 +7,6 @@ import numpy as np
 from thesisrecon.stereo._plane_kernels import (
     MAX_EXCESS_COST,
     MIN_WINDOW_COVERAGE,
-    SAME_PLANE,
     TEXTURE,
     UNKNOWN,
 )
@@ -93,41 +92,6 @@ class Setting:
             support[v, u] = good.sum()
             slope[v, u] = np.linalg.norm(self.motions(u, v, planes[v, u, 0])[good])
         return least, support, slope
-
-    def sweep(self, planes, cost, *, step_px, converged_cost, backward):
-        """One pass over planes and costs, in place."""
-        height, width = self.gray.shape
-        way = -1 if backward else 1
-        for v in range(height)[::way]:
-            for u in range(width)[::way]:
-                if np.isfinite(self.gray[v, u]) and not cost[v, u] <= converged_cost:
-                    self.improve(planes, cost, (u, v), way, step_px)
-
-    def improve(self, planes, cost, at, way, step_px):
-        """One pixel of a pass."""
-        u, v = at
-        reach = -self.offsets[0, 0]
-        plane, least = planes[v, u].astype(float), float(cost[v, u])
-
-        def take(trial):
-            nonlocal plane, least
-            tried = self.cost(u, v, trial)
-            if tried < least:
-                plane, least = trial, tried
-
-        move = step_px / self.motions(u, v, plane[0]).max() if least < UNKNOWN else 0.0
-        for a, b in ((u - way, v), (u, v - way)):
-            if 0 <= a < planes.shape[1] and 0 <= b < planes.shape[0] and np.isfinite(planes[b, a, 0]):
-                trial = planes[b, a].astype(float)
-                trial[0] += (u - a) * trial[1] + (v - b) * trial[2]
-                apart = np.abs(trial - plane) @ (1.0, reach, reach)
-                if not apart <= SAME_PLANE * move:
-                    take(trial)
-        if least < UNKNOWN:
-            move = step_px / self.motions(u, v, plane[0]).max()
-            for k in range(6):
-                take(plane + np.eye(3)[k // 2] * (1 - 2 * (k % 2)) * move / (1.0 if k < 2 else reach))
-        planes[v, u], cost[v, u] = plane, least
 
 
 def census(grey):

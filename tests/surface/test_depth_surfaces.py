@@ -12,9 +12,9 @@ from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, sphere_map
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
-from thesisrecon.surface._mesh import connected_parts
+from thesisrecon.surface._mesh import connected_parts, surface_from_depth
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import LinearSurface, surface_from_depth
+from thesisrecon.surface.model import LinearSurface
 
 SHAPE = (60, 80)
 P = camera_from_centre(

@@ -8,114 +8,22 @@ from scipy.interpolate import BSpline
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tests.conftest import refuses
 from tests.surface.sphere import ring_of
-from thesisrecon.records import TexturedMesh
-from thesisrecon.surface._bspline_pieces import Domain, evaluate_pixels, pieces_of, sum_squares
-from thesisrecon.surface._mesh import face_areas, halve_surface, simplify_mesh
-from thesisrecon.surface.bspline import _basis, _energies
+from thesisrecon.surface._mesh import halve_surface
+from thesisrecon.surface.bspline import (
+    Domain,
+    _basis,
+    _energies,
+    _evaluate_pixels,
+    _pieces_of,
+    _sum_squares,
+)
 from thesisrecon.surface.fusion import VolumetricFusion
 
 
 @pytest.fixture(scope="module")
 def sphere():
     return VolumetricFusion(tolerance=0.0).fuse(ring_of())
-
-
-def sheet(steps, height=0.0, *, flip=False):
-    """The unit square at a height in 2 steps^2 triangles that look up, or down if flipped."""
-    x, y = np.meshgrid(np.linspace(0, 1, steps + 1), np.linspace(0, 1, steps + 1))
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
-    n = (np.arange(steps)[:, None] * (steps + 1) + np.arange(steps)).ravel()
-    up = np.stack([n, n + 1, n + steps + 2], axis=1), np.stack([n, n + steps + 2, n + steps + 1], axis=1)
-    faces = np.concatenate(up)
-    return TexturedMesh(vertices, faces[:, ::-1] if flip else faces)
-
-
-def joined(*meshes):
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]
-    return TexturedMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
-
-
-def normals(mesh):
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-
-
-def cycles(faces):
-    """Faces with their smallest corner first, in order."""
-    turned = np.stack([np.roll(face, -int(np.argmin(face))) for face in faces])
-    return turned[np.lexsort(turned.T)]
-
-
-@pytest.mark.parametrize("most", [12_000, 3_000, 500])
-def test_a_coarser_sphere_is_still_the_sphere(sphere, most):
-    assert len(sphere.faces) > 12_000
-    small = simplify_mesh(sphere, most)
-    assert 0.6 * most < len(small.faces) <= most
-    side = np.sqrt(4 * np.pi / most)
-    radius = np.linalg.norm(small.vertices, axis=1)
-    # A vertex where its planes meet stands off a sphere by about the square of its cell over eight.
-    assert np.sqrt(np.mean((radius - 1.0) ** 2)) < 0.3 * side**2 + 0.003
-    middle = small.vertices[small.faces].mean(axis=1)
-    outward = (normals(small) * middle).sum(axis=1) / np.linalg.norm(middle, axis=1)
-    assert (outward > 0).mean() > 0.99
-    assert face_areas(small.vertices, small.faces).sum() == pytest.approx(4 * np.pi, rel=0.08)
-
-
-def test_no_face_is_degenerate_or_repeated(sphere):
-    small = simplify_mesh(sphere, 2_000)
-    assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
-    assert len(np.unique(cycles(small.faces), axis=0)) == len(small.faces)
-    assert set(np.unique(small.faces)) == set(range(len(small.vertices)))
-
-
-def test_a_flat_sheet_stays_flat_and_looks_the_same_way():
-    for flip, sign in ((False, 1.0), (True, -1.0)):
-        small = simplify_mesh(sheet(40, flip=flip), 300)
-        assert 100 < len(small.faces) <= 300
-        np.testing.assert_allclose(small.vertices[:, 2], 0.0, atol=1e-12)
-        np.testing.assert_allclose(normals(small)[:, 2], sign)
-
-
-def test_the_two_sides_of_a_thin_wall_stay_apart():
-    wall = joined(sheet(40, 0.01), sheet(40, 0.0, flip=True))
-    small = simplify_mesh(wall, 400)
-    assert sorted(np.unique(small.vertices[:, 2].round(9)).tolist()) == [0.0, 0.01]
-    up = normals(small)[:, 2] > 0
-    heights = small.vertices[small.faces][..., 2]
-    np.testing.assert_allclose(heights[up], 0.01)
-    np.testing.assert_allclose(heights[~up], 0.0, atol=1e-12)
-
-
-def test_a_ridge_stays_sharp():
-    roof = sheet(60)
-    height = 0.5 - np.abs(roof.vertices[:, 0] - 0.5)
-    roof = replace(roof, vertices=np.column_stack([roof.vertices[:, :2], height]))
-    small = simplify_mesh(roof, 400)
-    off = np.abs(small.vertices[:, 2] - (0.5 - np.abs(small.vertices[:, 0] - 0.5)))
-    assert off.max() < 1e-6
-
-
-def test_small_meshes_are_unchanged_and_colours_are_averaged(sphere):
-    assert simplify_mesh(sphere, len(sphere.faces)) is sphere
-    high = sphere.vertices[:, 1] > 0
-    colors = np.where(high[:, None], (200, 40, 90), (20, 60, 10)).astype(np.uint8)
-    uv = np.zeros((len(sphere.faces), 3, 2))
-    small = simplify_mesh(replace(sphere, colors=colors, uv=uv), 1_000)
-    assert small.uv is None
-    assert small.colors is not None
-    assert small.colors.shape == small.vertices.shape
-    assert (small.colors[small.vertices[:, 1] > 0.2] == (200, 40, 90)).all()
-    assert (small.colors[small.vertices[:, 1] < -0.2] == (20, 60, 10)).all()
-
-
-def test_a_mesh_of_nothing_but_one_place_becomes_empty():
-    point = TexturedMesh(np.zeros((9, 3)), np.arange(9).reshape(3, 3))
-    assert len(simplify_mesh(point, 2).faces) <= 2
-    refuses(ValueError, "max_faces", simplify_mesh, point, 0)
 
 
 CELL = 4
@@ -137,7 +45,7 @@ def domain():
 
 @pytest.fixture
 def pieces(domain):
-    return pieces_of(domain, CELL)
+    return _pieces_of(domain, CELL)
 
 
 def edges(domain):
@@ -178,14 +86,14 @@ def test_coefficients_are_shared_within_connected_parts(domain, pieces):
             assert len(set(zip(label, own, strict=True))) == len(set(label)) == len(set(own))
             assert not owners & set(own.tolist())
             owners |= set(own.tolist())
-    assert owners == set(range(pieces.count))
+    assert owners == set(range(pieces.total))
 
 
 def rows_of(pieces):
     """(pixels, coefficients) weights of the coefficients in each pixel of a piece."""
     y, x = np.nonzero(pieces.piece >= 0)
     tensor = _basis((y % CELL + 0.5) / CELL)[:, :, None] * _basis((x % CELL + 0.5) / CELL)[:, None, :]
-    rows = np.zeros((len(y), pieces.count))
+    rows = np.zeros((len(y), pieces.total))
     np.add.at(
         rows, (np.arange(len(y))[:, None], pieces.coefficient[pieces.piece[y, x]]), tensor.reshape(-1, 16)
     )
@@ -195,23 +103,23 @@ def rows_of(pieces):
 def test_values_and_sums_are_those_of_the_rows(pieces):
     rng = np.random.default_rng(1)
     rows, covered = rows_of(pieces), pieces.piece >= 0
-    c, target = rng.normal(size=pieces.count), rng.normal(size=covered.shape)
+    c, target = rng.normal(size=pieces.total), rng.normal(size=covered.shape)
     weight = rng.random(covered.shape) * (rng.random(covered.shape) < 0.9)
     along = _basis((np.arange(CELL) + 0.5) / CELL)
     value = np.empty(covered.shape)
-    evaluate_pixels(pieces.piece, pieces.coefficient, c, along, CELL, value)
+    _evaluate_pixels(pieces.piece, pieces.coefficient, c, along, CELL, value)
     np.testing.assert_allclose(value[covered], rows @ c, atol=1e-12)
     assert np.isnan(value[~covered]).all()
     matrix, right = np.zeros((len(pieces.cell), 16, 16)), np.zeros((len(pieces.cell), 16))
-    sum_squares(pieces.piece, target, weight, along, CELL, matrix, right)
-    full = np.zeros((pieces.count, pieces.count))
+    _sum_squares(pieces.piece, target, weight, along, CELL, matrix, right)
+    full = np.zeros((pieces.total, pieces.total))
     upper = np.triu(np.ones((16, 16)), 1)[None] * matrix
     np.add.at(
         full, (pieces.coefficient[:, :, None], pieces.coefficient[:, None, :]), matrix + upper.swapaxes(1, 2)
     )
     w = weight[covered]
     np.testing.assert_allclose(full, rows.T @ (w[:, None] * rows), atol=1e-12)
-    total = np.bincount(pieces.coefficient.ravel(), right.ravel(), pieces.count)
+    total = np.bincount(pieces.coefficient.ravel(), right.ravel(), pieces.total)
     np.testing.assert_allclose(total, rows.T @ (w * target[covered]), atol=1e-12)
 
 

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from tests.surface.sphere import ring_of, sphere_map
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _simplification
-from thesisrecon.surface._mesh import face_areas, simplify_mesh
-from thesisrecon.surface._simplification import reduce_faces, simplify_surface
+from thesisrecon.surface._mesh import face_areas
+from thesisrecon.surface._simplification import _merge_in_cells, reduce_faces, simplify_surface
 from thesisrecon.surface.fusion import VolumetricFusion
 
 
@@ -149,9 +149,25 @@ def test_a_number_of_faces_goes_to_the_details(most):
 
     relief = grid(height, 90)
     off = []
-    for mesh in (reduce_faces(relief, most), simplify_mesh(relief, most)):
+    for mesh in (reduce_faces(relief, most), _merge_in_cells(relief, most)):
         x, y, z = points_on(mesh).T
         off.append(np.sqrt(np.mean((z - height(x, y)) ** 2)))
         assert len(mesh.faces) <= most
     assert off[0] < off[1]
     assert reduce_faces(relief, len(relief.faces)) is relief
+
+
+def test_merged_faces_are_distinct_and_both_sides_of_a_thin_wall_stay():
+    front, back = (grid(lambda x, y, z=z: 0.0 * x * y + z, 40) for z in (0.0, 0.01))
+    faces = np.concatenate([front.faces[:, ::-1], back.faces + len(front.vertices)])
+    wall = TexturedMesh(np.concatenate([front.vertices, back.vertices]), faces)
+    small = _merge_in_cells(wall, 400)
+    assert 100 < len(small.faces) <= 400
+    assert (np.diff(np.sort(small.faces, axis=1), axis=1) > 0).all()
+    assert set(np.unique(small.faces)) == set(range(len(small.vertices)))
+    a, b, c = (small.vertices[small.faces[:, k]] for k in range(3))
+    up = np.cross(b - a, c - a)[:, 2] > 0
+    np.testing.assert_allclose(a[up, 2], 0.01)
+    np.testing.assert_allclose(a[~up, 2], 0.0, atol=1e-12)
+    point = TexturedMesh(np.zeros((9, 3)), np.arange(9).reshape(3, 3))
+    assert len(reduce_faces(point, 2).faces) <= 2

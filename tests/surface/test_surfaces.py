@@ -15,11 +15,10 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.imaging.raster import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface import fusion
-from thesisrecon.surface._mesh import connected_parts, face_areas, remove_small_parts
+from thesisrecon.surface._mesh import connected_parts, face_areas, remove_small_parts, surface_from_depth
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, _incidence_cosines
-from thesisrecon.surface.linear import LinearSurface, surface_from_depth
-from thesisrecon.surface.model import SurfaceModel
+from thesisrecon.surface.model import LinearSurface, SurfaceModel
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from thesisrecon.camera import compose_camera
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import DisparityMap
-from thesisrecon.views import _interpolation_kernels as kernels
+from thesisrecon.views import interpolation as kernels
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     _with_all_rows,
@@ -196,16 +196,6 @@ def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage
     np.testing.assert_array_equal(pair.view(1.0), turned)
 
 
-def test_a_turned_view_is_the_view_through_a_homography(stage):
-    left, right = photographs(stage)
-    pair = rectified_pair(left, right, disparities(stage))
-    shift = np.array([[1.0, 0.0, 7.0], [0.0, 1.0, -3.0], [0.0, 0.0, 1.0]])
-    for s in (0.0, 0.5):
-        off = np.abs(pair.view(s, turn=shift)[2:-8, 12:-2] - pair.view(s)[5:-5, 5:-9].astype(float))
-        assert np.quantile(off, 0.9) < 1.0
-        np.testing.assert_array_equal(pair.view(s, turn=-2.0 * shift), pair.view(s, turn=shift))
-
-
 def test_exposures_are_interpolated_too(stage):
     left, right = photographs(stage)
     factor = np.array([0.8, 0.7, 0.75])
@@ -289,47 +279,6 @@ def test_empty_rows_take_the_nearest():
     assert np.isnan(_with_all_rows(nothing)).all()
 
 
-def test_disparities_are_taken_back_by_interpolation():
-    whole, sure = field(1, holes=0.0), np.random.default_rng(1).random((14, 23)).astype(np.float32)
-    H = np.array([[1.1, 0.05, -2.0], [-0.03, 0.9, 1.2], [1e-3, -2e-3, 1.0]])
-    shape = (16, 20)
-    places, d, conf = np.empty((*shape, 2)), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    kernels.disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
-    y, x = np.mgrid[0:16, 0:20].astype(float)
-    xh = np.stack([x, y, np.ones(shape)], axis=-1) @ H.T
-    at = xh[..., :2] / xh[..., 2:]
-    np.testing.assert_allclose(places, at, atol=1e-12)
-    u, v = np.clip(at[..., 0], 0, 22), np.clip(at[..., 1], 0, 13)
-    x0, y0 = np.minimum(u.astype(int), 21), np.minimum(v.astype(int), 12)
-    four = np.stack([whole[y0, x0], whole[y0, x0 + 1], whole[y0 + 1, x0], whole[y0 + 1, x0 + 1]])
-    s, t = u - x0, v - y0
-    smooth = (1 - t) * ((1 - s) * four[0] + s * four[1]) + t * ((1 - s) * four[2] + s * four[3])
-    nearest = np.rint(v).astype(int), np.rint(u).astype(int)
-    plain = np.where(np.ptp(four, axis=0) <= kernels.ONE_SURFACE_PX, smooth, whole[nearest])
-    np.testing.assert_allclose(d, plain, atol=1e-5)
-    inside = (at > -0.5).all(axis=-1) & (at[..., 0] < 22.5) & (at[..., 1] < 13.5)
-    np.testing.assert_array_equal(conf, np.where(inside, sure[nearest], 0.0))
-    assert 0.2 < inside.mean() < 1.0
-    H[2] = [-0.1, 0.0, 1.0]
-    kernels.disparity_from_rectified((whole, sure), H, (0, 16), places, d, conf)
-    assert np.isnan(places[:, 10:]).all()
-    assert np.isnan(d[:, 10:]).all()
-    assert np.isfinite(d[:, :10]).all()
-
-
-def test_pixels_are_sampled_as_the_homography_maps_them():
-    rng = np.random.default_rng(2)
-    places, d = rng.uniform(0, 30, (5, 7, 2)), field(3, (5, 7))
-    G = np.array([[0.9, 0.1, 3.0], [-0.1, 1.1, -2.0], [4e-3, -0.05, 1.0]])
-    target = np.empty((5, 7, 2))
-    kernels.intermediate_positions(places, d, 0.3, G, (0, 5), target)
-    moved = places - 0.3 * np.stack([d, 0 * d], axis=-1).astype(float)
-    xh = np.concatenate([moved, np.ones((5, 7, 1))], axis=-1) @ G.T
-    plain = np.where(xh[..., 2:] > 0, xh[..., :2] / xh[..., 2:], np.nan)
-    np.testing.assert_allclose(target, plain, rtol=1e-12)
-    assert 0 < np.isnan(plain).sum() < plain.size
-
-
 def neighbours(at, shape, reach, step=1):
     """Index of the pixels of a picture up to ``reach`` rows and columns away."""
     offsets = range(-reach, reach + 1, step)
@@ -352,7 +301,7 @@ def test_guesses_become_medians_of_pixels_of_their_colour():
         if sure[y, x] > 0.0 or np.isnan(d[y, x]):
             np.testing.assert_array_equal(out[y, x], d[y, x])
             continue
-        part = neighbours((y, x), shape, kernels.REACH, kernels.SPARSE)
+        part = neighbours((y, x), shape, kernels.REACH, kernels.STEP)
         apart = np.abs(levels[part] - levels[y, x]).sum(axis=-1)
         weight = np.exp(-apart / 30.0) * np.where(sure[part] > 0.0, 1.0, 0.5)
         values, weight = d[part].ravel(), weight.ravel()
@@ -367,24 +316,6 @@ def test_guesses_become_medians_of_pixels_of_their_colour():
     # Between 15 and 18 the colours are those of the left surface.
     guessed = sure[:, 15:18] == 0.0
     assert np.median(out[:, 15:18][guessed & np.isfinite(d[:, 15:18])]) < 5.0
-
-
-def test_a_guess_alone_goes_with_those_around():
-    d = field(7)
-    rng = np.random.default_rng(7)
-    d[rng.random(d.shape) < 0.15] += 9.0
-    sure = rng.choice([0.0, 0.0, 1.0], d.shape).astype(np.float32)
-    out = np.empty_like(d)
-    for rows in ((0, 5), (5, 14)):
-        kernels.filter_extrapolated_by_median(d, sure, rows, out)
-    for y, x in np.ndindex(d.shape):
-        part = d[neighbours((y, x), d.shape, kernels.NEAR)]
-        values = np.sort(part[np.isfinite(part)])
-        expected = d[y, x]
-        if sure[y, x] == 0.0 and np.isfinite(expected) and np.ptp(values) > kernels.ONE_SURFACE_PX:
-            expected = values[len(values) // 2]
-        np.testing.assert_array_equal(out[y, x], expected)
-    assert (out != d).sum() > 20
 
 
 def test_two_pictures_become_one_by_the_rules():

@@ -8,9 +8,8 @@ from tests.conftest import refuses
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.views._warping import DIRECTIONS, distances_to_known
 from thesisrecon.views.tensor import CalibratedPair, VirtualCamera, camera_at, seed_of_two
-from thesisrecon.views.tensor_synthesis import _extrapolate_inverse_depth, prepare_synthesis
+from thesisrecon.views.tensor_synthesis import prepare_synthesis
 
 SIZE = (160, 120)
 K = calibration_matrix(150.0, 150.0, 81.0, 58.0)
@@ -194,28 +193,3 @@ def test_photographs_that_contradict_each_other_have_no_correspondence():
     places, _ = _true_places()
     with pytest.raises(StageFailure, match="no pixel of image 1 has a known correspondence"):
         prepare_synthesis(PAIR, BLACK, (places[0] + 50.0, places[1]))
-
-
-def test_the_kernel_is_its_plain_twin():
-    rng = np.random.default_rng(9)
-    own = rng.choice([0.1, 0.2, 0.4, np.nan], (11, 14)).astype(np.float32)
-    other = rng.choice([0.15, 0.3, np.nan], (12, 13)).astype(np.float32)
-    P2 = np.column_stack([np.eye(3) + 0.01 * rng.normal(size=(3, 3)), [-20.0, 3.0, 0.1]])
-    distance = distances_to_known(own)
-    found = np.empty_like(own)
-    _extrapolate_inverse_depth((own, other), P2, DIRECTIONS, distance, 0.05, found)
-    for y, x in np.ndindex(own.shape):
-        candidates = []
-        for (dy, dx), n in zip(DIRECTIONS, distance[:, y, x], strict=True):
-            if n < 1:
-                continue
-            rho = own[y + n * dy, x + n * dx]
-            u, v, w = P2 @ np.array([x, y, 1.0, rho])
-            j, i = int(np.rint(u / w)), int(np.rint(v / w))
-            seen = other[i, j] if 0 <= i < 12 and 0 <= j < 13 else np.nan
-            candidates.append((bool(w <= 0.0 or rho / w > seen + 0.05), n * n * (dy**2 + dx**2), rho))
-        if np.isfinite(own[y, x]):
-            assert found[y, x] == own[y, x]
-        else:
-            nearest = min(c[:2] for c in candidates)
-            assert found[y, x] in [c[2] for c in candidates if c[:2] == nearest]

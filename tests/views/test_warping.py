@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from thesisrecon.camera import Camera
-from thesisrecon.imaging.raster import rasterize, sample_texture
-from thesisrecon.views._warping import DIRECTIONS, STRETCH, fill_holes, forward_map, sample
-from thesisrecon.views.render import Light, Shading, _average_blocks, _shade
+from thesisrecon.imaging.raster import sample_texture
+from thesisrecon.views._warping import DIRECTIONS, fill_holes, forward_map, sample
 
 SIZE = (31, 23)
 
@@ -15,108 +13,6 @@ def forward_warp(image, target, near, **more):
     """Levels and inverse depth of an image seen from elsewhere."""
     source, front = forward_map(target, near, **more)
     return sample(image, source), front
-
-
-def rough(seed, shape=(19, 27)):
-    """A surface with jumps, missing pixels, stretched and folded places."""
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
-    near = 3.0 + np.sin(x / 5.0) + 0.7 * np.cos(y / 4.0)
-    near[5:12, 8:17] += 4.0
-    near += rng.normal(0.0, 0.2, shape)
-    near[rng.random(shape) < 0.06] = np.nan
-    target = np.stack([x + 0.9 * near + 0.03 * y, 1.2 * y + 0.2 * near], axis=-1)
-    return target, near.astype(np.float32)
-
-
-def joined(target, near, a, b, step):
-    if not (0 <= b[0] < near.shape[0] and 0 <= b[1] < near.shape[1]):
-        return False
-    return bool(abs(near[a] - near[b]) <= step and np.abs(target[a] - target[b]).max() <= STRETCH)
-
-
-def pieces(target, near, step):
-    """Every triangle and footprint as an affine map (2, 3) from the picture to the photograph's offsets, and
-    the corner of those; in the order in which they are drawn."""
-    found = []
-    for y, x in np.ndindex(near.shape):
-        if np.isnan(near[y, x]):
-            continue
-        a, b, c, d = (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)
-        inside = y + 1 < near.shape[0] and x + 1 < near.shape[1]
-        corners = [(a, b, c), (d, c, b), (b, d, a), (c, a, d)]
-        held = [
-            inside and joined(target, near, p, q, step) and joined(target, near, p, r, step)
-            for p, q, r in corners
-        ]
-        if held[0] and held[1]:
-            held[2] = held[3] = False
-        found += [("triangle", *corner) for corner, kept in zip(corners, held, strict=True) if kept]
-        around = [
-            joined(target, near, a, (y + v, x + u), step) for v, u in ((0, 1), (0, -1), (1, 0), (-1, 0))
-        ]
-        if not all(around):
-            found.append(("pixel", a, around, None))
-    return found
-
-
-def slope(target, near, a, step, has):
-    values = np.concatenate([target, near[..., None]], axis=2)
-    forward = values[a[0] + step[0], a[1] + step[1]] if has[0] else values[a]
-    backward = values[a[0] - step[0], a[1] - step[1]] if has[1] else values[a]
-    return (forward - backward) / sum(has) if any(has) else None
-
-
-def plain_map(target, near, step):
-    """The plain twin of ``draw_surface``: every piece against all pixels."""
-    height, width = SIZE[1], SIZE[0]
-    gy, gx = np.mgrid[0:height, 0:width].astype(float)
-    source, front = np.full((height, width, 2), np.nan), np.full((height, width), np.nan)
-    for kind, a, second, third in pieces(target, near, step):
-        q = np.stack([gx, gy], axis=-1) - target[a]
-        at = np.array(a[::-1], dtype=float)
-        if kind == "triangle":
-            M = np.stack([target[second] - target[a], target[third] - target[a]], axis=1)
-            rise = np.array([near[second] - near[a], near[third] - near[a]])
-            steps = np.stack([np.subtract(second, a)[::-1], np.subtract(third, a)[::-1]], axis=1)
-        else:
-            across, down = (
-                slope(target, near, a, s, second[i : i + 2]) for s, i in (((0, 1), 0), ((1, 0), 2))
-            )
-            if across is None:
-                across = np.array([1.0, 0, 0]) if down is None else np.array([down[1], -down[0], 0.0])
-            if down is None:
-                down = np.array([-across[1], across[0], 0.0])
-            M, rise = np.stack([across[:2], down[:2]], axis=1), np.array([across[2], down[2]])
-            steps = np.eye(2)
-        if np.linalg.det(M) < 1e-9:
-            continue
-        uv = q @ np.linalg.inv(M).T
-        if kind == "triangle":
-            inside = (uv >= -1e-7).all(axis=-1) & (uv.sum(axis=-1) <= 1.0 + 1e-7)
-        else:
-            inside = (np.abs(uv) <= 0.5 + 1e-7).all(axis=-1)
-        here = near[a] + uv @ rise
-        drawn = inside & ~(front >= here)
-        front[drawn] = here[drawn]
-        places = at + uv @ steps.T
-        source[drawn] = np.clip(places, 0.0, np.array(near.shape[::-1]) - 1.0)[drawn]
-    return source, front
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_compiled_map_is_the_plain_one(seed):
-    target, near = rough(seed)
-    source, front = forward_map(target, near, size=SIZE, step=0.8)
-    plain_source, plain_front = plain_map(target, near, 0.8)
-    assert 0.3 < np.isfinite(front).mean() < 0.95
-    np.testing.assert_allclose(front, plain_front, atol=1e-5)
-    # Where two surfaces are equally near either is right.
-    assert np.mean(np.nan_to_num(np.abs(source - plain_source).max(axis=-1)) > 1e-3) < 0.01
-    for threads in (2, 3, SIZE[1]):
-        again = forward_map(target, near, size=SIZE, step=0.8, threads=threads)
-        np.testing.assert_array_equal(again[0], source)
-        np.testing.assert_array_equal(again[1], front)
 
 
 def test_strips_include_contributions_from_far_above():
@@ -253,62 +149,6 @@ def test_a_single_pixel_and_nothing_at_all():
     rgb, seen = forward_warp(np.full((1, 1, 3), 9.0), np.array([[[2.2, 1.1]]]), near * np.nan, size=(4, 3))
     assert np.isnan(seen).all()
     assert np.isnan(fill_holes(rgb, seen, step=0.0)).all()
-
-
-def unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-20)
-
-
-def shaded(color, points, normals, eye, shading):
-    """The plain twin of ``shade_points``: Lambert's law."""
-    normals, to_eye = unit(normals), unit(eye - points)
-    normals = normals * np.where((normals * to_eye).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    light = np.full_like(color, shading.ambient)
-    for lamp in shading.lights:
-        if lamp.direction is not None:
-            to_lamp = unit(np.tile(np.asarray(lamp.direction), (len(points), 1)))
-        else:
-            to_lamp = unit(np.asarray(lamp.position) - points)
-        cosine = np.maximum((normals * to_lamp).sum(axis=1), 0.0)[:, None]
-        light += cosine * lamp.color
-    return np.asarray(color * light)
-
-
-def test_light_is_that_of_the_formulas():
-    rng = np.random.default_rng(0)
-    color, (points, normals) = rng.uniform(0, 255, (500, 3)), rng.normal(size=(2, 500, 3))
-    normals[:5] = 0.0
-    lamps = (Light(direction=(1.0, 2.0, -3.0), color=(0.5, 0.6, 0.2)), Light(position=(0.3, 0.1, -4.0)))
-    for lights in ((), lamps[:1], lamps):
-        shading = Shading(ambient=0.2, lights=lights)
-        eye = np.array([0.1, -0.2, -3.0])
-        seen = color.astype(np.float32)
-        _shade(seen, points.astype(np.float32), normals.astype(np.float32), eye, shading)
-        np.testing.assert_allclose(seen, shaded(color, points, normals, eye, shading), atol=0.02)
-
-
-@pytest.mark.parametrize("samples", [1, 2, 3])
-def test_blocks_are_means_before_the_background(samples):
-    rng = np.random.default_rng(2)
-    color = rng.uniform(-20, 300, (6 * samples, 8 * samples, 3)).astype(np.float32)
-    drawn = rng.integers(-1, 2, color.shape[:2])
-    behind = np.array([10, 200, 30], dtype=np.float32)
-    out = np.empty((6, 8, 3), dtype=np.uint8)
-    _average_blocks(color, drawn, samples, behind, out)
-    plain = np.where(drawn[..., None] < 0, behind, color).reshape(6, samples, 8, samples, 3).mean(axis=(1, 3))
-    assert np.abs(out - np.clip(np.rint(plain), 0, 255)).max() <= 1
-
-
-def test_values_of_vertices_and_corners_are_interpolated_alike():
-    rng = np.random.default_rng(3)
-    vertices, faces = rng.uniform([-2, -2, 3], [2, 2, 6], (30, 3)), rng.integers(0, 30, (20, 3))
-    K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
-    raster = rasterize(vertices, faces, Camera(K, np.eye(3), np.zeros(3), (64, 48)))
-    values = rng.uniform(size=(30, 4)).astype(np.float32)
-    assert (raster.face >= 0).mean() > 0.2
-    np.testing.assert_array_equal(raster.interpolate(values, faces), raster.interpolate(values[faces]))
-    part = raster[10:20]
-    np.testing.assert_array_equal(part.interpolate(values[faces]), raster.interpolate(values[faces])[10:20])
 
 
 def test_bytes_and_floats_of_a_texture_are_sampled_alike():

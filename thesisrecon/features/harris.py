@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon._numba import FAST, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.imaging.filters import gaussian_taps, smooth
+from thesisrecon.imaging.resampling import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
 

@@ -16,7 +16,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features.harris import CornerMeasure, select_spread
-from thesisrecon.imaging.filters import halve, resample, smooth
+from thesisrecon.imaging.resampling import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
 
 PATCH_SIDE = 8

@@ -12,11 +12,10 @@ from thesisrecon._numba import empty, kernel
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
+from thesisrecon.records import TexturedMesh
 
 _SLACK = 1e-7
 """Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
-_NEAR = 1e-6
-"""Nearest depth that is drawn, relative to the depth of the farthest corner of a face."""
 
 
 @kernel
@@ -168,45 +167,42 @@ class Raster:
         return Raster(self.depth[rows], self.face[rows], self.weights[rows])
 
 
-def rasterize(vertices: F64, faces: I64, camera: Camera, *, threads: int = 1) -> Raster:
+def rasterize(vertices: F64, faces: I64, camera: Camera) -> Raster:
     """Find the face, seen from any side, at the centre of each pixel of a camera without distortion."""
     width, height = camera.size
-    return rasterize_corners(*image_corners(vertices, faces, camera), (height, width), threads=threads)
+    return rasterize_rows(*image_corners(vertices, faces, camera), (0, height), width)
 
 
 def image_corners(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, float]:
     """Image points K (R X + t) (M, 3, 3) of the corners of faces, and the nearest depth that is drawn."""
+    _near = 1e-6  # Nearest depth that is drawn, relative to the depth of the farthest corner of a face
     if not camera.is_pinhole:
         raise ValueError("Rendering needs a camera without distortion: undistort the image first")
     # Vertices that no face uses may not be finite.
     with np.errstate(invalid="ignore"):
         seen = (vertices @ camera.R.T + camera.t) @ (camera.K / camera.K[2, 2]).T
     corners = np.ascontiguousarray(seen[faces])
-    return corners, _NEAR * max(float(np.abs(corners[..., 2]).max(initial=0.0)), 1e-300)
-
-
-def rasterize_corners(corners: F64, near: float, shape: tuple[int, int], *, threads: int = 1) -> Raster:
-    """Find the face at the centre of each pixel from the image points K (R X + t) (M, 3, 3) of corners."""
-    corners = np.ascontiguousarray(corners)
-    raster = _empty_raster(shape)
-    run_in_strips(lambda rows: _draw(corners, near, rows, raster[slice(*rows)]), shape[0], threads)
-    return raster
+    return corners, _near * max(float(np.abs(corners[..., 2]).max(initial=0.0)), 1e-300)
 
 
 def rasterize_rows(corners: F64, near: float, rows: tuple[int, int], width: int) -> Raster:
-    """Return the rows (first, last + 1) of the raster of :func:`rasterize_corners`."""
-    raster = _empty_raster((rows[1] - rows[0], width))
-    _draw(corners, near, rows, raster)
+    """Find the face at the pixels of rows (first, last + 1) from the image points (M, 3, 3) of corners."""
+    shape = (rows[1] - rows[0], width)
+    depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
+    raster = Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
+    _rasterize_rows(np.ascontiguousarray(corners), near, rows, depth, face, raster.weights)
     return raster
 
 
-def _empty_raster(shape: tuple[int, int]) -> Raster:
-    depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
-    return Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
-
-
-def _draw(corners: F64, near: float, rows: tuple[int, int], raster: Raster) -> None:
-    _rasterize_rows(corners, near, rows, raster.depth, raster.face, raster.weights)
+def vertex_normals(mesh: TexturedMesh) -> F64:
+    """Unit vertex normals (N, 3), the area-weighted mean of the face normals."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    total = np.zeros_like(mesh.vertices)
+    for k in range(3):
+        for d in range(3):
+            total[:, d] += np.bincount(mesh.faces[:, k], normal[:, d], len(total))
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
 def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:

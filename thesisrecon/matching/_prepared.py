@@ -17,7 +17,7 @@ import scipy
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.imaging.filters import halve, resample
+from thesisrecon.imaging.resampling import halve, resample
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, Seeds
 
 SIDE = 15

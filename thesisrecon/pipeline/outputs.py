@@ -36,8 +36,7 @@ from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirector
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._mesh import halve_surface
 from thesisrecon.surface._simplification import reduce_faces
-from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.surface.texture_atlas import TextureAtlas, cut_tile
+from thesisrecon.surface.model import SurfaceModel, TextureAtlas, cut_tile
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048

@@ -36,8 +36,7 @@ from thesisrecon.results import RunResult
 from thesisrecon.runtime._run import Batch, stream
 from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
-from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
-from thesisrecon.views.render import render_mesh
+from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, render_mesh, ssim
 
 MAP_BYTES = 2**29
 """Depth maps in memory, those before and those after confirmation; more are read when they are used."""

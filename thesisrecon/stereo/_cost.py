@@ -17,8 +17,6 @@ from thesisrecon.arrays import F32, I16, I32, U8, U16
 
 LEVELS = 4
 """Integer steps of one grey level: resampled images have fractional levels."""
-REACH = 2
-"""Radius of the census window: 5 x 5 pixels, 24 comparisons."""
 ARM = 2
 """Maximal length of a support arm in pixels."""
 CENSUS_BITS = 24
@@ -26,11 +24,6 @@ WEIGHT_SHIFT = 8
 """Weights are in units of 1 / 256."""
 MAX_DISPARITIES = 4096
 """Upper limit of the number of disparities searched."""
-STRIP_MARGIN = 24
-"""Additional rows above and below a strip: pixels farther away hardly change a path cost."""
-MIN_STRIP_ROWS = 32
-ROWS_FOR_NOISE = 24
-"""Number of evenly spaced rows used for the median."""
 
 CostFeatures = tuple[I32, I16, U8]
 """Census transform (H, W), channels (K, H, W) and valid pixels (H, W) of rows of an image."""
@@ -46,14 +39,17 @@ def checked_range(disparity_range: tuple[int, int]) -> tuple[int, int]:
 
 def row_strips(height: int, bytes_per_row: int, memory_bytes: float) -> list[tuple[int, int, int, int]]:
     """Fewest strips (first, last, from, to) of rows that fit the memory; ``from`` and ``to`` have margins."""
+    # Additional rows above and below a strip: pixels farther away hardly change a path cost.
+    strip_margin = 24
+    min_strip_rows = 32
     fitting = int(memory_bytes // max(bytes_per_row, 1))
     if height <= fitting:
         return [(0, height, 0, height)]
-    own = max(fitting - 2 * STRIP_MARGIN, MIN_STRIP_ROWS)
+    own = max(fitting - 2 * strip_margin, min_strip_rows)
     count = -(-height // own)
     edges = [height * k // count for k in range(count + 1)]
     return [
-        (first, last, max(first - STRIP_MARGIN, 0), min(last + STRIP_MARGIN, height))
+        (first, last, max(first - strip_margin, 0), min(last + strip_margin, height))
         for first, last in pairwise(edges)
     ]
 
@@ -91,9 +87,10 @@ def estimate_noise(image: StereoImage) -> float:
     The median absolute response to the difference of two Laplacians, which is insensitive to linear and
     quadratic shading (Immerkaer 1996, with the median instead of the mean because texture is not noise).
     """
+    rows_for_noise = 24  # Number of evenly spaced rows used for the median
     if min(image.valid.shape) < 3:
         return 0.0
-    step = max(image.valid.shape[0] // ROWS_FOR_NOISE, 1)
+    step = max(image.valid.shape[0] // rows_for_noise, 1)
     top = np.arange(0, image.valid.shape[0] - 2, step)
     rows = [image.channels[:, top + k].copy() for k in range(3)]
     mixed = rows[0] - 2 * rows[1] + rows[2]
@@ -121,10 +118,7 @@ def _count_ones(word: np.int32) -> np.uint32:
 
 @kernel
 def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
-    """Convert grey levels (H, W, K), NaN = no pixel, to integer channels (K, H, W) and their sum (H, W).
-
-    ``valid`` (H, W) receives 255 where there is a pixel, else 0.
-    """
+    """Convert grey levels (H, W, K), NaN = no pixel, to integer channels, their sum, and 255 if valid."""
     height, width, n = image.shape
     top = np.float32(255.0 * LEVELS)
     for y in range(height):
@@ -151,19 +145,20 @@ def _compare(centre: I16, other: I16, bits: I32) -> None:
 @kernel
 def census(grey: I16, bits: I32) -> None:
     """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
+    reach = 2  # Radius of the census window: 5 x 5 pixels, 24 comparisons
     height, width = grey.shape
-    padded = empty((2 * REACH + 1, width + 2 * REACH), np.int16)
+    padded = empty((2 * reach + 1, width + 2 * reach), np.int16)
     bits[:] = 0
     for y in range(height):
-        for dy in range(-REACH, REACH + 1):
-            row = padded[dy + REACH]
+        for dy in range(-reach, reach + 1):
+            row = padded[dy + reach]
             source = grey[min(max(y + dy, 0), height - 1)]
-            copy_to(row[REACH : REACH + width], source)
-            row[:REACH] = source[0]
-            row[REACH + width :] = source[width - 1]
-        for dy in range(2 * REACH + 1):
-            for dx in range(2 * REACH + 1):
-                if dx != REACH or dy != REACH:
+            copy_to(row[reach : reach + width], source)
+            row[:reach] = source[0]
+            row[reach + width :] = source[width - 1]
+        for dy in range(2 * reach + 1):
+            for dx in range(2 * reach + 1):
+                if dx != reach or dy != reach:
                     _compare(grey[y], padded[dy, dx : dx + width], bits[y])
 
 
@@ -345,11 +340,7 @@ def cost_volume(
     outside: np.uint8,
     volume: U8,
 ) -> None:
-    """Matching costs (H, D, W) averaged over the support arms ``masks``, unless these are empty.
-
-    A ring buffer holds the horizontal sums of 2 ARM + 1 rows, so only the volume itself is large. Other
-    arguments: see :func:`_row_costs`.
-    """
+    """Matching costs (H, D, W) of :func:`_row_costs`, averaged over support arms unless these are empty."""
     height, n, width = volume.shape
     if masks.shape[1] == 0:
         for y in range(height):
@@ -372,11 +363,3 @@ def cost_volume(
         _shares(counts, y, wide, share)
         for q in range(n):
             _mean_along_column(ring[q], y, wide, share, volume[y, q])
-
-
-@kernel
-def add_squares(a: I16, b: I16, sign: int, out: I32) -> None:
-    """Add (``sign`` 1) or subtract (-1) the squared differences of two rows (W,)."""
-    for x in range(len(out)):
-        apart = np.int32(b[x]) - np.int32(a[x])
-        out[x] = np.int32(out[x] + np.int32(sign) * apart * apart)

@@ -29,20 +29,12 @@ from thesisrecon.optimize.bundle.partial import triangulate_points
 
 Size = tuple[int, int]
 """Width and height in pixels."""
-FOCAL_PER_SIDE = 1.2
-"""Unit of normalised coordinates relative to the longer image side: the focal length of a usual lens."""
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
 MIN_MATCHES = 8
-MIN_SAME_HALF = 0.8
-"""Minimum fraction of matches on corresponding half-lines; half of the wrong matches are there by chance."""
-SAMPLES = 16
-"""Samples along each image side at which distortion is measured."""
 MAX_SHRINK = 1.4
 """Largest reduction of any pixel along any direction; the area is preserved on average."""
 MAX_GROWTH = 6.0
 """Largest number of pixels of the frame relative to the larger image."""
-CROP_MARGIN = 1.0
-"""Margin of the disparity range that limits the crop, as a share of the range of the matches."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +232,9 @@ def _checked_call(xy1: F64, xy2: F64, size1: Size, size2: Size) -> tuple[F64, F6
 
 def _pencil_of_fundamental(F: F64, sizes: tuple[Size, Size]) -> tuple[EpipolarPencil, float]:
     """Unoriented pencil of F (3, 3), and the ratio of the singular values of the normalised F."""
-    units = FOCAL_PER_SIDE * np.array([max(size) for size in sizes], dtype=np.float64)
+    # Unit of normalised coordinates relative to the longer image side: the focal length of a usual lens.
+    focal_per_side = 1.2
+    units = focal_per_side * np.array([max(size) for size in sizes], dtype=np.float64)
     centres = (np.array(sizes, dtype=np.float64) - 1.0) / 2.0
     T = scale_and_shift(units, centres)
     U, s, Vt = np.linalg.svd(T[1].T @ F @ T[0])
@@ -261,9 +255,11 @@ def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -
 
 def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
     """Pencil with the sign of the second view that most matches support."""
+    # Minimum fraction of matches on corresponding half-lines; half of the wrong matches are there by chance.
+    min_same_half = 0.8
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
     share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
-    if max(share, 1.0 - share) < MIN_SAME_HALF:
+    if max(share, 1.0 - share) < min_same_half:
         evidence = f"only {100.0 * max(share, 1.0 - share):.0f} % of {len(xy1)} lie on corresponding halves"
         advice = "the fundamental matrix or the matches are wrong; estimate them again"
         raise StageFailure("matches lie on opposite halves of their epipolar lines", evidence, advice)
@@ -352,14 +348,15 @@ def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
 
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:
     """Samples of the part of an image within the arc: the corners of that polygon, then a grid."""
-    grid = _image_grid(pencil.sizes[side], SAMPLES)
+    samples = 16  # Samples along each image side at which distortion is measured
+    grid = _image_grid(pencil.sizes[side], samples)
     middle, half = 0.5 * (arc[0] + arc[1]), 0.5 * (arc[1] - arc[0])
     # The tolerance keeps the corners that bound the arc despite rounding.
     inside = np.abs(pencil.angles(side, grid, about=middle) - middle) <= half + 1e-9
     rim, enter, leave = pencil.chords(side, np.array(arc))
     met = leave >= enter
     ends = [pencil.pixels(side, rim.foot + t[:, None] * rim.direction)[met] for t in (enter, leave)]
-    corner = [0, SAMPLES - 1, -SAMPLES, -1]
+    corner = [0, samples - 1, -samples, -1]
     corners = grid[corner][inside[corner]]
     return np.concatenate([*ends, corners, grid[inside]])
 
@@ -392,10 +389,12 @@ def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
 
 def common_crop(samples: Sequence[F64], matches: Sequence[F64]) -> tuple[F64, F64]:
     """Least and greatest rectified coordinates (2, 2) that both images see, one row per image."""
+    # Margin of the disparity range that limits the crop, as a share of the range of the matches.
+    crop_margin = 1.0
     low, high = (np.stack([f(xy, axis=0) for xy in samples]) for f in (np.min, np.max))
     low[:, 1], high[:, 1] = low[:, 1].max(), high[:, 1].min()
     if len(matches[0]):
-        near, far = disparity_bounds(matches[0][:, 0] - matches[1][:, 0], margin=CROP_MARGIN)
+        near, far = disparity_bounds(matches[0][:, 0] - matches[1][:, 0], margin=crop_margin)
         least, most = low[:, 0].copy(), high[:, 0].copy()
         low[0, 0], high[0, 0] = max(least[0], least[1] + near), min(most[0], most[1] + far)
         low[1, 0], high[1, 0] = max(least[1], least[0] - far), min(most[1], most[0] - near)

@@ -155,10 +155,7 @@ def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, w
 def _cost_inside(
     squares: U32, start: int, width: int, warp: F64, offsets: F32, samples: F32, variance: float
 ) -> float:
-    """1 - weighted NCC of a window that lies inside the other view, -1 if a pixel of it is unknown.
-
-    The packed pixels of that view begin at ``start``.
-    """
+    """1 - weighted NCC of a window that lies inside the other view, -1 if a pixel of it is unknown."""
     x0, x1, x2 = np.float32(warp[0]), np.float32(warp[1]), np.float32(warp[2])
     y0, y1, y2 = np.float32(warp[3]), np.float32(warp[4]), np.float32(warp[5])
     z1, z2, one, byte = np.float32(warp[6]), np.float32(warp[7]), np.float32(1.0), np.uint32(255)

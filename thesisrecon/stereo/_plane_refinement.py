@@ -9,8 +9,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F32, U8
 from thesisrecon.records import PinholeView
-from thesisrecon.stereo._depth_fusion import InverseDepth, pixel_transfer
-from thesisrecon.stereo._depth_kernels import surface_continuation
+from thesisrecon.stereo._depth_fusion import InverseDepth, pixel_transfer, surface_continuation
 from thesisrecon.stereo._plane_kernels import (
     UNKNOWN,
     PatchViews,
@@ -24,22 +23,12 @@ from thesisrecon.stereo._plane_kernels import (
 
 ALIKE = 0.03
 """Largest relative difference of inverse depths on one surface."""
-SWEEPS = 4
-"""Passes over the image, alternating in direction."""
-FIRST_STEP_PX = 0.5
-"""Perturbation of the first pass; it is halved in every pass."""
 RADIUS, SPACING = 4, 2
 """Radius of the window, and distance of its samples, in pixels."""
-INTENSITY_SCALE = 15.0
-"""Grey level difference to the centre at which the weight of a sample is 1/e."""
 MAX_COST, MAX_CONTINUATION_COST = 0.4, 0.6
 """Largest accepted cost, and that of pixels that are accepted if they continue a surface."""
-CONVERGED_COST = 0.1
-"""Planes up to this cost are not changed."""
 GATE = 3.0
 """Standard deviations within which plane and fused correspondences agree."""
-SIGMA_PX = 0.4
-"""Standard deviation of a position in the neighbours."""
 
 _Search = tuple[PatchViews, PatchWindow]
 
@@ -56,11 +45,12 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
     A pixel is kept if two neighbours have at most ``MAX_COST``, one has at most half of it, or two of the
     fused correspondences ``found`` agree.
     """
+    sweeps = 4  # Passes over the image, alternating in direction
     if not others or not np.isfinite(found.value).any():
         return found
     search = _search_arguments(reference, others)
     planes = _planes(found.value)
-    _sweep(search, planes, _begin_cost(search, planes), SWEEPS)
+    _sweep(search, planes, _begin_cost(search, planes), sweeps)
     rho = planes[..., 0]
     least, support, std = _rate(search, planes, MAX_COST)
     seen = _is_supported(least, support)
@@ -119,6 +109,7 @@ def _continuing_surfaces(search: _Search, planes: F32, seen: B8, least: F32) -> 
 
 def _search_arguments(reference: PinholeView, others: Sequence[PinholeView]) -> _Search:
     """Kernel arguments of a view and its neighbours."""
+    intensity_scale = 15.0  # Grey level difference to the centre at which the weight of a sample is 1/e
     gray = [_gray(view) for view in others]
     squares = [np.empty(one.shape, dtype=np.uint32) for one in gray]
     for one, words in zip(gray, squares, strict=True):
@@ -129,7 +120,7 @@ def _search_arguments(reference: PinholeView, others: Sequence[PinholeView]) -> 
     packed = np.concatenate([words.ravel() for words in squares])
     steps = SPACING * np.arange(-(RADIUS // SPACING), RADIUS // SPACING + 1)
     offsets = np.stack(np.meshgrid(steps, steps)).reshape(2, -1).astype(np.float32)
-    weights = np.exp(-np.arange(256.0) / INTENSITY_SCALE).astype(np.float32)
+    weights = np.exp(-np.arange(256.0) / intensity_scale).astype(np.float32)
     return PatchViews(_gray(reference), packed, layout, H, e), PatchWindow(offsets, weights)
 
 
@@ -148,16 +139,19 @@ def _begin_cost(search: _Search, planes: F32) -> F32:
 
 def _sweep(search: _Search, planes: F32, cost: F32, sweeps: int) -> None:
     """Propagate and perturb planes (H, W, 3) of cost (H, W) in place."""
+    first_step_px = 0.5  # Perturbation of the first pass; it is halved in every pass
+    converged_cost = 0.1  # Planes up to this cost are not changed
     active = np.ones(cost.shape, dtype=np.uint8)
     for k in range(sweeps):
-        sweep_planes(*search, FIRST_STEP_PX * 0.5**k, CONVERGED_COST, k % 2 == 1, planes, cost, active)
+        sweep_planes(*search, first_step_px * 0.5**k, converged_cost, k % 2 == 1, planes, cost, active)
 
 
 def _rate(search: _Search, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
     """Smallest cost, support and standard deviation (H, W) of planes (H, W, 3)."""
+    sigma_px = 0.4  # Standard deviation of a position in the neighbours
     shape = planes.shape[:2]
     least, slope = np.full(shape, UNKNOWN, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     support = np.zeros(shape, dtype=np.uint8)
     rate_planes(*search, planes, max_cost, least, support, slope)
     with np.errstate(divide="ignore"):
-        return least, support, (SIGMA_PX / slope).astype(np.float32)
+        return least, support, (sigma_px / slope).astype(np.float32)

@@ -6,30 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
-from thesisrecon.arrays import B8, F32, I16, U8, U16
+from thesisrecon.arrays import B8, F32, F64, I16, U8, U16
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo._cost import LEVELS, StereoImage, add_squares
+from thesisrecon.stereo._cost import LEVELS, StereoImage
 
 UNREACHED = np.uint16(65535)
-MIN_FACTOR = np.float32(0.05)
-"""Factor of the confidence without texture."""
-MIN_TEXTURED = 20
-"""A region needs one textured pixel per this number of pixels."""
-STEP_PX = np.float32(1.0)
-"""Largest disparity difference of neighbours on one surface."""
-SUBSAMPLING = 5
-"""Row and column step of the pixels used for a median."""
-TEXTURE_RADIUS = 4
-"""Radius of the window in which texture is measured, equal to that of the costs."""
-TEXTURED = np.float32(1.7)
-"""Texture measure that noise does not reach."""
-LOCKING_PX = 0.17
-"""Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities."""
-MIN_NEIGHBOURS = 5
-"""Known neighbours required to fill a pinhole."""
 
 
 @kernel
@@ -116,61 +101,26 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
             right[y, x] = np.float32(first + index_r[x]) if index_r[x] >= 0 else np.float32(np.nan)
 
 
-@kernel
-def check_left_right(left: F32, right: F32, confidence: F32, limits: F32) -> None:
-    """Set disparities to NaN that differ from their partner's by more than ``limits[0]``.
+def check_left_right(left: F32, right: F32, confidence: F32, largest_px: float, least: float) -> None:
+    """Set disparities of the left image to NaN that differ from their partner's, or of low confidence."""
+    width = left.shape[1]
+    partner = np.floor(np.arange(width, dtype=np.float32) - left + np.float32(0.5))
+    # Comparisons with NaN are false.
+    inside = (partner >= 0.0) & (partner < width)
+    at = np.where(inside, partner, 0.0).astype(np.int64)
+    agree = inside & (np.abs(np.take_along_axis(right, at, axis=1) - left) <= largest_px)
+    left[~agree | (confidence < least)] = np.nan
 
-    Also those whose confidence is less than ``limits[1]``.
+
+def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> F32:
+    """Confidence (H, W), 0 where no disparity is known, halved where it was not known before filling.
+
+    It is reduced where ``texture`` of :func:`texture_of` is weak.
     """
-    height, width = left.shape
-    for y in range(height):
-        for x in range(width):
-            if np.isnan(left[y, x]):
-                continue
-            partner = int(np.floor(np.float32(x) - left[y, x] + np.float32(0.5)))
-            if not (0 <= partner < width and abs(right[y, partner] - left[y, x]) <= limits[0]):
-                left[y, x] = np.nan
-            if confidence[y, x] < limits[1]:
-                left[y, x] = np.nan
-
-
-@kernel
-def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> None:
-    """Set the confidence to 0 where no disparity is known; halve it where one was filled in.
-
-    It is reduced where ``texture`` of :func:`texture_of` is weak. ``confirmed`` are the disparities before
-    filling, NaN = unknown; all arrays (H, W).
-    """
-    height, width = confidence.shape
-    for y in range(height):
-        for x in range(width):
-            excess = max(texture[y, x] - np.float32(1.0), np.float32(0.0))
-            share = max(excess / (excess + np.float32(1.0)), MIN_FACTOR)
-            share = share * np.float32(0.5) if np.isnan(confirmed[y, x]) else share
-            confidence[y, x] = np.float32(0.0) if np.isnan(disparity[y, x]) else confidence[y, x] * share
-
-
-@kernel
-def _squared_gradient(channels: I16, radius: int, out: F32) -> None:
-    """Mean of (I(x + 1) - I(x - 1))^2 over channels and a square window, (H, W); zeros outside the image."""
-    n, height, width = channels.shape
-    columns = zeros(width, np.int32)
-    share = np.float32(1.0) / np.float32(n * (2 * radius + 1) ** 2)
-    for y in range(-radius, height):
-        # Running sum: one row enters the window, another leaves it.
-        for row, sign in ((y + radius, 1), (y - radius - 1, -1)):
-            if 0 <= row < height and width > 2:
-                for k in range(n):
-                    line = channels[k, row]
-                    add_squares(line[: width - 2], line[2:], sign, columns[1 : width - 1])
-        if y < 0:
-            continue
-        total = np.int64(0)
-        for x in range(-radius, width):
-            total += columns[x + radius] if x + radius < width else 0
-            total -= columns[x - radius - 1] if x - radius - 1 >= 0 else 0
-            if x >= 0:
-                out[y, x] = np.float32(total) * share
+    excess = np.maximum(texture - np.float32(1.0), np.float32(0.0))
+    share = np.maximum(excess / (excess + np.float32(1.0)), np.float32(0.05))
+    share[np.isnan(confirmed)] *= np.float32(0.5)
+    return np.where(np.isnan(disparity), np.float32(0.0), confidence * share)
 
 
 @kernel
@@ -180,6 +130,7 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
     A region needs one textured pixel, in or next to it, in twenty. Neighbours are connected if their
     disparities differ by at most ``step``.
     """
+    min_textured = 20  # A region needs one textured pixel per this number of pixels
     height, width = disparity.shape
     # Padding with unknown pixels gives every pixel four neighbours; one column serves both sides.
     line = width + 1
@@ -210,41 +161,24 @@ def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: in
                     open_[other] = False
                     queue[n] = other
                     n += 1
-        if n < smallest or MIN_TEXTURED * size < n:
+        if n < smallest or min_textured * size < n:
             for k in range(n):
                 y, x = queue[k] // line - 1, queue[k] % line
                 disparity[y, x] = np.nan
                 flat[queue[k]] = np.nan
 
 
-@kernel
-def fill_pinholes(disparity: F32, least: int, out: F32) -> None:
+def fill_pinholes(disparity: F32, least: int) -> F32:
     """Fill unknown pixels that have ``least`` known ones among 8 neighbours with their median, (H, W)."""
-    height, width = disparity.shape
-    around = empty(8, np.float32)
-    for y in range(height):
-        copy_to(out[y], disparity[y])
-        for x in range(width):
-            if not np.isnan(disparity[y, x]):
-                continue
-            n = 0
-            for b in range(max(y - 1, 0), min(y + 2, height)):
-                for a in range(max(x - 1, 0), min(x + 2, width)):
-                    n += not np.isnan(disparity[b, a])
-            if n < least:
-                continue
-            n = 0
-            for b in range(max(y - 1, 0), min(y + 2, height)):
-                for a in range(max(x - 1, 0), min(x + 2, width)):
-                    value = disparity[b, a]
-                    if not np.isnan(value):
-                        place = n
-                        while place > 0 and around[place - 1] > value:
-                            around[place] = around[place - 1]
-                            place -= 1
-                        around[place] = value
-                        n += 1
-            out[y, x] = np.float32(0.5) * (around[(n - 1) // 2] + around[n // 2])
+    y, x = np.nonzero(np.isnan(disparity))
+    padded = np.pad(disparity, 1, constant_values=np.nan)
+    # Sorted, unknown pixels come last; the pixel itself is one of them.
+    around = np.sort([padded[y + b, x + a] for b in range(3) for a in range(3)], axis=0)
+    known = np.isfinite(around).sum(axis=0)
+    n, out = np.flatnonzero(known >= least), disparity.copy()
+    below, above = (around[place, n] for place in ((known[n] - 1) // 2, known[n] // 2))
+    out[y[n], x[n]] = np.float32(0.5) * (below + above)
+    return out
 
 
 @kernel
@@ -275,24 +209,29 @@ def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32
             out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)
 
 
-QUANTISATION = float(1.0 / np.sqrt(12.0))
-"""Quantisation noise of integer grey levels."""
-
-
 def texture_of(image: StereoImage, noise: float) -> F32:
     """Squared horizontal gradient (H, W) relative to that of ``noise``: 1 = no texture, NaN = no pixel."""
-    out = np.empty(image.valid.shape, np.float32)
-    _squared_gradient(image.channels, TEXTURE_RADIUS, out)
-    out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, QUANTISATION) ** 2)
+    texture_radius = 4  # Radius of the window in which texture is measured, equal to that of the costs
+    quantisation = float(1.0 / np.sqrt(12.0))  # Quantisation noise of integer grey levels
+    squares: F64 = np.zeros(image.valid.shape)
+    if image.valid.shape[1] > 2:
+        step = image.channels[:, :, 2:].astype(np.int32) - image.channels[:, :, :-2]
+        squares[:, 1:-1] = (step * step).mean(axis=0)
+    mean = scipy.ndimage.uniform_filter(squares, 2 * texture_radius + 1, mode="constant")
+    out: F32 = mean.astype(np.float32)
+    out /= np.float32(2.0 * LEVELS**2 * np.hypot(noise, quantisation) ** 2)
     out[image.valid == 0] = np.nan
     return out
 
 
 def disparity_noise(raw: F32, smooth: F32) -> float:
     """Standard deviation of the disparities: median deviation from the smoothed ones, plus pixel locking."""
-    apart = np.abs(raw[::SUBSAMPLING, ::SUBSAMPLING] - smooth[::SUBSAMPLING, ::SUBSAMPLING])
+    subsampling = 5  # Row and column step of the pixels used for a median
+    # Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities.
+    locking_px = 0.17
+    apart = np.abs(raw[::subsampling, ::subsampling] - smooth[::subsampling, ::subsampling])
     known = apart[np.isfinite(apart)]
-    return float(np.hypot(1.4826 * np.median(known), LOCKING_PX)) if len(known) else float("nan")
+    return float(np.hypot(1.4826 * np.median(known), locking_px)) if len(known) else float("nan")
 
 
 def match_both_sides(

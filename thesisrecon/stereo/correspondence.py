@@ -20,18 +20,8 @@ from thesisrecon.stereo.semi_global import SemiGlobalMatching
 
 Shape = tuple[int, ...]
 """Height and width in pixels."""
-STRIP_ROWS = 128
-"""Rows of the reference view that are mapped at a time."""
-ONE_SURFACE_PX = 1.0
-"""Disparity range of four neighbours up to which they are interpolated."""
 MAX_COSTS = 400.0
 """Matching costs per pixel of the reference view; the frames of wide baselines are reduced to that."""
-GAIN_PATCH = 2
-"""Radius of the patches whose brightness is compared."""
-RANGE_MARGIN = 0.25
-"""Widening of the disparity range of the sparse points at both ends, as a share of the range."""
-MIN_SIGMA_PX = 0.2
-"""Lower limit of the standard deviation of disparities, which grows with decreasing confidence."""
 
 
 @dataclass(frozen=True)
@@ -52,21 +42,7 @@ class PairMatching:
     def correspond(
         self, reference: PinholeView, other: PinholeView, xy1: F64, xy2: F64, *, shapes: tuple[Shape, Shape]
     ) -> Correspondence:
-        """Compute the positions of the pixels of ``reference`` in ``other``.
-
-        Parameters
-        ----------
-        reference, other : PinholeView
-            Undistorted views with their cameras.
-        xy1, xy2 : ndarray (N, 2)
-            Projections of sparse points in pixels, for the disparity range and the brightness gain.
-        shapes : tuple of (height, width)
-            Image shapes in which the correspondence is returned.
-
-        Returns
-        -------
-        Correspondence
-        """
+        """Compute the positions of the pixels of ``reference`` in ``other``."""
         own = reference.seen.shape, other.seen.shape
         frame = rectify_cameras(reference.P, other.P, own[0][::-1], own[1][::-1], xy1=xy1, xy2=xy2)
         wanted = _searched_range(frame, xy1, xy2)
@@ -96,9 +72,11 @@ class PairMatching:
         self, frame: Rectification, found: DisparityMap, own: tuple[Shape, Shape], wanted: tuple[Shape, Shape]
     ) -> Correspondence:
         """Correspondence at ``wanted`` shapes from disparities of the frame of images of ``own`` shapes."""
+        # Lower limit of the standard deviation of disparities, which grows with decreasing confidence.
+        min_sigma_px = 0.2
         xy = np.full((*wanted[0], 2), np.nan, dtype=np.float32)
         sigma = np.full(wanted[0], np.nan, dtype=np.float32)
-        std = max(wanted[1]) / max(own[1]) * float(np.fmax(found.sigma_px, MIN_SIGMA_PX))
+        std = max(wanted[1]) / max(own[1]) * float(np.fmax(found.sigma_px, min_sigma_px))
         for rows, pixels in _strips(wanted[0]):
             places = frame.rectified_from_original(0, _resized(pixels, wanted[0], own[0]))
             d, sure = _sample_disparity(found, places)
@@ -117,8 +95,9 @@ class PairMatching:
 
 def _strips(shape: Shape) -> Iterator[tuple[slice, F64]]:
     """Rows of an image a few at a time, and the positions (N, 2) of their pixels."""
-    for first in range(0, shape[0], STRIP_ROWS):
-        rows = slice(first, min(first + STRIP_ROWS, shape[0]))
+    strip_rows = 128  # Rows of the reference view that are mapped at a time
+    for first in range(0, shape[0], strip_rows):
+        rows = slice(first, min(first + strip_rows, shape[0]))
         y, x = np.mgrid[rows, : shape[1]]
         yield rows, np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float64)
 
@@ -130,7 +109,9 @@ def _resized(xy: F64, shape: Shape, wanted: Shape) -> F64:
 
 def _searched_range(frame: Rectification, xy1: F64, xy2: F64) -> tuple[int, int]:
     """Disparity range of matches within the frame width; ``StageFailure`` if it is empty or too large."""
-    first, last = disparity_range(frame, xy1, xy2, margin=RANGE_MARGIN)
+    # Widening of the disparity range of the sparse points at both ends, as a share of the range.
+    range_margin = 0.25
+    first, last = disparity_range(frame, xy1, xy2, margin=range_margin)
     first, last = max(first, 1 - frame.size[0]), min(last, frame.size[0] - 1)
     if not 0 <= last - first < MAX_DISPARITIES:
         evidence = f"it is {first} to {last} px"
@@ -141,13 +122,14 @@ def _searched_range(frame: Rectification, xy1: F64, xy2: F64) -> tuple[int, int]
 
 def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
     """Disparity and confidence (N,) at positions (N, 2) of the rectified frame, NaN where unknown."""
+    one_surface_px = 1.0  # Disparity range of four neighbours up to which they are interpolated
     height, width = found.disparity.shape
     inside: B8 = np.asarray(np.isfinite(places).all(axis=1))
     x, y = np.clip(np.where(inside[:, None], places, 0.0), 0.0, (width - 1.0, height - 1.0)).T
     between, spread = (values[:, 0] for values in bilinear_samples(found.disparity[..., None], x, y))
     nearest = np.rint(y).astype(np.int64), np.rint(x).astype(np.int64)
     # A comparison with NaN is false: with an unknown pixel among the four the nearest is used.
-    d = np.where(spread <= ONE_SURFACE_PX, between, found.disparity[nearest])
+    d = np.where(spread <= one_surface_px, between, found.disparity[nearest])
     d = np.where(inside, d, np.nan)
     return d, np.where(np.isfinite(d), found.confidence[nearest], 0.0)
 
@@ -166,9 +148,10 @@ def _brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
 
 def _patch_means(rgb: U8, xy: F64) -> F64:
     """Mean colours (N, 3) around pixels (N, 2), NaN where the patch leaves the image."""
+    gain_patch = 2  # Radius of the patches whose brightness is compared
     height, width = rgb.shape[:2]
     at = np.rint(xy).astype(np.int64)
-    reach = GAIN_PATCH
+    reach = gain_patch
     inside = np.all((at >= reach) & (at < np.array([width, height]) - reach), axis=1)
     at = np.where(inside[:, None], at, reach)
     dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
@@ -193,21 +176,7 @@ class RectifiedPair:
     right: DisparityMap  #: of the second image, of the same sign
 
     def correspondences(self, side: int, size: tuple[int, int]) -> F32:
-        """Compute the positions of the pixels of one image in the other.
-
-        Parameters
-        ----------
-        side : {0, 1}
-            The image.
-        size : tuple of int
-            (width, height) of that image.
-
-        Returns
-        -------
-        ndarray (H, W, 2) float32
-            Pixels of the other image, NaN outside the frame; occluded pixels get the background disparity
-            (:meth:`DisparityMap.filled`).
-        """
+        """Compute the positions of the pixels of one image in the other."""
         found = self.right if side else self.left
         complete = replace(found, disparity=found.filled())
         places = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)

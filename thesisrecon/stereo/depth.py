@@ -10,25 +10,26 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from thesisrecon.arrays import B8, F32, F64
+from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.imaging.on_demand import MappingOnDemand
 from thesisrecon.imaging.resampling import pinhole_frame, pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo._depth_fusion import InverseDepth, fuse_neighbours, link_sequence, pixel_transfer
-from thesisrecon.stereo._depth_kernels import count_agreement, splat_depths, surface_continuation
-from thesisrecon.stereo._frustum_samples import frustum_samples, project_inside
+from thesisrecon.stereo._depth_fusion import (
+    InverseDepth,
+    count_agreement,
+    fuse_neighbours,
+    link_sequence,
+    pixel_transfer,
+    splat_depths,
+    surface_continuation,
+)
 from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
+from thesisrecon.stereo._postprocessing import remove_speckles
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
-BEST_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG = 10.0, 3.0, 10.0
-"""Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones."""
-MIN_ANGLE_DEG, MIN_POINTS = 1.0, 12
-"""A neighbour has at least ``MIN_POINTS`` common points with triangulation angles of ``MIN_ANGLE_DEG``."""
-MIN_SIDE = 64
-"""Lower limit of the settings for the longest side of depth maps and of images for matching, in pixels."""
 VIEW_BYTES = 2**29
 """Memory for undistorted views at each of the two sizes; others are computed again when they are used."""
 
@@ -98,47 +99,41 @@ def _select_neighbours(
 
 def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other: int) -> F64 | None:
     """Weights (N,) of the points that ``other`` sees too, None if it cannot be a neighbour."""
+    # Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones.
+    best_deg, sigma_below_deg, sigma_above_deg = 10.0, 3.0, 10.0
+    # A neighbour has this many common points with at least this triangulation angle.
+    min_angle_deg, min_points = 1.0, 12
     common = points.seen[other]
-    if int(common.sum()) < MIN_POINTS:
+    if int(common.sum()) < min_points:
         return None
     a, b = (points.X[common] - centres[i] for i in (view, other))
-    sine = np.linalg.norm(np.cross(a, b), axis=1)
-    angle = np.degrees(np.arctan2(sine, np.sum(a * b, axis=1)))
-    if int(np.sum(angle >= MIN_ANGLE_DEG)) < MIN_POINTS:
+    angle = _angles_deg(a, b)
+    if int(np.sum(angle >= min_angle_deg)) < min_points:
         return None
-    off = angle - BEST_DEG
-    width = np.where(off < 0.0, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG)
+    off = angle - best_deg
+    width = np.where(off < 0.0, sigma_below_deg, sigma_above_deg)
     weights = np.zeros(len(points.X))
-    weights[common] = np.where(angle >= MIN_ANGLE_DEG, np.exp(-0.5 * (off / width) ** 2), 0.0)
+    weights[common] = np.where(angle >= min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
     return weights
 
 
-SURE = 3.0
-"""Standard deviations by which an inverse depth must exceed 0, that of infinity."""
-REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS = 1.5, 0.01, 2.0
-"""Limits of the reprojection error, and of the depth difference: a share plus standard deviations."""
 MIN_VIEWS = 1
 """Views that must confirm a pixel."""
-MIN_REGION_RATIO, STEP = 1e-4, 0.02
-"""Connected regions below this share of the pixels are removed; relative depth step in a region."""
-RADIUS, GATE = 5, 2.0
-"""Window of the surface continuation, and distance from its plane in standard deviations."""
-MAX_SOURCES = 4
-"""Largest number of views from which a depth map is completed."""
-GAP_PX, SWEEPS = 1, 2
-"""Size of the gaps between projected pixels that completion fills, and number of passes of its search."""
 
 
 def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
-    """Keep the depths that the depth maps of other views confirm.
+    """Keep the depths that the depth maps of other views confirm (Merrell et al., ICCV 2007).
 
-    A pixel is projected into another view, and the depth there is projected back (Merrell et al., ICCV 2007;
-    fusion in COLMAP). It is confirmed if both agree and contradicted if the other view sees through it. It is
-    kept if at least ``MIN_VIEWS`` views and more than contradict it confirm it, or if none contradicts it and
-    it continues the surface of confirmed pixels. ``views`` becomes the number of confirming views.
+    A pixel is projected into another view, and the depth there is projected back. It is confirmed if both
+    agree and contradicted if the other view sees through it. It is kept if ``MIN_VIEWS`` views and more than
+    contradict it confirm it, or if none contradicts it and it continues the surface of confirmed pixels.
     """
+    # Limits of the reprojection error, and of the depth difference: a share plus standard deviations.
+    reprojection_px, max_relative, max_sigmas = 1.5, 0.01, 2.0
+    # Window of the surface continuation, and distance from its plane in standard deviations.
+    radius, gate = 5, 2.0
     agree, contradict, joins = np.zeros((3, *depth_map.depth.shape), dtype=np.uint8)
-    limits = np.array([REPROJECTION_PX, MAX_RELATIVE, MAX_SIGMAS])
+    limits = np.array([reprojection_px, max_relative, max_sigmas])
     own = depth_map.depth, depth_map.std
     for other in others:
         to, back = _transfer(depth_map.P, other.P), _transfer(other.P, depth_map.P)
@@ -147,14 +142,17 @@ def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap
     with np.errstate(divide="ignore"):
         rho = (1.0 / depth_map.depth).astype(np.float32)
     std = depth_map.std * rho * rho
-    surface_continuation(rho, std, keep.astype(np.uint8), RADIUS, ALIKE, GATE, joins)
+    surface_continuation(rho, std, keep.astype(np.uint8), radius, ALIKE, gate, joins)
     keep |= (contradict == 0) & (joins > 0)
     return _without_small_regions(keep_depths(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
 
 def _without_small_regions(depth_map: DepthMap) -> DepthMap:
-    least = MIN_REGION_RATIO * depth_map.depth.size
-    return keep_depths(depth_map, _region_sizes(depth_map.depth, STEP) >= least)
+    """Remove connected regions of less than 1e-4 of the pixels; depths in a region differ by at most 2 %."""
+    log = np.log(depth_map.depth)
+    least = int(np.ceil(1e-4 * log.size))
+    remove_speckles(log, np.ones(log.shape, dtype=bool), np.float32(0.02), least)
+    return keep_depths(depth_map, np.isfinite(log))
 
 
 def _transfer(P: F64, P_other: F64) -> F64:
@@ -162,37 +160,8 @@ def _transfer(P: F64, P_other: F64) -> F64:
     return np.column_stack(pixel_transfer(P, P_other))
 
 
-def _region_sizes(depth: F32, step: float) -> F64:
-    """(H, W) pixels of each pixel's region of depths that differ by at most the share ``step``, 0 if none."""
-    number = np.arange(depth.size).reshape(depth.shape)
-    log = np.log(depth)
-    pairs = []
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        # A comparison with NaN is false.
-        joined = np.abs(log[a] - log[b]) <= step
-        pairs.append(np.stack([number[a][joined], number[b][joined]]))
-    row, column = np.concatenate(pairs, axis=1)
-    edges = np.ones(len(row), dtype=bool)
-    graph = scipy.sparse.coo_matrix((edges, (row, column)), shape=(depth.size, depth.size))
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    sizes = np.bincount(label)[label].reshape(depth.shape)
-    return np.where(np.isfinite(depth), sizes, 0.0)
-
-
 def keep_depths(depth_map: DepthMap, keep: B8) -> DepthMap:
-    """Return the depth map with unknown depths outside a mask.
-
-    Parameters
-    ----------
-    depth_map : DepthMap
-        Depths of a view.
-    keep : ndarray (H, W) of bool
-        The pixels whose depths remain.
-
-    Returns
-    -------
-    DepthMap
-    """
+    """Return the depth map with unknown depths outside a mask."""
     depth, std = (np.where(keep, part, np.float32(np.nan)) for part in (depth_map.depth, depth_map.std))
     return replace(depth_map, depth=depth, std=std, views=np.where(keep, depth_map.views, np.uint8(0)))
 
@@ -204,6 +173,9 @@ def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[i
     the plane search against the ``MAX_SOURCES`` images that contribute most pixels. Accepted planes (by the
     rule of :func:`refine_depths`) are measured depths: nothing is interpolated.
     """
+    max_sources = 4  # Largest number of views from which a depth map is completed
+    # Size of the gaps between projected pixels that completion fills, and number of passes of its search.
+    gap_px, sweeps = 1, 2
     unknown = np.isnan(own.depth) & views[own.view].seen
     offers = []
     for other in others:
@@ -212,20 +184,88 @@ def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[i
         offers.append(np.where(unknown, offer, np.float32(np.nan)))
     worth = [int(np.isfinite(offer).sum()) for offer in offers]
     order = sorted(range(len(offers)), key=lambda k: (-worth[k], k))
-    best = [k for k in order if worth[k]][:MAX_SOURCES]
+    best = [k for k in order if worth[k]][:max_sources]
     if not best:
         return own
     nearest = np.fmin.reduce([offers[k] for k in best])
-    wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), GAP_PX)
+    wanted = unknown & scipy.ndimage.binary_dilation(np.isfinite(nearest), np.ones((3, 3)), gap_px)
     rho = (np.float32(1.0) / np.where(unknown, nearest, own.depth)).astype(np.float32)
     images = [views[others[k].view] for k in best]
-    found, std, support = search_planes(views[own.view], images, rho, wanted=wanted, sweeps=SWEEPS)
+    found, std, support = search_planes(views[own.view], images, rho, wanted=wanted, sweeps=sweeps)
     new = np.isfinite(found)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = np.float32(1.0) / found
         std = np.where(new, std * depth * depth, own.std)
     completed = np.where(new, support, own.views).astype(np.uint8)
     return replace(own, depth=np.where(new, depth, own.depth), std=std, views=completed)
+
+
+def frustum_samples(
+    views: Mapping[int, PinholeView], n_views: int, depth_range: F64 | None = None
+) -> tuple[F64, B8]:
+    """Sample the common frusta; return points (N, 3) and whether each of ``n_views`` shows them (V, N).
+
+    The points lie on the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2), and
+    are shown by the views whose image contains them. Without a range, another view shows a point only at a
+    triangulation angle from 0.5 to 40 degrees: below, depth is uncertain; above, windows look different.
+    Points shown only by their own view are left out.
+    """
+    min_angle_deg, max_angle_deg = 0.5, 40.0
+    # Depths between given limits, evenly in inverse depth; ratio of successive depths without limits.
+    depths, ratio = 12, 1.25
+    centres = {i: dehomogenize(camera_centre(view.P)) for i, view in views.items()}
+    points, shown = [np.zeros((0, 3))], [np.zeros((n_views, 0), dtype=bool)]
+    for i, view in views.items():
+        away = [float(np.linalg.norm(centres[j] - centres[i])) for j in views if j != i]
+        away = [distance for distance in away if distance > 0.0]
+        if depth_range is not None:
+            first, last = 1.0 / depth_range[i]
+            depth = 1.0 / np.linspace(first, last, depths)
+        elif away:
+            nearest = 0.5 * min(away) / np.tan(np.radians(max_angle_deg))
+            farthest = max(away) / np.tan(np.radians(min_angle_deg))
+            depth = np.geomspace(nearest, farthest, 2 + int(np.log(farthest / nearest) / np.log(ratio)))
+        else:
+            continue
+        X = _on_rays(view, centres[i], depth)
+        seen = np.zeros((n_views, len(X)), dtype=bool)
+        for j in views:
+            if j != i:
+                seen[j] = project_inside(views[j], X)[1]
+                if depth_range is None:
+                    angle = _angles_deg(X - centres[i], X - centres[j])
+                    seen[j] &= (angle >= min_angle_deg) & (angle <= max_angle_deg)
+        kept = seen.any(axis=0)
+        seen[i] = True
+        points.append(X[kept])
+        shown.append(seen[:, kept])
+    return np.concatenate(points), np.concatenate(shown, axis=1)
+
+
+def _on_rays(view: PinholeView, centre: F64, depth: F64) -> F64:
+    """Points (N, 3) on the rays of a grid of pixels, at each depth."""
+    grid = (8, 6)  # Samples along the width and the height of an image
+    size = np.array(view.seen.shape[::-1])
+    x, y = (np.linspace(0.02, 0.98, n) * (side - 1.0) for n, side in zip(grid, size, strict=True))
+    xh = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.ones(grid[0] * grid[1])])
+    # The third row of P has unit norm: the rays have depth 1.
+    rays = np.linalg.solve(view.P[:, :3], xh).T
+    return np.asarray((centre + depth[:, None, None] * rays).reshape(-1, 3))
+
+
+def project_inside(view: PinholeView, X: F64) -> tuple[F64, B8]:
+    """Pixels (N, 2) of points in a view, and whether they are in front of it and inside the image."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = project(view.P, X)
+    size = np.array(view.seen.shape[::-1])
+    inside = np.all((xy >= 0.0) & (xy <= size - 1.0), axis=1)
+    return xy, np.asarray((X @ view.P[2, :3] + view.P[2, 3] > 0.0) & inside)
+
+
+def _angles_deg(a: F64, b: F64) -> F64:
+    """Angles (N,) between vectors (N, 3)."""
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, np.sum(a * b, axis=1))))
 
 
 @dataclass(frozen=True)
@@ -238,17 +278,7 @@ class MultiViewScene:
     matched: Mapping[int, PinholeView] = field(default_factory=dict)  #: in the size used for stereo matching
 
     def subset(self, numbers: Collection[int]) -> MultiViewScene:
-        """Restrict the scene to some views, which reduces the data sent to a worker.
-
-        Parameters
-        ----------
-        numbers : collection of int
-            Views, e.g. those of :meth:`MultiViewStereo.required_views`.
-
-        Returns
-        -------
-        MultiViewScene
-        """
+        """Restrict the scene to some views, which reduces the data sent to a worker."""
         views, matched = (
             {i: given[i] for i in given if i in numbers} for given in (self.views, self.matched)
         )
@@ -280,13 +310,14 @@ class MultiViewStereo:
     min_comparison_views = 12
 
     def __post_init__(self) -> None:
+        min_side = 64
         if self.sequence_links < 0:
             raise ValueError(f"sequence_links must not be negative; got {self.sequence_links}")
         if self.max_neighbours < 1:
             raise ValueError(f"max_neighbours must be at least 1; got {self.max_neighbours}")
-        if min(self.max_side, self.match_side) < MIN_SIDE:
+        if min(self.max_side, self.match_side) < min_side:
             sides = f"{self.max_side} and {self.match_side}"
-            raise ValueError(f"max_side and match_side must be at least {MIN_SIDE} px; got {sides}")
+            raise ValueError(f"max_side and match_side must be at least {min_side} px; got {sides}")
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """See `thesisrecon.config.DepthEstimator.match_rectified`."""
@@ -384,8 +415,9 @@ class MultiViewStereo:
 
 def _depth_map(view: PinholeView, found: InverseDepth, keep: B8) -> DepthMap:
     """Convert inverse depths to depths; those not kept or not significantly above 0 are unknown."""
+    sure = 3.0  # Standard deviations by which an inverse depth must exceed 0, that of infinity
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = (found.value > SURE * found.std) & keep
+        known = (found.value > sure * found.std) & keep
         depth = np.where(known, 1.0 / found.value, np.nan).astype(np.float32)
         std = np.where(known, found.std * depth * depth, np.nan).astype(np.float32)
     return DepthMap(view.view, view.P, depth, std, np.where(known, found.views, 0).astype(np.uint8))

@@ -18,16 +18,20 @@ from thesisrecon.stereo._epipolar_pair import (
     pair_of_cameras,
     pair_of_fundamental,
 )
-from thesisrecon.stereo._planar import common_orientation, hartley, loop_zhang, minimum_distortion
-from thesisrecon.stereo._polar import PolarRectification, polar
-from thesisrecon.stereo._rectification_quality import RectificationQuality, matches_in_frame, measure_quality
+from thesisrecon.stereo._frames import (
+    PolarRectification,
+    common_orientation,
+    disparity_gradients,
+    hartley,
+    loop_zhang,
+    matches_in_frame,
+    minimum_distortion,
+    polar,
+    singular_values,
+)
 
-MAX_TURN_DEG, MAX_ASPECT = 5.0, 0.1
-"""Limits of the midline angle's deviation from 90 degrees, and of the change of the aspect ratio."""
 BENDING = 0.03
 """Penalty of polar frames, which bend straight lines."""
-SIZE_WEIGHT = 0.05
-"""Weight of the log of the relative frame size, which costs time."""
 
 Method = Callable[[EpipolarPair], Rectification]
 PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)
@@ -38,40 +42,19 @@ METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar
 
 @dataclass(frozen=True)
 class RectifiedImages:
-    """Two images whose rows correspond: x_right = x_left - d with disparities d >= 0.
+    """Two images whose rows correspond: x_right = x_left - d with disparities d >= 0."""
 
-    Parameters
-    ----------
-    left, right : ndarray (H, W, 3) float32
-        Rectified images, NaN outside the originals.
-    max_disparity_px : float
-        Largest disparity of the matches, with a margin.
-    frame, shift : Rectification, int
-        Maps between the images and the rectified frame, and the columns by which the right image was moved
-        to the right or, if negative, the left one.
-    """
-
-    left: F32
+    left: F32  #: (H, W, 3) NaN outside the originals, as is ``right``
     right: F32
-    max_disparity_px: float
-    frame: Rectification
-    shift: int
+    max_disparity_px: float  #: largest disparity of the matches, with a margin
+    frame: Rectification  #: maps between the images and the rectified frame
+    shift: int  #: columns by which the right image was moved to the right or, if negative, the left one
 
     @classmethod
     def of(
         cls, frame: Rectification, images: tuple[U8 | F32, U8 | F32], disparities: tuple[int, int]
     ) -> RectifiedImages:
-        """Resample two images; one moves to the right by whole columns so that disparities begin at 0.
-
-        Parameters
-        ----------
-        frame, images, disparities : Rectification, tuple of ndarray (H, W, 3), tuple of int
-            The maps, the images, and the first and last disparity.
-
-        Returns
-        -------
-        RectifiedImages
-        """
+        """Resample two images; one moves to the right by whole columns so that disparities begin at 0."""
         shift, (width, height) = disparities[0], frame.size
         moved = np.full((2, height, width + max(-shift, 0), 3), np.nan, dtype=np.float32)
         for side, image in enumerate(images):
@@ -83,34 +66,12 @@ class RectifiedImages:
         return cls(moved[0], moved[1], float(disparities[1] - shift), frame, shift)
 
     def rectified_from_original(self, side: int, xy: F64) -> F64:
-        """Map pixels of an image (side 0 or 1) to the rectified one.
-
-        Parameters
-        ----------
-        side, xy : int, ndarray (N, 2)
-            Image and pixels.
-
-        Returns
-        -------
-        ndarray (N, 2)
-            NaN beyond the line that is sent to infinity.
-        """
+        """Map pixels of an image (side 0 or 1) to the rectified one."""
         moved = self.frame.rectified_from_original(side, xy, within=False)
         return np.asarray(moved + np.array([_moved_by(side, self.shift), 0]))
 
     def original_from_rectified(self, side: int, xy: F64) -> F64:
-        """Map pixels of a rectified image (side 0 or 1) to the original one.
-
-        Parameters
-        ----------
-        side, xy : int, ndarray (N, 2)
-            Image and pixels.
-
-        Returns
-        -------
-        ndarray (N, 2)
-            NaN beyond the epipole.
-        """
+        """Map pixels of a rectified image (side 0 or 1) to the original one."""
         places = np.asarray(xy - np.array([_moved_by(side, self.shift), 0]))
         return self.frame.original_from_rectified(side, places, within=False)
 
@@ -120,22 +81,80 @@ def _moved_by(side: int, shift: int) -> int:
     return max(shift if side else -shift, 0)
 
 
+@dataclass(frozen=True)
+class RectificationQuality:
+    """Distortion measures of a rectified pair; pairs of numbers refer to both images."""
+
+    orthogonality_deg: tuple[float, float]  #: angle of the mapped image midlines
+    aspect: tuple[float, float]  #: ratio of their lengths relative to the original
+    size_ratio: float  #: pixels of the frame relative to the larger image
+    min_scale: float  #: least local scale along any direction
+    stretch: float  #: exp of the standard deviation of the log singular values, 1 for similarities
+    disparity_slope: float  #: RMS gradient of the fitted disparities, NaN with fewer than 3 matches
+
+    @property
+    def distortion(self) -> float:
+        """Root of the sum of squares of ``log stretch`` and half the ``disparity_slope``."""
+        slope = self.disparity_slope if np.isfinite(self.disparity_slope) else 0.0
+        return float(np.hypot(np.log(self.stretch), 0.5 * slope))
+
+
+def measure_quality(rectification: Rectification, pair: EpipolarPair) -> RectificationQuality:
+    """Measure the distortion of a rectification over the common field of view of a pair."""
+    values, midlines = [], []
+    for side, samples in enumerate(pair.regions):
+        inside = np.isfinite(rectification.rectified_from_original(side, samples)).all(axis=1)
+        J = jacobians(rectification, side, samples[inside])
+        values.append(singular_values(J[np.isfinite(J).all(axis=(1, 2))]))
+        midlines.append(_midlines(rectification, side, pair.pencil.sizes[side]))
+    found = np.concatenate(values)
+    found = found if len(found) else np.full((1, 2), np.nan)
+    angles, aspects = zip(*midlines, strict=True)
+    width, height = rectification.size
+    slope = float("nan")
+    left, right = matches_in_frame(rectification, pair.matches)
+    if len(left) >= 3:
+        slope = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
+    return RectificationQuality(
+        orthogonality_deg=angles,
+        aspect=aspects,
+        size_ratio=width * height / max(w * h for w, h in pair.pencil.sizes),
+        min_scale=float(found[:, 1].min()),
+        stretch=float(np.exp(np.std(np.log(np.maximum(found, 1e-12))))),
+        disparity_slope=slope,
+    )
+
+
+def jacobians(rectification: Rectification, side: int, xy: F64) -> F64:
+    """Numerical derivatives (N, 2, 2) of the map from pixels (N, 2) of an image to the frame."""
+    step_px = 0.01  # Half step of numerical derivatives
+    columns = []
+    for axis in np.eye(2):
+        ahead = rectification.rectified_from_original(side, xy + step_px * axis, within=False)
+        step = ahead - rectification.rectified_from_original(side, xy - step_px * axis, within=False)
+        # A full circle of half-lines has a cut, across which neighbours are far apart.
+        step[np.abs(step[:, 1]) > 0.5 * rectification.size[1]] = np.nan
+        columns.append(step / (2.0 * step_px))
+    return np.stack(columns, axis=-1)
+
+
+def _midlines(rectification: Rectification, side: int, size: Size) -> tuple[float, float]:
+    """Angle in degrees of the mapped midlines, and the ratio of their lengths relative to the original."""
+    w, h = size[0] - 1.0, size[1] - 1.0
+    ends = np.array([[0.0, h / 2.0], [w, h / 2.0], [w / 2.0, 0.0], [w / 2.0, h]])
+    a, b, c, d = rectification.rectified_from_original(side, ends, within=False)
+    across, down = b - a, d - c
+    lengths = float(np.hypot(*across)), float(np.hypot(*down))
+    with np.errstate(invalid="ignore"):
+        angle = float(np.degrees(np.arccos(np.clip(across @ down / (lengths[0] * lengths[1]), -1.0, 1.0))))
+    return angle, lengths[0] / lengths[1] * h / w
+
+
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
     """Return the rectification of least distortion among several methods.
 
     Those within the angle and aspect limits take precedence; methods that fail are skipped. If all fail, the
     ``StageFailure`` of the last is raised.
-
-    Parameters
-    ----------
-    pair : EpipolarPair
-        The prepared pair.
-    methods : sequence of callable
-        Methods to choose from.
-
-    Returns
-    -------
-    Rectification
     """
     best: Rectification | None = None
     least, failure = (True, np.inf), StageFailure(Notice("no-rectification-method"))
@@ -154,86 +173,35 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
 
 
 def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, float]:
+    # Limits of the midline angle's deviation from 90 degrees, and of the change of the aspect ratio.
+    max_turn_deg, max_aspect = 5.0, 0.1
+    size_weight = 0.05  # Weight of the log of the relative frame size, which costs time
     # A midline through the epipole of a polar frame has no angle.
     turned = max((abs(a - 90.0) for a in quality.orthogonality_deg if np.isfinite(a)), default=0.0)
     aspect = max((abs(a - 1.0) for a in quality.aspect if np.isfinite(a)), default=0.0)
     bent = BENDING if isinstance(found, PolarRectification) else 0.0
-    cost = quality.distortion + bent + SIZE_WEIGHT * np.log(quality.size_ratio)
-    return turned > MAX_TURN_DEG or aspect > MAX_ASPECT, float(cost)
+    cost = quality.distortion + bent + size_weight * np.log(quality.size_ratio)
+    return turned > max_turn_deg or aspect > max_aspect, float(cost)
 
 
 def rectify_pair(
     F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, methods: Sequence[Method] = METHODS
 ) -> Rectification:
-    """Rectify two images with known fundamental matrix.
-
-    The direction of larger disparities for nearer points is determined with typical focal lengths.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, x2' F x1 = 0.
-    xy1, xy2 : ndarray (N >= 8, 2)
-        Inlier matches in pixels.
-    size1, size2 : tuple of int
-        (width, height) in pixels.
-    methods : sequence of callable
-        Methods to choose from.
-
-    Returns
-    -------
-    Rectification
-
-    Raises
-    ------
-    ValueError
-        If an array has the wrong shape or an image is too small.
-    StageFailure
-        If the pair has no parallax, too few or contradictory matches, or, for planar methods, an epipole
-        inside an image.
-    """
+    """Rectify two images with known fundamental matrix."""
     return rectify(pair_of_fundamental(F, xy1, xy2, size1, size2), methods)
 
 
 def rectify_cameras(
     P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
 ) -> Rectification:
-    """Rectify two undistorted images with known metric cameras.
-
-    Parameters
-    ----------
-    P1, P2 : ndarray (3, 4)
-        Cameras P = K [R t] with P[2] X > 0 for points in front.
-    size1, size2 : tuple of int
-        (width, height) in pixels.
-    xy1, xy2 : ndarray (N, 2), optional
-        Matches in pixels, by which the frame is cropped to the common field of view.
-
-    Returns
-    -------
-    Rectification
-    """
+    """Rectify two undistorted images with known metric cameras."""
     return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2))
 
 
 def disparity_range(
     rectification: Rectification, xy1: F64, xy2: F64, *, margin: float = 0.15
 ) -> tuple[int, int]:
-    """Return the first and last disparity to search from matches; ``StageFailure`` if none is in the frame.
-
-    Parameters
-    ----------
-    rectification : Rectification
-        The maps.
-    xy1, xy2 : ndarray (N, 2)
-        Matches in pixels of the images.
-    margin : float
-        Widening at both ends as a share of the range, in addition to 2 px.
-
-    Returns
-    -------
-    tuple of int
-    """
+    """First and last disparity to search, from matches; ``StageFailure`` if none is in the frame."""
     left, right = matches_in_frame(rectification, (xy1, xy2))
     if len(left) == 0:
         raise StageFailure(

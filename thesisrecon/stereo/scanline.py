@@ -14,13 +14,7 @@ from numpy.typing import ArrayLike
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo._cost import (
-    LEVELS,
-    add_squares,
-    checked_range,
-    estimate_noise,
-    prepare_stereo_images,
-)
+from thesisrecon.stereo._cost import LEVELS, checked_range, estimate_noise, prepare_stereo_images
 from thesisrecon.stereo._postprocessing import final_confidence, texture_of
 
 OCCLUDED = -32768
@@ -33,22 +27,21 @@ RADIX = 1 << 24
 fewer discontinuities.
 """
 MATCHED, LEFT_OCCLUDED, RIGHT_OCCLUDED = 0, 1, 2
-GREY_RANGE = 256.0
-"""Grey levels over which the value of an occluded pixel is uniformly distributed."""
 ROWS, WARM_UP = 96, 8
 """Rows of a strip, and rows above it that are solved first to provide a previous row."""
-MATCH_NATS = 0.5
-"""Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed."""
-STEPS_PER_NAT = 16.0
-"""Cost steps per nat; smaller differences are equal. The grey levels and s^2 = 4 of the paper give 16."""
-SIGNIFICANT = 30.0
-"""Nats above the minimum from which the probability is taken as 0."""
 
 
 @kernel
 def _add_row(values: I32, out: I32) -> None:
     for x in range(len(out)):
         out[x] = np.int32(out[x] + values[x])
+
+
+@kernel
+def _add_squares(a: I16, b: I16, out: I32) -> None:
+    for x in range(len(out)):
+        apart = np.int32(b[x]) - np.int32(a[x])
+        out[x] = np.int32(out[x] + apart * apart)
 
 
 @kernel
@@ -61,7 +54,7 @@ def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) ->
         out[q] = 0
         if hi > lo:
             for k in range(n):
-                add_squares(right[k, y, lo - d : hi - d], left[k, y, lo:hi], 1, out[q, lo:hi])
+                _add_squares(right[k, y, lo - d : hi - d], left[k, y, lo:hi], out[q, lo:hi])
 
 
 @kernel
@@ -192,10 +185,7 @@ def _solve_row(
 
 @kernel
 def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) -> None:
-    """Probability (W,) of the disparities found, or adjacent ones, among the whole range.
-
-    ``likelihood`` of 0, 1, ... steps of cost above the minimum.
-    """
+    """Probability (W,) of the disparities found, or adjacent ones, among the whole range."""
     n, width = costs.shape
     for x in range(width):
         out[x] = 0.0
@@ -268,13 +258,6 @@ def _solve_rows(
 
 Cohesion = Literal["none", "along", "along and across"]
 
-ROUNDING_PX = float(1.0 / np.sqrt(12.0))
-"""Standard deviation of an integer disparity."""
-DETECTION = 0.99
-"""Detection probability P_D."""
-MIN_VARIANCE = 4.0
-"""Variance s^2 of the paper; that of the measured image noise is added."""
-
 
 @dataclass(frozen=True)
 class MaximumLikelihoodScanline:
@@ -309,21 +292,28 @@ class MaximumLikelihoodScanline:
         measurements alone, 3 / D if they are indistinguishable. It is reduced where texture is missing,
         because errors of neighbouring pixels are then not independent.
         """
+        # Expected cost of a match per component: (z - z')^2 / (2 s^2) is chi-square distributed.
+        match_nats = 0.5
+        # Cost steps per nat; smaller differences are equal. The grey levels and s^2 = 4 of the paper give 16.
+        steps_per_nat = 16.0
+        significant = 30.0  # Nats above the minimum from which the probability is taken as 0
+        rounding_px = float(1.0 / np.sqrt(12.0))  # Standard deviation of an integer disparity
+        min_variance = 4.0  # Variance s^2 of the paper; that of the measured image noise is added
         first, last = checked_range(disparity_range)
         sides = prepare_stereo_images(left, right)
         noise = float(np.mean([estimate_noise(side) for side in sides]))
-        variance = MIN_VARIANCE + noise**2
+        variance = min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
         occluded = _occlusion_cost(components, variance)
         model = (
             self.radius,
-            STEPS_PER_NAT / (4.0 * variance * LEVELS**2),
-            round(STEPS_PER_NAT * occluded),
-            round(STEPS_PER_NAT * (MATCH_NATS * components if self.out_of_view else occluded)),
+            steps_per_nat / (4.0 * variance * LEVELS**2),
+            round(steps_per_nat * occluded),
+            round(steps_per_nat * (match_nats * components if self.out_of_view else occluded)),
             int(self.cohesion != "none"),
             int(self.cohesion == "along and across"),
         )
-        likelihood = np.exp(-np.arange(int(SIGNIFICANT * STEPS_PER_NAT) + 2) / STEPS_PER_NAT)
+        likelihood = np.exp(-np.arange(int(significant * steps_per_nat) + 2) / steps_per_nat)
         likelihood[-1] = 0.0
         height, width = sides[0].valid.shape
         disparity, confidence = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
@@ -337,11 +327,13 @@ class MaximumLikelihoodScanline:
             own = slice(start - top, stop - top)
             disparity[start:stop] = np.where(found[own] == OCCLUDED, np.float32(np.nan), found[own])
             confidence[start:stop] = probable[own]
-        final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
-        return DisparityMap(disparity, confidence, ROUNDING_PX)
+        confidence = final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
+        return DisparityMap(disparity, confidence, rounding_px)
 
 
 def _occlusion_cost(components: int, variance: float) -> float:
     """Cost of an occluded pixel in nats, with m components of one variance s^2."""
-    odds = np.log(DETECTION / (1.0 - DETECTION))
-    return float(odds + components * np.log(GREY_RANGE / np.sqrt(2.0 * np.pi * variance)))
+    grey_range = 256.0  # Grey levels over which the value of an occluded pixel is uniformly distributed
+    detection = 0.99  # Detection probability P_D
+    odds = np.log(detection / (1.0 - detection))
+    return float(odds + components * np.log(grey_range / np.sqrt(2.0 * np.pi * variance)))

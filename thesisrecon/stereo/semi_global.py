@@ -1,7 +1,8 @@
 """Semi-global matching of rectified pairs (thesis, section 2.5; Hirschmüller, PAMI 30(2), 2008).
 
 It sums the minimal costs of the paths that reach a pixel along its row and column (4 paths), or along the
-diagonals as well (8 paths). Occlusions are found afterwards by the left-right check.
+diagonals as well (8 paths). Occlusions are found afterwards by the left-right check. All inner loops run over
+pixels of a row so that the compiler vectorises them; horizontal paths are computed on transposed blocks.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thesisrecon._numba import copy_to, empty, full, kernel
 from thesisrecon.arrays import F32, I16, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import (
@@ -27,11 +29,7 @@ from thesisrecon.stereo._cost import (
     row_strips,
     support_masks,
 )
-from thesisrecon.stereo._path_kernels import TOP, adaptive_P2, scratch_size, sum_paths
 from thesisrecon.stereo._postprocessing import (
-    MIN_NEIGHBOURS,
-    STEP_PX,
-    TEXTURED,
     best_disparities,
     check_left_right,
     disparity_noise,
@@ -42,22 +40,185 @@ from thesisrecon.stereo._postprocessing import (
     texture_of,
 )
 
-MIN_NOISE = 1.0
-"""Standard deviation in grey levels of quantisation and viewpoint change, added to the image noise."""
-TOLERANCE = 5.0
-"""Colour difference at which an arm of the support ends, in standard deviations of the noise."""
-OUTSIDE = 0.4
-"""Cost of a partner outside the image, as a share of the maximal cost."""
+TOP = 127
+"""Upper limit of matching cost plus penalty: the sum of two opposite path costs then fits one byte."""
+BLOCK = 192
+"""Rows transposed together for the horizontal paths."""
 P1, P2, MIN_P2 = 0.43, 1.6, 0.65
 """Penalties of a disparity change of 1, of larger ones, and limit of the adapted P2, in maximal costs."""
-EDGE = 14.0
-"""Intensity step that halves P2, in standard deviations of the noise."""
 MAX_COST = int(TOP / (1.0 + P2))
 """Maximal matching cost: the largest for which cost and penalty fit one byte."""
-LEFT_RIGHT_PX, MIN_CONFIDENCE = 1.0, 0.02
-"""Largest difference in the left-right check; disparities of less confidence are unknown."""
-MIN_REGION_PX = 60
-"""Connected regions of fewer pixels are removed, as are larger ones without texture."""
+
+
+@kernel
+def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
+    for x in range(len(out)):
+        apart = np.float32(a[x]) - np.float32(b[x])
+        apart = -apart if apart < 0 else apart
+        p2 = largest * scale / (scale + apart)
+        out[x] = np.uint8(least if p2 < least else p2)
+
+
+@kernel(error_model="numpy")
+def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
+    """Penalties P2 (4, H, W) from the left, upper, upper left and upper right neighbour of each pixel.
+
+    They decrease with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
+    (Hirschmüller 2008, section 2.2).
+    """
+    height, width = grey.shape
+    out[:] = np.uint8(largest)
+    for y in range(height):
+        _adapt_P2(grey[y, 1:], grey[y, : width - 1], largest, least, scale, out[0, y, 1:])
+        if y > 0:
+            above = grey[y - 1]
+            _adapt_P2(grey[y], above, largest, least, scale, out[1, y])
+            _adapt_P2(grey[y, 1:], above[: width - 1], largest, least, scale, out[2, y, 1:])
+            _adapt_P2(grey[y, : width - 1], above[1:], largest, least, scale, out[3, y, : width - 1])
+
+
+@kernel
+def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8, path: U8, least: U8) -> None:
+    """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
+
+    ``before`` are the rows L'(d - 1), L'(d), L'(d + 1) of the previous pixels, ``base`` their minimum over d;
+    ``least`` is updated with the minimum of this row.
+    """
+    below, same, above = before
+    for x in range(len(cost)):
+        # Loads precede the selections: a load inside one would prevent vectorisation.
+        near, other, value, floor = below[x], above[x], same[x], base[x]
+        near = other if other < near else near
+        near = np.uint8(near + P1)
+        value = near if near < value else value
+        far = np.uint8(floor + p2[x])
+        value = far if far < value else value
+        value = np.uint8(np.uint8(value - floor) + cost[x])
+        path[x] = value
+        so_far = least[x]
+        least[x] = value if value < so_far else so_far
+
+
+@kernel
+def _extend_row(
+    cost: U8, before: U8, base: U8, p2: U8, settings: tuple[np.uint8, int, U8], path: U8, least: U8
+) -> None:
+    """Path costs (D, W) of a row of pixels from those of the previous row, ``shift`` columns aside.
+
+    ``p2`` (W,) belongs to the previous pixel. ``settings`` are P1, the shift, and a row of unreachable costs.
+    """
+    P1, shift, unreachable = settings
+    n, width = cost.shape
+    a, b = max(0, -shift), width - max(0, shift)
+    c, d = a + shift, b + shift
+    least[:] = 255
+    for q in range(n):
+        if b > a:
+            below = before[q - 1, c:d] if q > 0 else unreachable[c:d]
+            above = before[q + 1, c:d] if q < n - 1 else unreachable[c:d]
+            _extend(
+                cost[q, a:b], (below, before[q, c:d], above), base[c:d], p2[c:d], P1, path[q, a:b], least[a:b]
+            )
+        for x in range(a):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
+        for x in range(b, width):
+            path[q, x] = cost[q, x]
+            least[x] = min(least[x], cost[q, x])
+
+
+@kernel
+def _start_row(cost: U8, path: U8, least: U8) -> None:
+    least[:] = 255
+    for q in range(len(cost)):
+        for x in range(len(least)):
+            value = cost[q, x]
+            path[q, x] = value
+            least[x] = min(least[x], value)
+
+
+@kernel
+def _add(values: U8, total: U8) -> None:
+    for x in range(len(total)):
+        total[x] = np.uint8(total[x] + values[x])
+
+
+@kernel
+def _shifted(p2: U8, shift: int, out: U8) -> None:
+    """Shift a row of penalties by ``shift`` columns, zeros outside."""
+    width = len(p2)
+    a, b = min(max(0, shift), width), max(width + min(0, shift), 0)
+    out[:a], out[b:] = 0, 0
+    if b > a:
+        copy_to(out[a:b], p2[a - shift : b - shift])
+
+
+@kernel
+def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
+    """Sum path costs from above, ``shift`` columns aside, and the opposite ones, to ``total`` (N, D, W)."""
+    rows, n, width = costs.shape
+    unreachable = full(width, np.uint8(255 - P1), np.uint8)
+    least, p2 = empty((2, width), np.uint8), empty(width, np.uint8)
+    _start_row(costs[0], total[0], least[0])
+    for y in range(1, rows):
+        # The sum still holds the path from above only, from which the next row continues.
+        _shifted(P2[y], shift, p2)
+        settings = (P1, shift, unreachable)
+        old, new = least[(y - 1) & 1], least[y & 1]
+        _extend_row(costs[y], total[y - 1], old, p2, settings, total[y], new)
+    paths = empty((2, n, width), np.uint8)
+    _start_row(costs[rows - 1], paths[(rows - 1) & 1], least[(rows - 1) & 1])
+    for y in range(rows - 1, -1, -1):
+        path = paths[y & 1]
+        if y < rows - 1:
+            settings = (P1, -shift, unreachable)
+            old = least[(y + 1) & 1]
+            _extend_row(costs[y], paths[(y + 1) & 1], old, P2[y + 1], settings, path, least[y & 1])
+        for q in range(n):
+            _add(path[q], total[y, q])
+
+
+@kernel
+def _transpose(source: U8, out: U8) -> None:
+    """Transpose (A, D, B) to (B, D, A) in squares of 8 x 8, which stay in the cache for any row length."""
+    a, n, b = source.shape
+    for q in range(n):
+        for top in range(0, a, 8):
+            for left in range(0, b, 8):
+                for x in range(left, min(left + 8, b)):
+                    for y in range(top, min(top + 8, a)):
+                        out[x, q, y] = source[y, q, x]
+
+
+def scratch_size(height: int, disparities: int, width: int) -> int:
+    """Bytes of a block of transposed costs."""
+    return width * disparities * min(height, BLOCK)
+
+
+@kernel
+def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
+    """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
+
+    ``P2`` (4, H, W) from :func:`adaptive_P2`; ``total`` (P, H, D, W) receives the sums: P = 2 for rows and
+    columns, P = 4 with the diagonals. ``scratch`` (2, scratch_size) is work space.
+    """
+    height, n, width = costs.shape
+    # Horizontal paths are sequential in x: transposed rows are vectorised over y.
+    for start in range(0, height, BLOCK):
+        rows = min(BLOCK, height - start)
+        size = width * n * rows
+        transposed = scratch[0, :size].reshape((width, n, rows))
+        summed = scratch[1, :size].reshape((width, n, rows))
+        _transpose(costs[start : start + rows], transposed)
+        p2 = empty((width, rows), np.uint8)
+        for y in range(rows):
+            copy_to(p2[:, y], P2[0, start + y])
+        _sum_opposite(transposed, p2, P1, 0, summed)
+        _transpose(summed, total[0, start : start + rows])
+    _sum_opposite(costs, P2[1], P1, 0, total[1])
+    if len(total) == 4:
+        _sum_opposite(costs, P2[2], P1, -1, total[2])
+        _sum_opposite(costs, P2[3], P1, 1, total[3])
 
 
 @dataclass(frozen=True)
@@ -87,33 +248,28 @@ class SemiGlobalMatching:
             raise ValueError("census_share must be in [0, 1], truncation positive, smoothing_radius >= 0")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
-        """Compute the disparities of the left image.
+        """Compute the disparities of the left image, NaN where occluded or ambiguous.
 
-        Parameters
-        ----------
-        left, right : array_like (H, W) or (H, W, K <= 4)
-            Grey levels 0 .. 255 of a rectified pair, NaN = no pixel.
-        disparity_range : tuple of int
-            First and last disparity in pixels, both included; x_right = x_left - d, of either sign.
-
-        Returns
-        -------
-        DisparityMap
-            NaN where the pixel is occluded, fails the left-right check or is ambiguous.
+        The images (H, W) or (H, W, K <= 4) hold grey levels 0 .. 255, NaN = no pixel. The range includes both
+        ends, of either sign; x_right = x_left - d.
         """
+        # Standard deviation in grey levels of quantisation and viewpoint change, added to the image noise.
+        min_noise = 1.0
         first, last = checked_range(disparity_range)
         images = prepare_stereo_images(left, right)
         measured = float(np.mean([estimate_noise(image) for image in images]))
-        noise = float(np.hypot(MIN_NOISE, measured))
+        noise = float(np.hypot(min_noise, measured))
         (height, width), n, pairs = images[0].valid.shape, last - first + 1, self.paths // 2
         bits = np.empty((2, height, width), np.int32)
         for image, out in zip(images, bits, strict=True):
             census(image.grey, out)
         arms = np.empty((4, ARM if self.support else 0, height, width), np.uint8)
         if self.support:
-            tolerance = np.int16(min(round(TOLERANCE * noise * LEVELS), 255 * LEVELS))
+            # The colour difference at which an arm of the support ends is five standard deviations.
+            tolerance = np.int16(min(round(5.0 * noise * LEVELS), 255 * LEVELS))
             support_masks(images[0].channels, images[0].valid, tolerance, arms)
-        weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(OUTSIDE * MAX_COST))
+        # A partner outside the image costs a share of the maximal cost.
+        weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(0.4 * MAX_COST))
         penalties, P1_cost = _adapted_P2(images[0], noise), np.uint8(round(P1 * MAX_COST))
         # Confidence 1/2 if the second best disparity costs P1 more on every path.
         half = float(2 * pairs * P1 * MAX_COST)
@@ -151,21 +307,22 @@ class SemiGlobalMatching:
 
     def _postprocess(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
         """Check, filter and smooth the disparities (H, W) of the left image; inputs are overwritten."""
-        limits = np.array([LEFT_RIGHT_PX, MIN_CONFIDENCE], np.float32)
-        check_left_right(left, right, confidence, limits)
-        remove_speckles(left, texture > TEXTURED, STEP_PX, MIN_REGION_PX)
-        closed, smooth = np.empty_like(left), np.empty_like(left)
-        fill_pinholes(left, MIN_NEIGHBOURS, closed)
+        step = np.float32(1.0)  # Largest disparity difference of neighbours on one surface
+        check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
+        # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
+        remove_speckles(left, texture > np.float32(1.7), step, 60)
+        closed, smooth = fill_pinholes(left, least=5), np.empty_like(left)
         closed[np.isnan(texture)] = np.nan
-        edge_preserving_mean(closed, STEP_PX, self.smoothing_radius, smooth)
-        final_confidence(confidence, left, smooth, texture)
+        edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
+        confidence = final_confidence(confidence, left, smooth, texture)
         return DisparityMap(smooth, confidence, disparity_noise(closed, smooth))
 
 
 def _adapted_P2(image: StereoImage, noise: float) -> U8:
     """P2 / (1 + g / ``EDGE``) with the intensity step g, at least ``MIN_P2``; see :func:`adaptive_P2`."""
+    edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
     out = np.empty((4, *image.valid.shape), np.uint8)
-    scale = np.float32(EDGE * noise * LEVELS * len(image.channels))
+    scale = np.float32(edge * noise * LEVELS * len(image.channels))
     adaptive_P2(image.grey, np.float32(P2 * MAX_COST), np.float32(MIN_P2 * MAX_COST), scale, out)
     return out
 

@@ -11,8 +11,6 @@ from thesisrecon.arrays import F32, F64, I32, I64, U8
 
 SIDE = 8
 """Voxels per side of a block."""
-WEIGHT_BEYOND = 0.1
-"""Weight of a depth extrapolated by half a pixel or more."""
 
 
 class MapSamples(NamedTuple):
@@ -124,6 +122,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
     the next of the four, because a surface net ends half a voxel before the last depth. NaN if all are
     unknown.
     """
+    weight_beyond = 0.1  # Weight of a depth extrapolated by half a pixel or more
     x, y = min(int(u), depth.shape[1] - 2), min(int(v), depth.shape[0] - 2)
     x, y = max(x, 0), max(y, 0)
     x1, y1 = min(x + 1, depth.shape[1] - 1), min(y + 1, depth.shape[0] - 1)
@@ -146,7 +145,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
         row = other_row
     else:
         row, column = other_row, other_column
-    return depth[row, column], (row, column), WEIGHT_BEYOND
+    return depth[row, column], (row, column), weight_beyond
 
 
 @kernel

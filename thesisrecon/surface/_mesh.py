@@ -1,4 +1,4 @@
-"""Triangle meshes: areas, normals, connected parts, and simplification by vertex clustering."""
+"""Triangle meshes: areas, connected parts, halves, and the piecewise linear surfaces of depth maps."""
 
 from __future__ import annotations
 
@@ -6,16 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import decompose_camera
-from thesisrecon.records import TexturedMesh
+from thesisrecon.records import DepthMap, TexturedMesh
 
 RISING, FALLING = ((0, 2, 1), (1, 2, 3)), ((0, 2, 3), (0, 3, 1))
 """Corners (0 1 above, 2 3 below) of the triangles of a square by its diagonal, the left one first."""
-MIN_PART_SHARE = 0.0005
-"""Connected parts below this share of the area are removed."""
 
 
 def remove_unused_vertices(mesh: TexturedMesh) -> TexturedMesh:
@@ -38,17 +35,6 @@ def face_areas(vertices: F64, faces: I64) -> F64:
     """Areas (M,) of triangles."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-
-
-def vertex_normals(mesh: TexturedMesh) -> F64:
-    """Unit vertex normals (N, 3), the area-weighted mean of the face normals."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    total = np.zeros_like(mesh.vertices)
-    for k in range(3):
-        for d in range(3):
-            total[:, d] += np.bincount(mesh.faces[:, k], normal[:, d], len(total))
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
 
 
 def connected_parts(faces: I64, vertices: int) -> I64:
@@ -102,79 +88,16 @@ def halve_surface(mesh: TexturedMesh, size: I64, largest: int) -> I64:
 
 def remove_small_parts(mesh: TexturedMesh) -> TexturedMesh:
     """Remove small connected parts, which come from wrong depths."""
+    min_part_share = 0.0005  # Connected parts below this share of the area are removed
     if not len(mesh.faces):
         return mesh
     part = connected_parts(mesh.faces, len(mesh.vertices))
     area = np.bincount(part, face_areas(mesh.vertices, mesh.faces))
-    return select_faces(mesh, area[part] >= MIN_PART_SHARE * area.sum())
+    return select_faces(mesh, area[part] >= min_part_share * area.sum())
 
 
-def simplify_mesh(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
-    """Merge vertices in cells of a grid, enlarged until the faces are few enough, to ``max_faces``.
-
-    Each cluster (Rossignac and Borrel 1993) becomes the point with the least squared distance to the planes
-    of its faces (Lindstrom 2000), which preserves edges and corners.
-    """
-    if max_faces < 1:
-        raise ValueError(f"max_faces must be at least 1; got {max_faces}")
-    if len(mesh.faces) <= max_faces:
-        return mesh
-    mesh = remove_unused_vertices(replace(mesh, uv=None, texture=None, untextured=None))
-    extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
-    while True:
-        cluster = _clusters(mesh, cell)
-        faces = _distinct_faces(cluster[mesh.faces])
-        if len(faces) <= max_faces:
-            break
-        cell *= max(1.02, float(np.sqrt(len(faces) / max_faces)))
-    vertices = _cluster_places(mesh, cluster, cell)
-    colors = None if mesh.colors is None else np.rint(_means(cluster, mesh.colors)).astype(np.uint8)
-    return remove_unused_vertices(replace(mesh, vertices=vertices, faces=faces, colors=colors))
-
-
-def _clusters(mesh: TexturedMesh, cell: float) -> I64:
-    """(N,) cluster of each vertex: vertices that edges connect within a cell."""
-    place = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
-    start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-    within = (place[start] == place[stop]).all(axis=1)
-    return components(start[within], stop[within], len(place))
-
-
-def _distinct_faces(faces: I64) -> I64:
-    """Faces (M', 3) with three corners, in their first order; both sides of a sheet stay."""
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    first = np.argmin(faces, axis=1)
-    turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
-
-
-def _cluster_places(mesh: TexturedMesh, cluster: I64, cell: float) -> F64:
-    """(C, 3) point nearest to the planes of the faces of each cluster, undetermined: the mean vertex."""
-    mean = _means(cluster, mesh.vertices)
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    planes = np.zeros((len(mean), 3, 3))
-    pull = np.zeros((len(mean), 3))
-    for corner in range(3):
-        which = cluster[mesh.faces[:, corner]]
-        away = (normal * (a - mean[which])).sum(axis=1)
-        for i in range(3):
-            pull[:, i] += np.bincount(which, normal[:, i] * away, len(mean))
-            for j in range(3):
-                planes[:, i, j] += np.bincount(which, normal[:, i] * normal[:, j], len(mean))
-    values, vectors = np.linalg.eigh(planes)
-    determined = values > np.maximum(1e-2 * values[:, 2:], np.finfo(float).tiny)
-    along = np.einsum("nij,ni->nj", vectors, pull) * determined / np.where(determined, values, 1.0)
-    step = np.einsum("nij,nj->ni", vectors, along)
-    return mean + np.where(np.linalg.norm(step, axis=1, keepdims=True) <= cell, step, 0.0)
-
-
-def _means(cluster: I64, values: F64 | NDArray[np.uint8]) -> F64:
-    """(C, 3) means of ``values`` (N, 3) over each cluster."""
-    size = np.bincount(cluster)
-    return np.stack([np.bincount(cluster, values[:, d]) / size for d in range(3)], axis=1)
+GRAZING_DEG = 10.0
+"""Surfaces break where they are seen at a smaller angle."""
 
 
 def max_depth_slope(P: F64, grazing_deg: float) -> float:
@@ -207,3 +130,30 @@ def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> 
     """Whether two depths differ by at most ``slope`` of the smaller, or three standard deviations."""
     limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
     return np.asarray(np.abs(z1 - z2) <= limit)
+
+
+def surface_from_depth(
+    depth_map: DepthMap, *, step: int = 1, grazing_deg: float = GRAZING_DEG
+) -> TexturedMesh:
+    """Triangulate a depth map.
+
+    Two pixels belong to one surface if the line between their points deviates from the rays by more than
+    ``grazing_deg``, or if their depths differ by less than three standard deviations.
+    """
+    depth = depth_map.depth[::step, ::step].astype(np.float64)
+    std = depth_map.std[::step, ::step].astype(np.float64)
+    diagonal, whole = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))
+    index = np.arange(depth.size).reshape(depth.shape)
+    corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], axis=-1)
+    faces = [
+        corners[(diagonal == rising) & whole[..., k]][:, triple]
+        for rising, triples in ((True, RISING), (False, FALLING))
+        for k, triple in enumerate(triples)
+    ]
+    order = np.concatenate(faces)
+    order = order[np.lexsort(order.T[::-1])]
+    K, R, t = decompose_camera(depth_map.P)
+    y, x = np.indices(depth.shape) * step
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(depth.size)], axis=1) @ np.linalg.inv(K).T
+    X = np.asarray((rays * depth.reshape(-1, 1) - t) @ R)
+    return remove_unused_vertices(TexturedMesh(X, order))

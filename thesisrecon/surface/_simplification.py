@@ -17,24 +17,10 @@ from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.records import TexturedMesh
-from thesisrecon.surface._mesh import face_areas, remove_unused_vertices, simplify_mesh
+from thesisrecon.surface._mesh import components, face_areas, remove_unused_vertices
 
 BLOCK_FACES = 150_000
 """Faces that are simplified as one block; vertices between blocks stay for the next round."""
-ROUNDS = 2
-"""Rounds, each with blocks across another axis."""
-PASSES = 10
-"""Passes over the faces, the limit rising evenly; one vertex takes part in one collapse of a pass."""
-BORDER_WEIGHT = 0.3
-"""Weight of the planes that keep the borders in place, relative to that of the faces."""
-FITTED_POINTS = 0.3
-"""Minimum weight of the original vertices around a new vertex for it to be moved."""
-TOWARDS_MIDDLE = 1e-3
-"""Weight of the middle of the edge where planes leave directions undetermined."""
-MAX_TURN = 0.5
-"""Cosine of the largest change of a face's normal in one collapse."""
-MIN_ROUNDNESS = 0.05
-"""Smallest height of a face over its longest side, unless it was flatter before."""
 SHARES, LONGEST = (0.08, 0.32), 8.0
 """Limits tried for a number of faces, and longest new side; unit: side of a square of a face's mean area."""
 MAX_FAN = 24
@@ -101,6 +87,7 @@ def _cross(a: F64, b: F64, out: F64) -> float:
 @kernel
 def sum_planes(mesh: MeshState) -> None:
     """Sum the planes of the faces at their vertices; mark borders and add planes across them."""
+    border_weight = 0.3  # Weight of the planes that keep the borders in place, relative to that of the faces
     points, faces = mesh.points, mesh.faces
     normal, across, side, other = empty(3), empty(3), empty(3), empty(3)
     for m in range(faces.shape[0]):
@@ -119,7 +106,7 @@ def sum_planes(mesh: MeshState) -> None:
             length = _cross(side, normal, across)
             for end in (v, w):
                 mesh.border[end] = 1
-                _add_plane(mesh, end, across, _offset(across, points, v), BORDER_WEIGHT * length * length)
+                _add_plane(mesh, end, across, _offset(across, points, v), border_weight * length * length)
 
 
 @kernel
@@ -141,10 +128,12 @@ def _shared(mesh: MeshState, v: int, w: int) -> int:
 @kernel
 def collapse_edges(mesh: MeshState, rows: tuple[int, int], block: int, longest: float) -> None:
     """Collapse the edges of one block, the faces of some rows; no new side is longer than ``longest``."""
+    # Passes over the faces, the limit rising evenly; one vertex takes part in one collapse of a pass.
+    passes = 10
     planes, point, ring = empty(11), empty(3), empty(2 * MAX_FAN, np.int64)
     touched = zeros(rows[1] - rows[0], np.uint8)
-    for turn in range(PASSES):
-        share = ((turn + 1.0) / PASSES) ** 2
+    for turn in range(passes):
+        share = ((turn + 1.0) / passes) ** 2
         touched[:] = 0
         for m in range(rows[0], rows[1]):
             if mesh.faces[m, 0] < 0 or touched[m - rows[0]]:
@@ -174,6 +163,7 @@ def collapse_edges(mesh: MeshState, rows: tuple[int, int], block: int, longest: 
 @kernel
 def _best_point(mesh: MeshState, v: int, w: int, most: float, planes: F64, point: F64) -> bool:
     """Sum the ``planes`` of an edge, find the ``point`` near them; False if its mean square is too large."""
+    towards_middle = 1e-3  # Weight of the middle of the edge where planes leave directions undetermined
     for n in range(11):
         planes[n] = mesh.planes[v, n] + mesh.planes[w, n]
     x = 0.5 * (mesh.points[v, 0] + mesh.points[w, 0])
@@ -184,7 +174,7 @@ def _best_point(mesh: MeshState, v: int, w: int, most: float, planes: F64, point
     ax, ay, az = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
     rx, ry, rz = planes[6] - ax, planes[7] - ay, planes[8] - az
     constant = planes[9] - 2.0 * (planes[6] * x + planes[7] * y + planes[8] * z) + ax * x + ay * y + az * z
-    more = TOWARDS_MIDDLE * (xx + yy + zz)
+    more = towards_middle * (xx + yy + zz)
     a, b, c = xx + more, yy + more, zz + more
     p, q, r = b * c - yz * yz, xz * yz - xy * c, xy * yz - xz * b
     det = a * p + xy * q + xz * r
@@ -243,6 +233,8 @@ def _noted(ring: I64, size: int, vertex: int) -> int:
 @kernel
 def _keeps_shape(mesh: MeshState, v: int, w: int, point: F64, longest: float) -> bool:
     """Whether the faces of v without w keep their orientation and roundness if v moves to a point."""
+    max_turn = 0.5  # Cosine of the largest change of a face's normal in one collapse
+    min_roundness = 0.05  # Smallest height of a face over its longest side, unless it was flatter before
     points, faces = mesh.points, mesh.faces
     corner = mesh.first[v]
     while corner >= 0:
@@ -259,13 +251,13 @@ def _keeps_shape(mesh: MeshState, v: int, w: int, point: F64, longest: float) ->
         nx, ny, nz = cy * pz - cz * py, cz * px - cx * pz, cx * py - cy * px
         old, new = ox * ox + oy * oy + oz * oz, nx * nx + ny * ny + nz * nz
         cosine = ox * nx + oy * ny + oz * nz
-        if cosine <= 0.0 or cosine * cosine < MAX_TURN * MAX_TURN * old * new:
+        if cosine <= 0.0 or cosine * cosine < max_turn * max_turn * old * new:
             return False
         base = cx * cx + cy * cy + cz * cz
         own, second = px * px + py * py + pz * pz, (px - cx) ** 2 + (py - cy) ** 2 + (pz - cz) ** 2
         before = max(base, vx * vx + vy * vy + vz * vz, (vx - cx) ** 2 + (vy - cy) ** 2 + (vz - cz) ** 2)
         side = max(base, own, second)
-        flat = new < (MIN_ROUNDNESS * side) ** 2 and new * before * before < old * side * side
+        flat = new < (min_roundness * side) ** 2 and new * before * before < old * side * side
         if flat or max(own, second) > longest * longest:
             return False
     return True
@@ -350,6 +342,8 @@ def simplify_surface(
     mesh: TexturedMesh, limit: F64, *, longest: float, threads: int = 1, overwrite: bool = False
 ) -> TexturedMesh:
     """Collapse edges while the rms distance to the planes of the original faces is within ``limit`` (N,)."""
+    rounds = 2  # Rounds, each with blocks across another axis
+    fitted_points = 0.3  # Minimum weight of the original vertices around a new vertex for it to be moved
     size, centre = len(mesh.vertices), mesh.vertices.mean(axis=0)
     points = np.subtract(mesh.vertices, centre, out=mesh.vertices if overwrite else None)
     original = points.astype(np.float32)
@@ -360,7 +354,7 @@ def simplify_surface(
     ))  # fmt: skip
     sum_planes(state)
     with ThreadPool(threads) as pool:
-        for axis in np.argsort(-np.ptp(points, axis=0), kind="stable")[:ROUNDS]:
+        for axis in np.argsort(-np.ptp(points, axis=0), kind="stable")[:rounds]:
             starts = _sort_into_blocks(state, int(axis))
             state = _linked(state)
             blocks = enumerate(pairwise(starts.tolist()))
@@ -371,7 +365,7 @@ def simplify_surface(
     state = _linked(state._replace(planes=np.zeros((0, 11))))
     total = np.zeros((size, 4))
     sum_distances(state, original, total)
-    moved = total[:, 3] >= FITTED_POINTS
+    moved = total[:, 3] >= fitted_points
     points[moved] += total[moved, :3] / total[moved, 3:]
     made = remove_unused_vertices(replace(mesh, vertices=points, faces=state.faces.astype(np.int64)))
     return replace(made, vertices=made.vertices + centre)
@@ -415,4 +409,30 @@ def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> Tex
         mesh = simplify_surface(mesh, limit, longest=LONGEST * cell, threads=threads)
         if len(mesh.faces) <= max_faces:
             break
-    return simplify_mesh(mesh, max_faces)
+    return mesh if len(mesh.faces) <= max_faces else _merge_in_cells(mesh, max_faces)
+
+
+def _merge_in_cells(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
+    """Merge vertices that edges connect within a cell of a grid (Rossignac and Borrel 1993).
+
+    Cells are enlarged until the faces are few enough. Both sides of a sheet stay.
+    """
+    extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
+    cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
+    start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
+    while True:
+        place = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
+        within = (place[start] == place[stop]).all(axis=1)
+        cluster = components(start[within], stop[within], len(place))
+        faces = cluster[mesh.faces]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+        first = np.argmin(faces, axis=1)
+        turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+        faces = faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
+        if len(faces) <= max_faces:
+            break
+        cell *= max(1.02, float(np.sqrt(len(faces) / max_faces)))
+    size = np.bincount(cluster)
+    mean = np.stack([np.bincount(cluster, mesh.vertices[:, d]) / size for d in range(3)], axis=1)
+    return remove_unused_vertices(replace(mesh, vertices=mean, faces=faces))

@@ -5,36 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon._threads import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.imaging.on_demand import OnDemand
-from thesisrecon.imaging.raster import rasterize, rasterize_corners
+from thesisrecon.imaging.raster import rasterize, rasterize_rows, vertex_normals
+from thesisrecon.imaging.resampling import weighted_median
 from thesisrecon.records import PinholeView, TexturedMesh
-from thesisrecon.surface._mesh import components, halve_surface, vertex_normals
-from thesisrecon.surface._texture_kernels import (
-    MAX_BLENDED,
-    ViewSurface,
-    combine_colors,
-    continue_faces,
-    diffuse,
-    grow_colors,
-    keep_largest,
-    observe_points,
-)
+from thesisrecon.surface._mesh import halve_surface
 
 DEPTH_TOLERANCE_PX = 3.0
 """Depth tolerance of visible vertices in pixel sizes: the z-buffer holds one depth per pixel."""
-SMOOTH_ROUNDS = 40
-"""Faces over which the choice of views is smoothed."""
-MIN_CHART_FACES = 30
-"""Smaller charts join a neighbour."""
-OWN_WEIGHT = 0.1
-"""Weight of a face's own share relative to those of its neighbours."""
 BUFFER_BYTES, SURFACE_BYTES = 2**28, 2**29
 """Depth buffers, and views prepared for blending, in memory; more are made again when they are used."""
 
@@ -42,15 +29,6 @@ BUFFER_BYTES, SURFACE_BYTES = 2**28, 2**29
 def view_camera(view: PinholeView) -> Camera:
     """The camera of a view with its image size."""
     return Camera.from_matrix(view.P, (view.rgb.shape[1], view.rgb.shape[0]))
-
-
-def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
-    """Pixels (N, 2) of vertices, NaN behind the camera, and depths (N,)."""
-    xyz = (vertices @ camera.R.T + camera.t) @ camera.K.T
-    depth = xyz[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        xy = np.where(depth[:, None] > 0.0, xyz[:, :2] / depth[:, None], np.nan)
-    return xy, depth
 
 
 def depth_buffers(mesh: TexturedMesh, views: Sequence[PinholeView]) -> Sequence[F32]:
@@ -62,150 +40,211 @@ def depth_buffers(mesh: TexturedMesh, views: Sequence[PinholeView]) -> Sequence[
     return OnDemand(len(views), depth, BUFFER_BYTES)
 
 
-def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
-    """Vertices (N,) with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
-    camera = view_camera(view)
-    width, height = camera.size
-    with np.errstate(invalid="ignore"):
-        inside = (xy >= 0.0).all(axis=1) & (xy[:, 0] <= width - 1.0) & (xy[:, 1] <= height - 1.0)
-    x, y = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
-    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
-    places = ((y, x), (y, right), (below, x), (below, right))
-    farthest = np.max([buffer[place] for place in places], axis=0)
-    seen = np.all([view.seen[place] for place in places], axis=0)
-    tolerance = DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-    return np.asarray(inside & seen & (depth <= farthest + tolerance))
-
-
-def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32]) -> F32:
-    """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
-    quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
-    for v, view in enumerate(views):
-        xy, depth = project_to_view(view_camera(view), mesh.vertices)
-        seen = _visible_vertices(view, buffers[v], xy, depth)
-        a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
-        # y points down: faces that are anticlockwise from outside have a negative area.
-        area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
-        whole = seen[mesh.faces].all(axis=1) & (np.nan_to_num(area) > 0.0)
-        quality[whole, v] = area[whole]
-    return quality
-
-
-def shows_part(mesh: TexturedMesh, views: Sequence[PinholeView]) -> bool:
-    """Whether any view shows a part of the outside of a face."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    for view in views:
-        camera = view_camera(view)
-        drawn = rasterize(mesh.vertices, mesh.faces, camera).face[view.seen]
-        drawn = drawn[drawn >= 0]
-        if np.any(np.sum(normal[drawn] * (camera.centre - a[drawn]), axis=1) > 0.0):
-            return True
-    return False
-
-
-def choose_views(
-    mesh: TexturedMesh,
-    views: Sequence[PinholeView],
-    buffers: Sequence[F32],
-    neighbours: I64,
-    *,
-    threads: int = 1,
-) -> I64:
-    """Choose the view (M,) from which each face is textured, -1 if no view sees it.
-
-    The best view of each face alone would give many small charts. Therefore the quality of each view relative
-    to the best one is diffused over the faces that it sees, and small charts join the neighbour with the
-    longest common border. Eight views are in memory at a time.
-    """
-    visible = np.zeros((len(mesh.faces), -(-len(views) // 8)), dtype=np.uint8)
-    label = np.full(len(mesh.faces), -1, dtype=np.int64)
-    best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
-
-    def see(first: int) -> tuple[F32, I64]:
-        quality = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
-        visible[:, first // 8] = np.packbits(quality > 0.0, axis=1)[:, 0]
-        return quality.max(axis=1), first + quality.argmax(axis=1)
-
-    def spread_shares(first: int) -> tuple[F32, I64]:
-        share = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
-        share /= np.maximum(best, np.float32(1e-20))[:, None]
-        spread, other = share.copy(), np.empty_like(share)
-        for _ in range(SMOOTH_ROUNDS):
-            diffuse(share, neighbours, OWN_WEIGHT, spread, other)
-            spread, other = other, spread
-        return spread.max(axis=1), first + spread.argmax(axis=1)
-
-    with ThreadPool(threads) as pool:
-        # Faces that the diffusion leaves without shares keep their best view.
-        for highest, work in ((best, see), (most, spread_shares)):
-            for value, view in pool.map(work, range(0, len(views), 8)):
-                higher = value > highest
-                highest[higher], label[higher] = value[higher], view[higher]
-    for _ in range(3):
-        label = _join_small(label, visible, neighbours)
-    return label
-
-
-def label_charts(label: I64, neighbours: I64) -> I64:
-    """Label the connected faces of one view."""
-    face = np.repeat(np.arange(len(label)), 3)
-    other = neighbours.ravel()
-    same = (other >= 0) & (label[face] == label[other])
-    return components(face[same], other[same], len(label))
-
-
-def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
-    """Join small charts to a neighbour; the bits of ``visible`` (M, V / 8) are the views that see a face."""
-    chart = label_charts(label, neighbours)
-    faces = np.bincount(chart)
-    small = (faces[chart] < MIN_CHART_FACES) & (label >= 0)
-    # A chart can take over a view that sees all of its faces.
-    sees = np.full((len(faces), visible.shape[1]), 255, dtype=np.uint8)
-    np.bitwise_and.at(sees, chart[small], visible[small])
-    face, side = np.nonzero(small[:, None] & (neighbours >= 0))
-    view = label[neighbours[face, side]]
-    crossing = (view >= 0) & (view != label[face])
-    borders, length = np.unique(
-        np.column_stack([chart[face[crossing]], view[crossing]]), axis=0, return_counts=True
-    )
-    common = (sees[borders[:, 0], borders[:, 1] // 8] >> (7 - borders[:, 1] % 8)) & 1 > 0
-    (chart_of, view_of), length = borders[common].T, length[common]
-    # The last assignment counts: the longest border, of equal ones the first view.
-    order = np.lexsort((-view_of, length))
-    joined = np.full(len(faces), -1)
-    joined[chart_of[order]] = view_of[order]
-    return np.where(small & (joined[chart] >= 0), joined[chart], label)
-
-
 PART_TEXELS, LARGE_PART_TEXELS, CHUNK_POINTS = 1 << 17, 1 << 19, 1 << 14
 """Texels of a part of the surface if all views are in memory, and otherwise; points of one task."""
-PREPARED_BYTES = 11
-"""Bytes of a pixel of a view that is prepared for blending."""
 BATCH_VIEWS, OBSERVED = 8, 1 << 22
 """Views that are used together; points times views from which the gains are estimated."""
-STRIP_ROWS = 64
-"""Rows of the texture processed at a time."""
 RIM_TEXELS = 1
 """Texels by which a chart is extrapolated for bilinear sampling."""
-BEYOND_FACE = 4.0
-"""Limit of that extrapolation in sides of a face."""
-GROWN_TEXELS = 3
-"""Further texels that take the colours of the rim, for reduced textures."""
-OUTLINE_PX = 10.0
-"""Depth step in pixel sizes that marks the outline of a foreground object."""
-MIN_TRUST = 1e-3
-"""Weight of pixels at outlines and image borders, which count where no other image shows the point."""
-GAIN_POINTS = 50_000
-"""Maximum number of points at which image gains are estimated; fewer with more than 80 views."""
-DARK, BRIGHT = 16.0, 240.0
-"""Colours outside this range are clipped or noisy and not used for gains."""
-POWER = 2.0
-"""Exponent of the pixels per area: 0 weighs all images equally, large values select the best one."""
+MAX_BLENDED = 32
+"""Views that are blended at a point, those of the largest weights."""
 SCATTER = 20.0
 """Distance from the median colour in grey levels at which the weight is a quarter."""
-FEATHER_PX = 8.0
-"""Width of the border in which the weight decreases."""
+
+
+class ViewSurface(NamedTuple):
+    """A surface seen by one view.
+
+    With (u, v, 1) z = M X + p, the pixels per area are ``scale`` = det M times the distance of ``centre`` to
+    the tangent plane over z^3.
+    ``depth`` (H, W): nearest depth, inf without a surface; ``trust`` (H, W): weight of each pixel in 0 .. 1;
+    ``tolerance``: relative depth by which visible points may lie behind ``depth``; ``gain`` (3,): of the
+    brightness.
+    """
+
+    P: F64
+    centre: F64
+    scale: float
+    depth: F32
+    trust: F32
+    tolerance: float
+    rgb: U8
+    gain: F32
+
+
+@kernel
+def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
+    """Observe points in one view: weights (pixels per area times trust) and colours times the gain.
+
+    A point is visible if it is at most ``view.tolerance`` of its depth behind the farthest of the four pixels
+    around.
+    """
+    P, centre, scale, depth, trust, tolerance, rgb, gain = view
+    height, width = depth.shape
+    for n in range(points.shape[0]):
+        weight[n] = 0.0
+        X, Y, Z = points[n]
+        towards = (
+            normals[n, 0] * (centre[0] - X)
+            + normals[n, 1] * (centre[1] - Y)
+            + normals[n, 2] * (centre[2] - Z)
+        )
+        z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        if not (z > 0.0 and towards > 0.0):
+            continue
+        u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z
+        v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z
+        if not (0.0 <= u <= width - 1.0 and 0.0 <= v <= height - 1.0):
+            continue
+        x, y = int(u), int(v)
+        right, below = min(x + 1, width - 1), min(y + 1, height - 1)
+        farthest = max(max(depth[y, x], depth[y, right]), max(depth[below, x], depth[below, right]))
+        if z * (1.0 - tolerance) > farthest:
+            continue
+        s, t = u - x, v - y
+        upper = trust[y, x] + s * (trust[y, right] - trust[y, x])
+        lower = trust[below, x] + s * (trust[below, right] - trust[below, x])
+        weight[n] = np.float32((upper + t * (lower - upper)) * scale * towards / (z * z * z))
+        for k in range(3):
+            a, b = np.float32(rgb[y, x, k]), np.float32(rgb[y, right, k])
+            c, d = np.float32(rgb[below, x, k]), np.float32(rgb[below, right, k])
+            top, bottom = a + s * (b - a), c + s * (d - c)
+            color[n, k] = np.float32((top + t * (bottom - top)) * gain[k])
+
+
+@kernel
+def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
+    """Sort the values (V,) of positive weight by index into ``order``; return their number and weight."""
+    count, total = 0, 0.0
+    for v in range(len(values)):
+        if weights[v] > 0.0:
+            k = count
+            while k > 0 and values[order[k - 1]] > values[v]:
+                order[k] = order[k - 1]
+                k -= 1
+            order[k] = v
+            count += 1
+            total += weights[v]
+    return count, total
+
+
+@kernel
+def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
+    """Let the observations (N,) of one more view replace the smallest kept ones (V, N) that are smaller.
+
+    Those of larger ``weight`` stay, of equal ones the first, in the order of the views.
+    """
+    views = weight.shape[0]
+    for n in range(len(one)):
+        if one[n] <= 0.0:
+            continue
+        least = 0
+        for v in range(1, views):
+            if weight[v, n] <= weight[least, n]:
+                least = v
+        if one[n] <= weight[least, n]:
+            continue
+        for v in range(least, views - 1):
+            weight[v, n] = weight[v + 1, n]
+            for k in range(3):
+                color[v, n, k] = color[v + 1, n, k]
+        weight[views - 1, n] = one[n]
+        for k in range(3):
+            color[views - 1, n, k] = its_color[n, k]
+
+
+@kernel
+def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
+    """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
+
+    Relative weights are raised to ``power`` and multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS
+    distance d from the weighted median colour.
+    """
+    views = weight.shape[0]
+    relative = empty(views)
+    order = empty(views, np.int64)
+    middle = empty(3)
+    for n in range(weight.shape[1]):
+        best = np.float32(0.0)
+        for v in range(views):
+            best = max(best, weight[v, n])
+        if best <= 0.0:
+            continue
+        for v in range(views):
+            relative[v] = weight[v, n] / best
+        for k in range(3):
+            count, sum_of_weights = _sort_weighted(color[:, n, k], relative, order)
+            middle[k] = weighted_median(color[:, n, k], relative, order[:count], 0.5 * sum_of_weights)
+        total = 0.0
+        mean = zeros(3)
+        for v in range(views):
+            if relative[v] <= 0.0:
+                continue
+            apart = 0.0
+            for k in range(3):
+                apart += (color[v, n, k] - middle[k]) ** 2
+            trust = 1.0 / (1.0 + apart / (3.0 * scatter * scatter))
+            w = relative[v] ** power * trust * trust
+            total += w
+            for k in range(3):
+                mean[k] += w * color[v, n, k]
+        for k in range(3):
+            out[n, k] = np.float32(mean[k] / total)
+
+
+@kernel
+def grow_colors(texture: U8, drawn: B8) -> None:
+    """Extend the drawn texels by the mean of their neighbours."""
+    height, width = drawn.shape
+    before = drawn.copy()
+    total = zeros(3)
+    for y in range(height):
+        for x in range(width):
+            if before[y, x]:
+                continue
+            total[:] = 0.0
+            count = 0
+            for j in range(max(y - 1, 0), min(y + 2, height)):
+                for i in range(max(x - 1, 0), min(x + 2, width)):
+                    if before[j, i]:
+                        count += 1
+                        for k in range(3):
+                            total[k] += texture[j, i, k]
+            if count:
+                drawn[y, x] = True
+                for k in range(3):
+                    texture[y, x, k] = int(total[k] / count + 0.5)
+
+
+@kernel
+def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
+    """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
+
+    ``corners`` (M, 3, 3): in homogeneous texels; ``face`` (H, W), -1 for none, and ``weights`` (H, W, 2) of
+    corners 1 and 2 are updated from the left, right, upper or lower neighbour.
+    """
+    height, width = face.shape
+    before = face.copy()
+    for y in range(height):
+        for x in range(width):
+            if before[y, x] >= 0:
+                continue
+            for side in range(4):
+                j = y + (side == 3) - (side == 2)
+                i = x + (side == 1) - (side == 0)
+                if not (0 <= j < height and 0 <= i < width) or before[j, i] < 0:
+                    continue
+                c = corners[before[j, i]]
+                ax, ay = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1]
+                bx, by = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1]
+                area = ax * by - ay * bx
+                dx, dy = x - c[0, 0], y - c[0, 1]
+                p, q = dx * by - dy * bx, ax * dy - ay * dx
+                if max(abs(p), abs(q)) <= farthest * abs(area) and area != 0.0:
+                    face[y, x] = before[j, i]
+                    weights[y, x, 0] = np.float32(p / area)
+                    weights[y, x, 1] = np.float32(q / area)
+                    break
 
 
 def paint_texture(
@@ -225,12 +264,14 @@ def paint_texture(
     texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``. The surface is
     painted part by part, each with the views whose image can contain it.
     """
+    prepared_bytes = 11  # Bytes of a pixel of a view that is prepared for blending
+    grown_texels = 3  # Further texels that take the colours of the rim, for reduced textures
     normals = vertex_normals(mesh)
     texture = cut_out.copy()
     drawn = np.zeros(texture.shape[:2], dtype=bool)
     with ThreadPool(threads) as pool:
         pixels = sum(camera.size[0] * camera.size[1] for camera in cameras)
-        texels = PART_TEXELS if PREPARED_BYTES * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
+        texels = PART_TEXELS if prepared_bytes * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
         for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], texels, pool):
             points, towards = _points_on_faces(mesh, normals, face, weights)
             box = points.min(axis=0), points.max(axis=0)
@@ -239,7 +280,7 @@ def paint_texture(
             color, shown = blend_colors(views, points, towards, pool)
             texture.reshape(-1, 3)[at[shown]] = np.clip(np.rint(color[shown]), 0, 255)
             drawn.ravel()[at[shown]] = True
-    for _ in range(GROWN_TEXELS):
+    for _ in range(grown_texels):
         grow_colors(texture, drawn)
     return texture
 
@@ -248,8 +289,10 @@ def prepare_views(
     mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32], *, threads: int = 1
 ) -> Sequence[ViewSurface]:
     """The surface as each view sees it, with gains that equalise the brightness; made when it is used."""
+    # Maximum number of points at which image gains are estimated; fewer with more than 80 views.
+    gain_points = 50_000
     prepared = OnDemand(len(views), lambda v: _prepared(views[v], buffers[v]), SURFACE_BYTES)
-    stride = max(1, len(mesh.vertices) // min(GAIN_POINTS, OBSERVED // max(len(views), 1)))
+    stride = max(1, len(mesh.vertices) // min(gain_points, OBSERVED // max(len(views), 1)))
     points, normals = (np.ascontiguousarray(a[::stride]) for a in (mesh.vertices, vertex_normals(mesh)))
     weight, color = _no_observations(len(views), points)
 
@@ -265,10 +308,9 @@ def prepare_views(
 def blend_colors(
     views: Sequence[ViewSurface], points: F64, normals: F64, pool: Executor | None = None
 ) -> tuple[F32, B8]:
-    """Colours (N, 3) of points with outward normals, and whether any view shows the point.
-
-    The views are used one after the other, and the observations of ``MAX_BLENDED`` are kept for each point.
-    """
+    """Colours (N, 3) of points with outward normals, and whether any view shows the point."""
+    # Exponent of the pixels per area: 0 weighs all images equally, large values select the best one.
+    power = 2.0
     slots = min(len(views), MAX_BLENDED)
     out, shown = np.zeros((len(points), 3), dtype=np.float32), np.zeros(len(points), dtype=bool)
     chunks = [slice(n, min(n + CHUNK_POINTS, len(points))) for n in range(0, len(points), CHUNK_POINTS)]
@@ -292,7 +334,7 @@ def blend_colors(
         batch.clear()
 
     def combine(some: slice, weight: F32, color: F32) -> None:
-        combine_colors(weight, color, POWER, SCATTER, out[some])
+        combine_colors(weight, color, power, SCATTER, out[some])
         shown[some] = weight.max(axis=0, initial=0.0) > 0.0
 
     list(map_all(combine, chunks, *zip(*kept, strict=True)))
@@ -329,19 +371,17 @@ def _may_contain(camera: Camera, low: F64, high: F64) -> bool:
 def _surface_parts(
     mesh: TexturedMesh, uv: F64, shape: tuple[int, int], largest: int, pool: Executor
 ) -> Iterator[tuple[I32, I32, F32]]:
-    """The texels of parts of the surface, of at most ``largest`` ones each.
-
-    Returns their numbers (N,), faces (N,), and weights (N, 2) of corners 1 and 2.
-    """
+    """Numbers (N,), faces and weights (N, 2) of corners 1 and 2 of at most ``largest`` texels at a time."""
+    strip_rows = 64  # Rows of the texture processed at a time
     top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
 
     def texels(first: int) -> tuple[I32, I32, F32]:
-        rows = slice(first, min(first + STRIP_ROWS, shape[0]))
+        rows = slice(first, min(first + strip_rows, shape[0]))
         # Comparisons with NaN are false: such faces are not seen.
         some = np.flatnonzero((bottom >= rows.start) & (top <= rows.stop))
         return _texels_of_rows((some, uv[some]), rows, shape[1])
 
-    strips = list(pool.map(texels, range(0, shape[0], STRIP_ROWS)))
+    strips = list(pool.map(texels, range(0, shape[0], strip_rows)))
     at, face, weights = (np.concatenate(kind) for kind in zip(*strips, strict=True))
     del strips
     count = np.bincount(face, minlength=len(uv))
@@ -357,14 +397,15 @@ def _surface_parts(
 
 def _texels_of_rows(faces: tuple[I64, F64], rows: slice, width: int) -> tuple[I32, I32, F32]:
     """Numbers (N,), faces (N,) and weights (N, 2) of the texels of some rows, and of the ``faces`` there."""
+    beyond_face = 4.0  # Limit of that extrapolation in sides of a face
     some, uv = faces
     corners = np.concatenate([uv, np.ones((len(some), 3, 1))], axis=2)
     corners[..., 1] -= rows.start - RIM_TEXELS
     shape = (rows.stop - rows.start + 2 * RIM_TEXELS, width)
-    raster = rasterize_corners(corners, 1e-3, shape)
+    raster = rasterize_rows(corners, 1e-3, (0, shape[0]), shape[1])
     face, weights = raster.face, raster.weights
     for _ in range(RIM_TEXELS):
-        continue_faces(corners, BEYOND_FACE, face, weights)
+        continue_faces(corners, beyond_face, face, weights)
     face, weights = face[RIM_TEXELS:-RIM_TEXELS], weights[RIM_TEXELS:-RIM_TEXELS]
     y, x = np.nonzero(face >= 0)
     at = ((y + rows.start) * width + x).astype(np.int32)
@@ -372,16 +413,20 @@ def _texels_of_rows(faces: tuple[I64, F64], rows: slice, width: int) -> tuple[I3
 
 
 def _prepared(view: PinholeView, depth: F32) -> ViewSurface:
+    outline_px = 10.0  # Depth step in pixel sizes that marks the outline of a foreground object
+    # Weight of pixels at outlines and image borders, which count where no other image shows the point.
+    min_trust = 1e-3
+    feather_px = 8.0  # Width of the border in which the weight decreases
     camera = view_camera(view)
     focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     # Pixels without a surface are no outline: they may be holes.
     far = scipy.ndimage.maximum_filter(np.where(np.isfinite(depth), depth, -np.inf), 3)
     near = scipy.ndimage.minimum_filter(depth, 3)
     with np.errstate(invalid="ignore"):
-        outline = far - near > OUTLINE_PX / focal * near
+        outline = far - near > outline_px / focal * near
     inside = np.pad(np.ones_like(view.seen[1:-1, 1:-1]), 1)
     distance = scipy.ndimage.distance_transform_edt(inside & view.seen & ~outline)
-    trust = np.clip(distance / FEATHER_PX, MIN_TRUST, 1.0)
+    trust = np.clip(distance / feather_px, min_trust, 1.0)
     # Bilinear interpolation must not use missing pixels.
     trust[scipy.ndimage.minimum_filter(view.seen, 3) == 0] = 0.0
     tolerance = DEPTH_TOLERANCE_PX / focal
@@ -393,8 +438,9 @@ def _prepared(view: PinholeView, depth: F32) -> ViewSurface:
 
 def _equalizing_gains(weight: F32, color: F32) -> F32:
     """Gains (V, 3) of geometric mean 1 that equalise the median colours of all pairs of views."""
+    dark, bright = 16.0, 240.0  # Colours outside this range are clipped or noisy and not used for gains
     views = len(weight)
-    usable = (weight[..., None] > 0.0) & (color > DARK) & (color < BRIGHT)
+    usable = (weight[..., None] > 0.0) & (color > dark) & (color < bright)
     log = np.maximum(color, 1.0)
     np.log(log, out=log)
     gains = np.ones((views, 3), dtype=np.float32)

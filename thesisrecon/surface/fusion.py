@@ -22,6 +22,7 @@ from thesisrecon.arrays import B8, F32, F64, I32, I64
 from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
+from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._fusion_kernels import (
     SIDE,
@@ -32,28 +33,20 @@ from thesisrecon.surface._fusion_kernels import (
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface._mesh import max_depth_slope, remove_small_parts, select_faces, triangulate_grid
+from thesisrecon.surface._mesh import (
+    GRAZING_DEG,
+    max_depth_slope,
+    remove_small_parts,
+    select_faces,
+    surface_from_depth,
+    triangulate_grid,
+)
 from thesisrecon.surface._simplification import simplify_surface
-from thesisrecon.surface.linear import GRAZING_DEG, surface_from_depth
 
-MIN_COSINE = 0.1
-"""Lower limit of the incidence cosine."""
-TRUNCATION_VOXELS = 3.0
-"""Truncation of the signed distances; less certain depths are ignored."""
-FUSED_GRAZING_DEG = 5.0
-"""Surfaces break where they are seen at a smaller angle."""
-MAX_RELATIVE = 0.02
-"""Relative depth difference, or three standard deviations, up to which a sheet already shows a point."""
-VOXEL_GROWTH = 1.15
-"""Factor by which voxels are enlarged until the blocks fit into memory."""
 GROUP_BYTES, MEDIAN_PIXELS = 2**30, 2**26
 """Prepared depth maps in memory at a time, and pixels from which the voxel size is computed."""
 SLAB_BLOCKS, TASK_BLOCKS = 8192, 512
 """Blocks in memory at a time, besides a layer before and after them, and blocks of one task."""
-MAX_STD_VOXELS = 1.0
-"""Upper limit of the standard deviations in the tolerance of the simplification."""
-LONGEST_VOXELS = 16.0
-"""Longest side of a simplified face: a texture needs images that show a face completely."""
 
 
 @dataclass(frozen=True)
@@ -92,28 +85,15 @@ class VolumetricFusion:
             raise ValueError(f"tolerance must be finite and not negative; got {self.tolerance}")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
-        """Fuse depth maps to one surface.
-
-        Parameters
-        ----------
-        depth_maps, threads : sequence of DepthMap, int
-            Depths of the views, and number of threads; the result does not depend on it.
-
-        Returns
-        -------
-        TexturedMesh
-            Surface without colours; faces are anticlockwise seen from the cameras.
-
-        Raises
-        ------
-        StageFailure
-            If the maps contain no depths.
-        """
+        """Fuse depth maps to one surface."""
+        max_std_voxels = 1.0  # Upper limit of the standard deviations in the tolerance of the simplification
+        # Longest side of a simplified face: a texture needs images that show a face completely.
+        longest_voxels = 16.0
         surface, std, voxel = self._fused(depth_maps, threads)
         if not len(surface.faces):
             raise _nothing_to_fuse()
         if self.tolerance:
-            limit, longest = self.tolerance * np.minimum(std, MAX_STD_VOXELS * voxel), LONGEST_VOXELS * voxel
+            limit, longest = self.tolerance * np.minimum(std, max_std_voxels * voxel), longest_voxels * voxel
             surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
         return remove_small_parts(surface)
 
@@ -126,7 +106,9 @@ class VolumetricFusion:
 
     def _lay_out(self, measured: _PreparedMaps) -> _Grid:
         """Voxel grid; leaves the depths that are certain enough for its truncation distance."""
-        step = max(1, -(-len(measured.maps) * measured.pixels // MEDIAN_PIXELS))
+        truncation_voxels = 3.0  # Truncation of the signed distances; less certain depths are ignored
+        voxel_growth = 1.15  # Factor by which voxels are enlarged until the blocks fit into memory
+        step = max(1, -(-measured.pixels // MEDIAN_PIXELS))
         footprints = [
             (m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)][::step]
             for group in measured
@@ -136,11 +118,11 @@ class VolumetricFusion:
             raise _nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
-            measured.limit(TRUNCATION_VOXELS * voxel)
+            measured.truncation = truncation_voxels * voxel
             grid = _grid(measured, voxel)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
                 return grid
-            voxel *= VOXEL_GROWTH
+            voxel *= voxel_growth
 
 
 @dataclass(frozen=True)
@@ -171,35 +153,27 @@ class _FusionMap:
 
 
 class _PreparedMaps:
-    """Depth maps prepared for fusion, in groups of ``GROUP_BYTES``; several groups are made for each use."""
+    """Depth maps of some certainty prepared for fusion, in groups; ``GROUP_BYTES`` of them are in memory."""
 
     def __init__(self, maps: Sequence[DepthMap], pool: ThreadPool) -> None:
-        self.maps, self.pool, self.truncation = maps, pool, np.inf
-        self.pixels = maps[0].depth.size if len(maps) else 0
-        self.size = max(1, GROUP_BYTES // (12 * max(self.pixels, 1)))
-        self.whole = self.certain = self._group(0) if len(maps) <= self.size else None
-
-    def _group(self, first: int) -> list[_FusionMap]:
-        some = range(first, min(first + self.size, len(self.maps)))
-        return list(self.pool.map(lambda n: _measured(self.maps[n]), some))
-
-    def limit(self, truncation: float) -> None:
-        """Leave out depths whose standard deviation across the surface exceeds the truncation."""
-        self.truncation = truncation
-        if self.whole is not None:
-            self.certain = [one.without_uncertain_depths(truncation) for one in self.whole]
+        self.pixels = sum(one.depth.size for one in maps)
+        self.pool, self.truncation = pool, np.inf
+        self.prepared = OnDemand(len(maps), lambda n: _measured(maps[n]), GROUP_BYTES)
 
     def __iter__(self) -> Iterator[list[_FusionMap]]:
-        if self.certain is not None:
-            yield self.certain
-            return
-        for first in range(0, len(self.maps), self.size):
-            yield [one.without_uncertain_depths(self.truncation) for one in self._group(first)]
+        group = 8
+
+        def certain(n: int) -> _FusionMap:
+            return self.prepared[n].without_uncertain_depths(self.truncation)
+
+        for first in range(0, len(self.prepared), group):
+            yield list(self.pool.map(certain, range(first, min(first + group, len(self.prepared)))))
 
 
 def _measured(depth_map: DepthMap) -> _FusionMap:
+    fused_grazing_deg = 5.0  # Surfaces break where they are seen at a smaller angle
     K = decompose_camera(depth_map.P)[0]
-    slope = max_depth_slope(depth_map.P, FUSED_GRAZING_DEG)
+    slope = max_depth_slope(depth_map.P, fused_grazing_deg)
     depth = _without_grazing(depth_map, slope)
     samples = MapSamples(depth, depth_map.std, _incidence_cosines(depth, K), slope)
     return _FusionMap(depth_map.P, float(np.sqrt(K[0, 0] * K[1, 1])), samples)
@@ -220,6 +194,7 @@ def _incidence_cosines(depth: F32, K: F64) -> F32:
     pixel, and its gradient determines the normal: the smaller of the differences to both neighbours, averaged
     over 3 x 3 pixels.
     """
+    min_cosine = 0.1  # Lower limit of the incidence cosine
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
     known = np.isfinite(inverse)
@@ -233,7 +208,7 @@ def _incidence_cosines(depth: F32, K: F64) -> F32:
     c = inverse - a * x - b * y
     normal = np.einsum("ji,j...->i...", K.astype(np.float32), np.stack([a, b, c]))
     cosine = inverse / np.sqrt((normal**2).sum(axis=0))
-    return np.where(known, np.maximum(cosine, np.float32(MIN_COSINE)), np.float32(1.0))
+    return np.where(known, np.maximum(cosine, np.float32(min_cosine)), np.float32(1.0))
 
 
 def _smaller_difference(values: F32, axis: int) -> F32:
@@ -408,6 +383,8 @@ class DepthSheets:
 
     def _coverage_test(self, depth_map: DepthMap) -> Callable[[F64], B8]:
         """Function that tests whether points (N, 3) lie on the sheet of a map."""
+        # Relative depth difference, or three standard deviations, up to which a sheet already shows a point.
+        max_relative = 0.02
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
         slope = self.step * max_depth_slope(depth_map.P, GRAZING_DEG)
@@ -425,7 +402,7 @@ class DepthSheets:
             (x, y), (u, v) = np.stack([x, y])[:, n], place[n].T % 1.0
             a, b, c, d = (1.0 / depth[y + k, x + m] for k in (0, 1) for m in (0, 1))
             there = 1.0 / ((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            inside[n] = np.abs(there - z[n]) <= np.maximum(MAX_RELATIVE * z[n], 3.0 * std[y, x])
+            inside[n] = np.abs(there - z[n]) <= np.maximum(max_relative * z[n], 3.0 * std[y, x])
             return np.asarray(inside)
 
         return shown

@@ -1,17 +1,374 @@
-"""Textured surface model of a scene from all depth maps (thesis, section 2.6)."""
+"""Textured surface model of a scene from all depth maps (thesis, section 2.6), and its texture atlas.
+
+A chart of the texture consists of connected faces that are assigned to one image and has the outline and
+resolution of that image. Its colours are blended from all images.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from thesisrecon._numba import kernel
 from thesisrecon._threads import ThreadPool
+from thesisrecon.arrays import B8, F32, F64, I64, U8, resizing_transform
+from thesisrecon.camera import Camera
+from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.imaging.on_demand import OnDemand
+from thesisrecon.imaging.resampling import resample, smooth
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.surface._mesh import components, connected_parts, face_neighbours, select_faces
+from thesisrecon.surface._texture_blending import (
+    DEPTH_TOLERANCE_PX,
+    depth_buffers,
+    paint_texture,
+    prepare_views,
+    view_camera,
+)
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
-from thesisrecon.surface.linear import LinearSurface
-from thesisrecon.surface.texture_atlas import TextureAtlas
+
+CHART_MARGIN = 2
+"""Pixels around each chart, so that reduced textures do not mix charts."""
+REDUCED_BYTES = 2**28
+"""Reduced images in memory; more are made again when they are used."""
+
+
+@dataclass(frozen=True)
+class TextureAtlas:
+    """Texture at the resolution of the view that shows each part of the surface best (2.6).
+
+    Parameters
+    ----------
+    max_texels : int
+        Limit of the texture size; images are reduced to fit.
+    """
+
+    max_texels: int = 4096 * 4096
+
+    def __post_init__(self) -> None:
+        if self.max_texels < 1:
+            raise ValueError(f"max_texels must be >= 1; got {self.max_texels}")
+
+    def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
+        """Texture a mesh."""
+        min_scale = 0.05  # Smallest reduction of the images
+        neighbours = face_neighbours(mesh.faces)
+        given = [view_camera(view) for view in views]
+        buffers = depth_buffers(mesh, views)
+        label = choose_views(mesh, views, buffers, neighbours, threads=threads)
+        if not (label >= 0).any():
+            raise StageFailure(Notice("no-texture"), "no image shows the outside of a face completely")
+        chart = label_charts(label, neighbours)
+        scale = 1.0
+        while True:
+            cameras = [camera.scaled(scale) for camera in given] if scale < 1.0 else given
+            xy = _corners(mesh, cameras, label)
+            rectangles = _rectangles(xy, label, chart, cameras)
+            offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
+            if size[0] * size[1] <= self.max_texels:
+                break
+            if scale <= min_scale:
+                texels = size[0] * size[1]
+                raise StageFailure(
+                    "the texture is too large",
+                    f"{len(rectangles)} charts need {texels} texels, the limit is {self.max_texels}",
+                    "increase max_texels",
+                )
+            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), min_scale)
+        uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
+        if scale < 1.0:
+            whole = views
+            views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
+            buffers = depth_buffers(mesh, views)
+        cut_out = _fill(views, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
+        seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
+        prepared = prepare_views(mesh, views, buffers, threads=threads)
+        texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
+        uv, texture = _swatches(neighbours, label, uv, texture)
+        return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
+
+
+@kernel
+def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
+    """Diffuse ``spread`` (M, V) over neighbouring faces by one step, among the views with a ``share``."""
+    for m in range(share.shape[0]):
+        count = 0
+        for k in range(3):
+            count += neighbours[m, k] >= 0
+        part = np.float32((1.0 - keep) / max(count, 1))
+        for v in range(share.shape[1]):
+            out[m, v] = 0.0
+            if share[m, v] > 0.0:
+                total = np.float32(0.0)
+                for k in range(3):
+                    if neighbours[m, k] >= 0:
+                        total += spread[neighbours[m, k], v]
+                out[m, v] = np.float32(keep) * share[m, v] + part * total
+
+
+def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
+    """Pixels (N, 2) of vertices, NaN behind the camera, and depths (N,)."""
+    xyz = (vertices @ camera.R.T + camera.t) @ camera.K.T
+    depth = xyz[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.where(depth[:, None] > 0.0, xyz[:, :2] / depth[:, None], np.nan)
+    return xy, depth
+
+
+def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
+    """Vertices (N,) with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
+    camera = view_camera(view)
+    width, height = camera.size
+    with np.errstate(invalid="ignore"):
+        inside = (xy >= 0.0).all(axis=1) & (xy[:, 0] <= width - 1.0) & (xy[:, 1] <= height - 1.0)
+    x, y = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
+    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+    places = ((y, x), (y, right), (below, x), (below, right))
+    farthest = np.max([buffer[place] for place in places], axis=0)
+    seen = np.all([view.seen[place] for place in places], axis=0)
+    tolerance = DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+    return np.asarray(inside & seen & (depth <= farthest + tolerance))
+
+
+def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32]) -> F32:
+    """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
+    quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
+    for v, view in enumerate(views):
+        xy, depth = project_to_view(view_camera(view), mesh.vertices)
+        seen = _visible_vertices(view, buffers[v], xy, depth)
+        a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
+        # y points down: faces that are anticlockwise from outside have a negative area.
+        area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
+        whole = seen[mesh.faces].all(axis=1) & (np.nan_to_num(area) > 0.0)
+        quality[whole, v] = area[whole]
+    return quality
+
+
+def choose_views(
+    mesh: TexturedMesh,
+    views: Sequence[PinholeView],
+    buffers: Sequence[F32],
+    neighbours: I64,
+    *,
+    threads: int = 1,
+) -> I64:
+    """Choose the view (M,) from which each face is textured, -1 if no view sees it.
+
+    The best view of each face alone would give many small charts. Therefore the quality of each view relative
+    to the best one is diffused over the faces that it sees, and small charts join the neighbour with the
+    longest common border. Eight views are in memory at a time.
+    """
+    smooth_rounds = 40  # Faces over which the choice of views is smoothed
+    own_weight = 0.1  # Weight of a face's own share relative to those of its neighbours
+    visible = np.zeros((len(mesh.faces), -(-len(views) // 8)), dtype=np.uint8)
+    label = np.full(len(mesh.faces), -1, dtype=np.int64)
+    best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
+
+    def see(first: int) -> tuple[F32, I64]:
+        quality = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+        visible[:, first // 8] = np.packbits(quality > 0.0, axis=1)[:, 0]
+        return quality.max(axis=1), first + quality.argmax(axis=1)
+
+    def spread_shares(first: int) -> tuple[F32, I64]:
+        share = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+        share /= np.maximum(best, np.float32(1e-20))[:, None]
+        spread, other = share.copy(), np.empty_like(share)
+        for _ in range(smooth_rounds):
+            diffuse(share, neighbours, own_weight, spread, other)
+            spread, other = other, spread
+        return spread.max(axis=1), first + spread.argmax(axis=1)
+
+    with ThreadPool(threads) as pool:
+        # Faces that the diffusion leaves without shares keep their best view.
+        for highest, work in ((best, see), (most, spread_shares)):
+            for value, view in pool.map(work, range(0, len(views), 8)):
+                higher = value > highest
+                highest[higher], label[higher] = value[higher], view[higher]
+    for _ in range(3):
+        label = _join_small(label, visible, neighbours)
+    return label
+
+
+def label_charts(label: I64, neighbours: I64) -> I64:
+    """Label the connected faces of one view."""
+    face = np.repeat(np.arange(len(label)), 3)
+    other = neighbours.ravel()
+    same = (other >= 0) & (label[face] == label[other])
+    return components(face[same], other[same], len(label))
+
+
+def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
+    """Join small charts to a neighbour; the bits of ``visible`` (M, V / 8) are the views that see a face."""
+    min_chart_faces = 30  # Smaller charts join a neighbour
+    chart = label_charts(label, neighbours)
+    faces = np.bincount(chart)
+    small = (faces[chart] < min_chart_faces) & (label >= 0)
+    # A chart can take over a view that sees all of its faces.
+    sees = np.full((len(faces), visible.shape[1]), 255, dtype=np.uint8)
+    np.bitwise_and.at(sees, chart[small], visible[small])
+    face, side = np.nonzero(small[:, None] & (neighbours >= 0))
+    view = label[neighbours[face, side]]
+    crossing = (view >= 0) & (view != label[face])
+    borders, length = np.unique(
+        np.column_stack([chart[face[crossing]], view[crossing]]), axis=0, return_counts=True
+    )
+    common = (sees[borders[:, 0], borders[:, 1] // 8] >> (7 - borders[:, 1] % 8)) & 1 > 0
+    (chart_of, view_of), length = borders[common].T, length[common]
+    # The last assignment counts: the longest border, of equal ones the first view.
+    order = np.lexsort((-view_of, length))
+    joined = np.full(len(faces), -1)
+    joined[chart_of[order]] = view_of[order]
+    return np.where(small & (joined[chart] >= 0), joined[chart], label)
+
+
+def _reduced(view: PinholeView, scale: float) -> PinholeView:
+    """The view with ``scale`` < 1 times as many pixels per side."""
+    width, height = view_camera(view).scaled(scale).size
+    S = resizing_transform(np.divide((width, height), view.rgb.shape[1::-1]))
+    blur = 0.5 * np.sqrt(max(1.0 / scale**2 - 1.0, 1e-6))
+    planes = [resample(smooth(view.rgb[..., k].astype(np.float32), blur), width, height) for k in range(3)]
+    seen = resample(view.seen.astype(np.float32), width, height) > 0.999
+    rgb = np.clip(np.rint(np.stack(planes, axis=-1)), 0, 255).astype(np.uint8)
+    return PinholeView(view.view, S @ view.P, rgb, seen)
+
+
+def _corners(mesh: TexturedMesh, cameras: Sequence[Camera], label: I64) -> F64:
+    """(M, 3, 2) corners of each face in its view in pixels, 0 without a view."""
+    xy = np.zeros((len(mesh.faces), 3, 2))
+    for v, camera in enumerate(cameras):
+        mine = label == v
+        xy[mine] = project_to_view(camera, mesh.vertices)[0][mesh.faces[mine]]
+    return xy
+
+
+def _rectangles(xy: F64, label: I64, chart: I64, cameras: Sequence[Camera]) -> I64:
+    """(C, 4) left, top, right, bottom of each chart in its image, the last two exclusive."""
+    charts = int(chart.max()) + 1
+    low = np.full((charts, 2), np.iinfo(np.int64).max)
+    high = np.full((charts, 2), -1)
+    view = np.zeros(charts, dtype=np.int64)
+    seen = label >= 0
+    view[chart[seen]] = label[seen]
+    np.minimum.at(low, chart[seen], np.floor(xy[seen].min(axis=1)).astype(np.int64))
+    np.maximum.at(high, chart[seen], np.ceil(xy[seen].max(axis=1)).astype(np.int64) + 1)
+    sizes = np.array([camera.size for camera in cameras])[view]
+    low = np.where(high < 0, 0, np.maximum(low - CHART_MARGIN, 0))
+    high = np.where(high < 0, 0, np.minimum(high + CHART_MARGIN, sizes))
+    return np.concatenate([low, high], axis=1)
+
+
+def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
+    """Positions (C, 2) of rectangles on shelves of decreasing height, and (width, height) of their box."""
+    width = max(
+        int(np.ceil(1.05 * np.sqrt(float(sizes.prod(axis=1).sum())))), int(sizes[:, 0].max(initial=1))
+    )
+    places = np.zeros_like(sizes)
+    x, y, shelf, widest = 0, 0, 0, 1
+    for c in np.lexsort((np.arange(len(sizes)), -sizes[:, 0], -sizes[:, 1])):
+        w, h = sizes[c]
+        if x + w > width:
+            x, y, shelf = 0, y + shelf, 0
+        places[c] = x, y
+        x, shelf, widest = x + w, max(shelf, h), max(widest, x + w)
+    return places, (int(widest), int(max(y + shelf, 1)))
+
+
+def _fill(
+    views: Sequence[PinholeView], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
+) -> U8:
+    """Texture (H, W, 3): the rectangle of each chart, copied from view ``label`` to its place."""
+    texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
+    # View by view, so that each is made once.
+    for c in np.argsort(label, kind="stable"):
+        (left, top, right, bottom), (x, y) = rectangles[c], offsets[c]
+        if label[c] >= 0:
+            rgb = views[label[c]].rgb
+            texture[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
+    return texture
+
+
+def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
+    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show.
+
+    Every texel is the one of the whole texture, and corners on the cut keep their places, so that tiles fit.
+    """
+    keep = np.zeros(len(mesh.faces), dtype=bool)
+    keep[faces] = True
+    tile = select_faces(mesh, keep)
+    if tile.uv is None or tile.texture is None:
+        return tile
+    # Faces with a common corner in the texture are one chart.
+    corners = np.column_stack([tile.faces.ravel(), tile.uv.reshape(-1, 2)])
+    number = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    chart = connected_parts(number, int(number.max(initial=-1)) + 1)
+    size = np.array(tile.texture.shape[1::-1])
+    low = np.full((int(chart.max(initial=-1)) + 1, 2), np.inf)
+    high = np.full_like(low, -np.inf)
+    np.minimum.at(low, chart, tile.uv.min(axis=1))
+    np.maximum.at(high, chart, tile.uv.max(axis=1))
+    first = np.clip(np.floor(low).astype(np.int64) - CHART_MARGIN, 0, size - 1)
+    last = np.clip(np.ceil(high).astype(np.int64) + 1 + CHART_MARGIN, 1, size)
+    offsets, (width, height) = _pack_rectangles(last - first)
+    texture = np.full((height, width, 3), 128, dtype=np.uint8)
+    for (left, top), (right, bottom), (x, y) in zip(first, last, offsets, strict=True):
+        texture[y : y + bottom - top, x : x + right - left] = tile.texture[top:bottom, left:right]
+    return replace(tile, uv=tile.uv + (offsets - first)[chart][:, None, :], texture=texture)
+
+
+def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
+    """Append patches with the colours of unseen faces: those of the nearest seen faces along the surface."""
+    swatch = 3  # Texels per side of the patch of unseen faces of similar colour
+    color_step = 16  # Grey levels of a channel that share a patch
+    unseen = np.flatnonzero(label < 0)
+    if not len(unseen):
+        return uv, texture
+    color = _surroundings(neighbours, label, uv, texture)[unseen]
+    code, patch = np.unique(color // color_step @ (1 << 16, 1 << 8, 1), return_inverse=True)
+    size = np.bincount(patch)
+    shades = np.stack([np.rint(np.bincount(patch, color[:, k]) / size) for k in range(3)], axis=1)
+    columns = max(texture.shape[1] // swatch, 1)
+    rows = -(-len(code) // columns)
+    strip = np.full((rows * swatch, texture.shape[1], 3), 128, dtype=np.uint8)
+    row, column = np.divmod(np.arange(len(code)), columns)
+    for dy in range(swatch):
+        for dx in range(min(swatch, texture.shape[1])):
+            strip[row * swatch + dy, column * swatch + dx] = shades
+    uv = uv.copy()
+    middle = np.stack([column * swatch + swatch // 2, texture.shape[0] + row * swatch + swatch // 2], axis=1)
+    uv[unseen] = middle[patch][:, None, :]
+    return uv, np.concatenate([texture, strip])
+
+
+def _surroundings(neighbours: I64, label: I64, uv: F64, texture: U8) -> U8:
+    """(M, 3) uint8 colours of seen faces, propagated from face to face to unseen ones."""
+    x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
+    known = label >= 0
+    color = np.where(known[:, None], texture[y, x], 0).astype(np.float64)
+    while not known.all():
+        open_ = np.flatnonzero(~known)
+        around = neighbours[open_]
+        known_side = (around >= 0) & known[around]
+        reached = known_side.any(axis=1)
+        if not reached.any():
+            color[~known] = color[known].mean(axis=0)
+            break
+        weights = known_side[reached].astype(np.float64)
+        mean = (color[around[reached]] * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
+        color[open_[reached]] = mean
+        known[open_[reached]] = True
+    return np.rint(color).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class LinearSurface:
+    """Piecewise linear surface through all depths: the map itself."""
+
+    def smooth(self, depth_map: DepthMap) -> DepthMap:
+        """See `thesisrecon.surface.bspline.BSplineSurface.smooth`; the map is unchanged."""
+        return depth_map
 
 
 @dataclass(frozen=True)
@@ -44,17 +401,7 @@ class SurfaceModel:
         return self.color(self.surface_of(depth_maps, threads=threads), views, threads=threads)
 
     def surface_of(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
-        """Build the surface without colours.
-
-        Parameters
-        ----------
-        depth_maps, threads
-            As in :meth:`build`.
-
-        Returns
-        -------
-        TexturedMesh
-        """
+        """Build the surface without colours."""
         if isinstance(self.surface, BSplineSurface):
             with ThreadPool(threads) as pool:
                 depth_maps = list(pool.map(self.surface.smooth, depth_maps))

@@ -11,14 +11,11 @@ from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I16, I32
-from thesisrecon.imaging.filters import cubic_weights
 from thesisrecon.imaging.raster import run_in_strips
+from thesisrecon.imaging.resampling import cubic_weights
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle extends beyond its edges, so that rounding leaves no gaps."""
-BACKGROUND_FRACTION = 0.4
-"""Pixels in this farther part of the range of inverse depth count as background; a single far pixel
-may be an outlier."""
 MIN_AREA = 1e-9
 """Twice the area (px^2) of the smallest triangle that is drawn."""
 STRETCH, ENLARGED = 3.0, 2.0
@@ -239,10 +236,7 @@ def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.floa
 
 @kernel
 def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
-    """Count the ``steps`` (K, 2) (down, right) from each pixel to the next known one, ``distance`` (K, H, W).
-
-    0 at known pixels, -1 if there is none.
-    """
+    """Count ``steps`` (K, 2) from each pixel to the next known one: 0 at known pixels, -1 for none."""
     height, width = inverse_depth.shape
     for k in range(steps.shape[0]):
         dy, dx = steps[k]
@@ -263,6 +257,9 @@ def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
 @kernel
 def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, step: float, out: F32) -> None:
     """Fill holes with the background around, see :func:`fill_holes`."""
+    # Pixels in this farther part of the range of inverse depth count as background; a single far pixel may be
+    # an outlier.
+    background_fraction = 0.4
     colors = empty(rgb.shape[2])
     for y in range(rgb.shape[0]):
         for x in range(rgb.shape[1]):
@@ -275,7 +272,7 @@ def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, s
                 if n > 0:
                     least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
                     most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
-            behind = least + max(step, BACKGROUND_FRACTION * (most - least))
+            behind = least + max(step, background_fraction * (most - least))
             for k in range(steps.shape[0]):
                 n = distance[k, y, x]
                 if n <= 0:

@@ -11,24 +11,14 @@ from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
 
-ROUND_GAP = np.radians(120.0)
-"""Cameras without a wider gap in azimuth surround the scene; the orbit is then a full circle."""
-MIN_ARC = np.radians(30.0)
-"""Minimum arc of an orbit that is not a full circle."""
 TILT_WEIGHT = 0.02
 """Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
-MIN_HORIZONTAL_DISTANCE = 0.1
-"""Minimum horizontal distance of an orbit relative to its distance: on the vertical axis up is undefined."""
 GROWTH = 1.1 ** np.arange(13)
 """Radius factors, tried in this order until the orbit keeps clear of the model and shows it."""
-CLEARANCE = 0.5
-"""Minimum distance to the model, in units of the median distance of the cameras."""
 SHOWN = 0.9
 """Minimum visible share of the model, in units of the median over the cameras."""
 TURNING = 3.0
 """Where the rotation per path length exceeds this multiple of its mean, it determines the speed."""
-STEPS = 64
-"""Samples per spline segment for measuring its length."""
 SAMPLE = 5000
 """Model points that are used to choose an orbit."""
 
@@ -50,20 +40,6 @@ def orbit(
     is that of the first camera. If the cameras surround the scene the path is a full circle from the first
     camera; otherwise it swings over the arc that they cover. The radius grows up to threefold until the
     circle keeps clear of X and every frame shows about as much of X as the cameras do.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        At least one registered camera.
-    X : ndarray (N, 3)
-        Scene points, evenly spread over the surface if there is one; non-finite points are ignored. A
-        ``ValueError`` if none is left or all points and cameras coincide.
-    frames, size : int; tuple of int, optional
-        Number of cameras, and image size (width, height); default: that of the first camera.
-
-    Returns
-    -------
-    list of Camera
     """
     _check(cameras, frames)
     X = np.asarray(X, dtype=np.float64).reshape(-1, 3)
@@ -98,17 +74,6 @@ def interpolate_cameras(
 
     Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011) at constant speed, slower where the
     rotation per path length is large; rotations are interpolated as quaternions, K linearly.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        At least one camera, in order.
-    frames, size : int; tuple of int, optional
-        As in :func:`orbit`. One camera or one frame gives the first camera.
-
-    Returns
-    -------
-    list of Camera
     """
     _check(cameras, frames)
     shown = [_fit_to_size(camera, size or cameras[0].size) for camera in cameras]
@@ -133,16 +98,6 @@ def estimate_up(cameras: Sequence[Camera]) -> F64:
     It is the direction nearest to perpendicular to the image rows, and with a small weight to the optical
     axes: hand-held cameras are tilted but hardly rolled. Its sign is that of the image up directions or, if
     these cancel, follows from cameras that look down.
-
-    Parameters
-    ----------
-    cameras : sequence of Camera
-        Registered cameras.
-
-    Returns
-    -------
-    ndarray (3,)
-        Unit vector.
     """
     rows, down, axis = np.array([camera.R for camera in cameras]).transpose(1, 0, 2)
     up = np.linalg.eigh(rows.T @ rows + TILT_WEIGHT * axis.T @ axis)[1][:, 0]
@@ -163,18 +118,7 @@ def _geometric_median(X: F64) -> F64:
 
 
 def sample_surface(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
-    """Sample points evenly over the area of a mesh, the same points each time.
-
-    Parameters
-    ----------
-    mesh, count : TexturedMesh, int
-        Mesh and number of points.
-
-    Returns
-    -------
-    ndarray (count, 3)
-        Empty if the mesh has no area.
-    """
+    """Sample points evenly over the area of a mesh, the same points each time."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
     if not len(area) or not area[-1] > 0.0:
@@ -198,9 +142,11 @@ def _check(cameras: Sequence[Camera], frames: int) -> None:
 
 def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
     """Radius and height of the orbit from camera offsets (V, 3) and the ``spread`` of the scene."""
+    # Minimum horizontal distance of an orbit relative to its distance: on the vertical axis up is undefined.
+    min_horizontal_distance = 0.1
     height = float(np.median(offset @ up))
     radius = float(np.median(np.linalg.norm(offset - np.outer(offset @ up, up), axis=1)))
-    least = MIN_HORIZONTAL_DISTANCE * max(np.hypot(radius, height), spread)
+    least = min_horizontal_distance * max(np.hypot(radius, height), spread)
     if not least > 0.0:
         raise ValueError("an orbit needs a distance; all points and cameras coincide")
     return max(radius, least), height
@@ -208,15 +154,18 @@ def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:
 
 def _azimuths(of_cameras: F64, frames: int) -> F64:
     """Angles (frames,) in rad, around the full circle or back and forth over the arc of the cameras."""
+    # Cameras without a wider gap in azimuth surround the scene; the orbit is then a full circle.
+    round_gap = np.radians(120.0)
+    min_arc = np.radians(30.0)  # Minimum arc of an orbit that is not a full circle
     ordered = np.sort(of_cameras)
     gaps = np.diff(ordered, append=ordered[0] + 2.0 * np.pi)
     phase = 2.0 * np.pi * np.arange(frames) / frames
     widest = int(np.argmax(gaps))
-    if gaps[widest] <= ROUND_GAP:
+    if gaps[widest] <= round_gap:
         return np.asarray(of_cameras[0] + phase)
     arc = 2.0 * np.pi - gaps[widest]
     start = ordered[(widest + 1) % len(ordered)]
-    return np.asarray(start + 0.5 * arc + 0.5 * max(arc, MIN_ARC) * np.sin(phase))
+    return np.asarray(start + 0.5 * arc + 0.5 * max(arc, min_arc) * np.sin(phase))
 
 
 def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]) -> Camera:
@@ -229,6 +178,7 @@ def _looking_at(K: F64, centre: F64, target: F64, up: F64, size: tuple[int, int]
 
 def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera], X: F64) -> float:
     """The first radius factor that keeps clear of X and shows enough; else the clear one that shows most."""
+    clearance = 0.5  # Minimum distance to the model, in units of the median distance of the cameras
     tree, nearest = scipy.spatial.cKDTree(X), [1 + len(X) // 1000]
 
     def distances(path: Sequence[Camera]) -> F64:
@@ -238,7 +188,7 @@ def _widening(circle: Callable[[float], list[Camera]], cameras: Sequence[Camera]
     def shares(path: Sequence[Camera]) -> F64:
         return np.array([_share_in_view(camera, X) for camera in path])
 
-    clear, shown = CLEARANCE * np.median(distances(cameras)), SHOWN * np.median(shares(cameras))
+    clear, shown = clearance * np.median(distances(cameras)), SHOWN * np.median(shares(cameras))
     best, most = float(GROWTH[-1]), -1.0
     for factor in GROWTH.tolist():
         path = circle(factor)
@@ -268,25 +218,22 @@ def _spline(centres: F64, place: F64) -> F64:
     differ = apart > 1e-9 * max(apart.sum(), float(np.abs(centres).max()))
     if not differ.any():
         return np.tile(centres[0], (len(place), 1))
-    place = np.interp(place, np.arange(len(centres)), np.concatenate([[0], np.cumsum(differ)]))
-    centres, gap = centres[np.append(True, differ)], np.sqrt(apart[differ])
+    knots = np.concatenate([[0.0], np.cumsum(np.where(differ, np.sqrt(apart), 0.0))])
+    at = np.interp(place, np.arange(len(centres)), knots)
+    centres, knots = centres[np.append(True, differ)], knots[np.append(True, differ)]
     padded = np.vstack([2.0 * centres[0] - centres[1], centres, 2.0 * centres[-1] - centres[-2]])
-    gap = np.concatenate([gap[:1], gap, gap[-1:]])[:, None]
+    gap = np.pad(np.diff(knots), 1, mode="edge")[:, None]
     chord = np.diff(padded, axis=0) / gap
     tangent = (gap[1:] * chord[:-1] + gap[:-1] * chord[1:]) / (gap[:-1] + gap[1:])
-    k = np.minimum(place.astype(np.int64), len(centres) - 2)
-    u = (place - k)[:, None]
-    start, end = tangent[k] * gap[k + 1], tangent[k + 1] * gap[k + 1]
-    rise = u * u * (3.0 - 2.0 * u)
-    bend = u * (1.0 - u) * ((1.0 - u) * start - u * end)
-    return np.asarray((1.0 - rise) * centres[k] + rise * centres[k + 1] + bend)
+    return np.asarray(scipy.interpolate.CubicHermiteSpline(knots, centres, tangent)(at))
 
 
 def _evenly(centres: F64, turning: F64, frames: int) -> F64:
     """Spline parameters (frames,) at equal times; ``turning`` (n - 1,): rotations in rad."""
-    place = np.linspace(0.0, len(centres) - 1, STEPS * (len(centres) - 1) + 1)
+    steps = 64  # Samples per spline segment for measuring its length
+    place = np.linspace(0.0, len(centres) - 1, steps * (len(centres) - 1) + 1)
     way = np.linalg.norm(np.diff(_spline(centres, place), axis=0), axis=1)
-    turn = np.repeat(turning / STEPS, STEPS)
+    turn = np.repeat(turning / steps, steps)
     if not way.sum() > 0.0:
         time = turn
     else:

@@ -1,4 +1,7 @@
-"""Rendering of a mesh from any camera, in colour and depth (thesis, section 2.6)."""
+"""Rendering of a mesh from any camera, in colour and depth (thesis, section 2.6), and similarity of images.
+
+PSNR and SSIM of a rendered and a real image (H, W, 3) of uint8 use the pixels ``compared`` (H, W).
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.camera import Camera
-from thesisrecon.imaging.raster import Raster, image_corners, rasterize_rows, run_in_strips, sample_texture
+from thesisrecon.imaging.raster import (
+    Raster,
+    image_corners,
+    rasterize_rows,
+    run_in_strips,
+    sample_texture,
+    vertex_normals,
+)
 from thesisrecon.records import RenderedView, TexturedMesh
 
 STRIP = 16
 """Rows that are coloured at a time, so that intermediate arrays stay in cache."""
 PART_SAMPLES = 2**21
 """Samples that are rasterised at a time in each thread: one takes 20 bytes."""
-BARE = (200, 200, 200)
-"""Colour of a mesh without texture and vertex colours."""
 
 
 @kernel
@@ -70,19 +79,11 @@ def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: 
 
 @dataclass(frozen=True)
 class Light:
-    """A light source at a position or at infinity.
+    """A light source at a position or at infinity."""
 
-    Parameters
-    ----------
-    direction, position : tuple of float, optional
-        Direction towards a distant light or position of a point light; exactly one of them is given.
-    color : tuple of float
-        Strength in red, green and blue; 1 leaves the texture as it is.
-    """
-
-    direction: tuple[float, float, float] | None = None
-    position: tuple[float, float, float] | None = None
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    direction: tuple[float, float, float] | None = None  #: towards a distant light
+    position: tuple[float, float, float] | None = None  #: of a point light; exactly one of both is given
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: 1 leaves the texture as it is
 
     def __post_init__(self) -> None:
         if (self.direction is None) == (self.position is None):
@@ -99,25 +100,10 @@ class Light:
 
 @dataclass(frozen=True)
 class Shading:
-    """Ambient light and light sources. Both sides of a surface are lit equally.
-
-    Parameters
-    ----------
-    ambient, lights : float, tuple of Light
-        Ambient light and light sources.
-    """
+    """Ambient light and light sources. Both sides of a surface are lit equally."""
 
     ambient: float = 0.3
     lights: tuple[Light, ...] = ()
-
-
-def _vertex_normals(mesh: TexturedMesh) -> F64:
-    """Unit normals (N, 3), area-weighted means over the adjacent faces; zero for unused vertices."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.repeat(np.cross(b - a, c - a), 3, axis=0)
-    count, corner = len(mesh.vertices), mesh.faces.ravel()
-    total = np.stack([np.bincount(corner, normal[:, d], count) for d in range(3)], axis=1)
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])
 
 
 def render_mesh(
@@ -140,7 +126,7 @@ def render_mesh(
     if shading is not None:
         # About the camera: single precision would round coordinates of a map grid.
         shading = _moved(shading, camera.centre)
-        lit = [a.astype(np.float32) for a in (mesh.vertices - camera.centre, _vertex_normals(mesh))]
+        lit = [a.astype(np.float32) for a in (mesh.vertices - camera.centre, vertex_normals(mesh))]
 
     def measure(start: int, stop: int, raster: Raster) -> None:
         valid[start:stop] = raster.face >= 0
@@ -184,8 +170,9 @@ def _in_parts(
 
 def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
     """Unlit colours (H, W, 3), 0 to 255; ``source``: texture coordinates, colours of the vertices or None."""
+    bare = (200, 200, 200)  # Colour of a mesh without texture and vertex colours
     if source is None:
-        return np.tile(np.asarray(BARE, dtype=np.float32), (*raster.face.shape, 1))
+        return np.tile(np.asarray(bare, dtype=np.float32), (*raster.face.shape, 1))
     if mesh.texture is None or mesh.uv is None:
         return raster.interpolate(source, mesh.faces)
     color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
@@ -208,3 +195,62 @@ def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) ->
     """Shade the colours (P, 3) of surface points in place."""
     lights = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
     _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lights, float(shading.ambient))
+
+
+GREY = np.array([0.299, 0.587, 0.114])
+"""Luma weights of Rec. 601."""
+
+
+def covered_pixels(rendered: RenderedView) -> B8:
+    """The pixels (H, W) whose eight neighbours are covered too; others blend with the background."""
+    return np.asarray(scipy.ndimage.binary_erosion(rendered.valid, np.ones((3, 3))))
+
+
+def match_exposure(real: U8, rendered: U8, compared: B8) -> U8:
+    """Match the exposure of a rendered image to a real one by one factor per channel (least squares)."""
+    _check(real, rendered, compared)
+    a, b = real[compared].astype(np.float64), rendered[compared].astype(np.float64)
+    factor = (a * b).sum(axis=0) / np.maximum((b * b).sum(axis=0), 1.0)
+    return np.asarray(np.clip(np.rint(rendered * factor), 0.0, 255.0), dtype=np.uint8)
+
+
+def psnr_db(real: U8, rendered: U8, compared: B8) -> float:
+    """Peak signal-to-noise ratio over all channels; infinite for equal images."""
+    _check(real, rendered, compared)
+    apart = (real.astype(np.float64) - rendered)[compared]
+    mean_square = float(np.mean(apart**2))
+    return float("inf") if mean_square == 0.0 else float(10.0 * np.log10(255.0**2 / mean_square))
+
+
+def ssim(real: U8, rendered: U8, compared: B8) -> float:
+    """Mean structural similarity of the luma (Wang, Bovik, Sheikh and Simoncelli 2004)."""
+    _check(real, rendered, compared)
+    return float(np.mean(_ssim_map(real, rendered, compared)[compared]))
+
+
+def _ssim_map(real: U8, rendered: U8, compared: B8) -> F64:
+    # Stabilising constants of SSIM for dark and uniform regions.
+    floor_luminance, floor_contrast = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
+    a, b = (np.where(compared, picture @ GREY, 0.0) for picture in (real, rendered))
+    share = np.maximum(_windowed(compared.astype(np.float64)), 1e-6)
+    mean_a, mean_b = _windowed(a) / share, _windowed(b) / share
+    spread_a = _windowed(a * a) / share - mean_a**2
+    spread_b = _windowed(b * b) / share - mean_b**2
+    common = _windowed(a * b) / share - mean_a * mean_b
+    luminance = (2.0 * mean_a * mean_b + floor_luminance) / (mean_a**2 + mean_b**2 + floor_luminance)
+    structure = (2.0 * common + floor_contrast) / (spread_a + spread_b + floor_contrast)
+    return np.asarray(luminance * structure)
+
+
+def _check(real: U8, rendered: U8, compared: B8) -> None:
+    if real.shape != rendered.shape or real.shape != (*compared.shape, 3):
+        shapes = f"{real.shape}, {rendered.shape} and {compared.shape}"
+        raise ValueError(f"images and mask must have the same size; got {shapes}")
+    if not compared.any():
+        raise ValueError("no pixel is shown by both images")
+
+
+def _windowed(values: F64) -> F64:
+    """Gaussian-weighted means (H, W), zero beyond the border."""
+    window_px = 1.5  # Standard deviation of the Gaussian window of SSIM
+    return np.asarray(scipy.ndimage.gaussian_filter(values, window_px, mode="constant", truncate=3.5))

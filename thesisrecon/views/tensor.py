@@ -23,19 +23,15 @@ from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, require_parallax_of_matches
 
-OFF_ROTATION = 1e-4
-"""Tolerance of R'R - I: a rotation written with four digits passes."""
-IN_FRONT = 0.75
-"""Share of matches that must lie in front of both cameras."""
-
 
 def _require_motion(R: F64, t: F64) -> None:
     """Check that R is a rotation within ``OFF_ROTATION`` and t three finite numbers."""
+    off_rotation = 1e-4  # Tolerance of R'R - I: a rotation written with four digits passes
     R = np.asarray(R, dtype=np.float64)
     if R.shape != (3, 3) or not np.isfinite(R).all():
         raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
     off, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
-    if not (off <= OFF_ROTATION and det > 0.0):
+    if not (off <= off_rotation and det > 0.0):
         raise ValueError(f"a rotation has R'R = I and det R = 1; this one is off by {off:.2g}, det {det:.3g}")
     if np.shape(t) != (3,) or not np.isfinite(t).all():
         raise ValueError(f"a translation is three finite numbers; got {t}")
@@ -43,17 +39,11 @@ def _require_motion(R: F64, t: F64) -> None:
 
 @dataclass(frozen=True)
 class CalibratedPair:
-    """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length.
+    """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length."""
 
-    Parameters
-    ----------
-    K1, K2, R, t : ndarray (3, 3), (3, 3), (3, 3) and (3,)
-        Intrinsics, and rotation and translation from the first to the second camera frame.
-    """
-
-    K1: F64
+    K1: F64  #: (3, 3) intrinsics, as is ``K2``
     K2: F64
-    R: F64
+    R: F64  #: (3, 3) and ``t`` (3,) from the first to the second camera frame
     t: F64
 
     def __post_init__(self) -> None:
@@ -84,61 +74,29 @@ class CalibratedPair:
 
 
 def default_intrinsics(size: tuple[int, int]) -> F64:
-    """Return K with the long side as focal length and the principal point at the image centre.
-
-    Parameters
-    ----------
-    size : tuple of int
-        Width and height in pixels.
-
-    Returns
-    -------
-    ndarray (3, 3)
-    """
+    """Return K with the long side as focal length and the principal point at the image centre."""
     f = float(max(size))
     return calibration_matrix(f, f, 0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0))
 
 
-def pair_from_fundamental(
-    F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64, small_rotation: bool = False
-) -> CalibratedPair:
+def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> CalibratedPair:
     """Compute the two cameras of F for given intrinsics (thesis, section 1.3).
 
     The fundamental matrix of the result is F exactly. The first camera has K1; of all second cameras that F
     allows, the left part is nearest to K2 R K1^-1 (least squares in coordinates of K2 and K1) with R from the
     essential matrix. Its intrinsics differ from K2 where F contradicts them.
-
-    Parameters
-    ----------
-    F : ndarray (3, 3)
-        Fundamental matrix, x2' F x1 = 0.
-    xy1, xy2 : ndarray (N, 2)
-        At least eight matches in pixels that agree with F; they select the decomposition.
-    K1, K2 : ndarray (3, 3)
-        Intrinsics, known or guessed (:func:`default_intrinsics`).
-    small_rotation : bool
-        Whether R is computed as I + [w]x, as in Avidan and Shashua; otherwise it may be any rotation.
-
-    Returns
-    -------
-    CalibratedPair
-        Cameras with a baseline of length 1.
-
-    Raises
-    ------
-    StageFailure
-        For an F of other matches, no parallax, or points behind the cameras.
     """
+    in_front = 0.75  # Share of matches that must lie in front of both cameras
     require_finite("pair_from_fundamental", F, xy1, xy2)
     require_calibration("view synthesis", K1)
     require_calibration("view synthesis", K2)
     require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
-    candidates = (_decompose_small if small_rotation else _decompose)(E / np.linalg.norm(E))
+    candidates = _decompose(E / np.linalg.norm(E))
     shares = [_ratio_in_front(R, t, rays1, rays2) for R, t in candidates]
     best = int(np.argmax(shares))
-    if not shares[best] >= IN_FRONT:
+    if not shares[best] >= in_front:
         raise StageFailure(
             "the scene is not in front of both cameras",
             f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, with the best of {len(shares)} cameras",
@@ -190,43 +148,14 @@ def _decompose(E: F64) -> list[tuple[F64, F64]]:
     return [(R, sign * U[:, 2]) for R in turns for sign in (1.0, -1.0)]
 
 
-def _decompose_small(E: F64) -> list[tuple[F64, F64]]:
-    """R = I + [w]x to first order, with both signs of t (Avidan and Shashua; Rousso et al., CVPR 1996).
-
-    E ~ [t]x (I + [w]x) is linear in the scale s of E and in s w: nine equations for four unknowns. The
-    returned rotation is that of the rotation vector w.
-    """
-    _, t = epipoles(E)
-    across = cross_matrix(t)
-    columns = [across, *(across @ cross_matrix(axis) for axis in np.eye(3))]
-    design = np.stack([column.ravel() for column in columns], axis=1)
-    solution = np.linalg.lstsq(design, E.ravel(), rcond=None)[0]
-    if not abs(solution[0]) > 1e-6 * np.linalg.norm(solution):
-        raise StageFailure(
-            "the rotation between the two images is not small",
-            "no small rotation explains the fundamental matrix",
-            "set small_rotation to False",
-        )
-    R = scipy.spatial.transform.Rotation.from_rotvec(solution[1:] / solution[0]).as_matrix()
-    return [(R, t), (R, -t)]
-
-
 @dataclass(frozen=True)
 class VirtualCamera:
-    """A virtual camera: the third camera of the seed tensor, moved from X_3 to R X_3 + t.
+    """A virtual camera: the third camera of the seed tensor, moved from X_3 to R X_3 + t."""
 
-    Parameters
-    ----------
-    rotation, translation, K : ndarray (3, 3), (3,) and (3, 3)
-        R, t in baselines, and intrinsics.
-    size : tuple of int
-        Width and height in pixels.
-    """
-
-    rotation: F64
-    translation: F64
-    K: F64
-    size: tuple[int, int]
+    rotation: F64  #: R (3, 3)
+    translation: F64  #: t (3,) in baselines
+    K: F64  #: (3, 3)
+    size: tuple[int, int]  #: width and height in pixels
 
     def __post_init__(self) -> None:
         _require_motion(self.rotation, self.translation)
@@ -241,17 +170,6 @@ def camera_at(
     """Place a virtual camera on the baseline; its rotation angle is the fraction ``s`` of that of the pair.
 
     K is interpolated if both sizes are equal, otherwise it is K2.
-
-    Parameters
-    ----------
-    pair, s : CalibratedPair, float
-        Cameras, and position in baselines from the first image (0) to the second (1), or beyond.
-    sizes : tuple
-        Width and height of both images; the view has the size of the second.
-
-    Returns
-    -------
-    VirtualCamera
     """
     turned = scipy.spatial.transform.Rotation.from_rotvec(
         s * scipy.spatial.transform.Rotation.from_matrix(pair.R).as_rotvec()
@@ -265,19 +183,11 @@ def camera_at(
 
 @dataclass(frozen=True)
 class VirtualTensor:
-    """The tensor of two images and a virtual camera.
+    """The tensor of two images and a virtual camera."""
 
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        a_i^j b_4^k - a_4^j b_i^k with its scale, which determines signs and depths.
-    P2, K : ndarray (3, 4) and (3, 3)
-        [a, a_4] beside P1 = [I 0], as :attr:`CalibratedPair.P2`, and intrinsics of the third camera.
-    """
-
-    T: F64
-    P2: F64
-    K: F64
+    T: F64  #: (3, 3, 3) a_i^j b_4^k - a_4^j b_i^k with its scale, which determines signs and depths
+    P2: F64  #: (3, 4) [a, a_4] beside P1 = [I 0], as :attr:`CalibratedPair.P2`
+    K: F64  #: (3, 3) intrinsics of the third camera
 
     @property
     def P3(self) -> F64:
@@ -295,20 +205,7 @@ class VirtualTensor:
         return VirtualTensor(_tensor(change[:3], self.P3 @ change), change[:3], self.K)
 
     def moved(self, rotation: F64, translation: F64, *, K: F64 | None = None) -> VirtualTensor:
-        """Return the tensor after a motion of the third camera from X_3 to R X_3 + t.
-
-        Parameters
-        ----------
-        rotation, translation : ndarray (3, 3), (3,)
-            R, and t in units of the baseline.
-        K : ndarray (3, 3), optional
-            New intrinsics; default: unchanged.
-
-        Returns
-        -------
-        VirtualTensor
-            The tensor; in pixels the motion is K R K_3^-1 and K t.
-        """
+        """Return the tensor after a motion of the third camera from X_3 to R X_3 + t."""
         K = self.K if K is None else K
         turn, shift = K @ rotation @ np.linalg.inv(self.K), K @ translation
         T = np.einsum("kl,ijl->ijk", turn, self.T) + np.einsum("k,ji->ijk", shift, self.P2[:, :3])
@@ -321,18 +218,7 @@ class VirtualTensor:
         return np.concatenate([along, -np.sum(along * xy2, axis=-1, keepdims=True)], axis=-1)
 
     def transfer(self, xy1: F64, xy2: F64) -> tuple[F64, F64]:
-        """Transfer matches to the third image, x''^k = x^i l_j T_i^jk, l perpendicular to epipolar lines.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (N, 2)
-            Matches in pixels.
-
-        Returns
-        -------
-        xy, inverse_depth : ndarray (N, 2) and (N,)
-            Pixels of the third image, NaN behind the camera, and 1 / z in it (z in baselines).
-        """
+        """Transfer matches to the third image, x''^k = x^i l_j T_i^jk, l perpendicular to epipolar lines."""
         x = homogenize(xy1)
         lines = self._perpendicular_lines(xy1, xy2)
         places = np.einsum("ni,nj,ijk->nk", x, lines, self.T)
@@ -345,18 +231,7 @@ class VirtualTensor:
         return np.where(seen[:, None], dehomogenize(places), np.nan), inverse_depth
 
     def disparity_per_inverse_depth(self, xy1: F64, xy2: F64) -> F64:
-        """Return the displacement in image 2 per unit of inverse depth in the third view, to first order.
-
-        Parameters
-        ----------
-        xy1, xy2 : ndarray (N, 2)
-            Matches in pixels.
-
-        Returns
-        -------
-        ndarray (N,)
-            Pixels per unit of inverse depth; NaN at the epipole.
-        """
+        """Return the displacement in image 2 per unit of inverse depth in the third view, to first order."""
         x = homogenize(xy1)
         a, a4 = x @ self.P2[:, :3].T, self.P2[:, 3]
         lines, third = self._perpendicular_lines(xy1, xy2), self.P3[2]
@@ -369,19 +244,7 @@ class VirtualTensor:
 
 
 def seed_of_two(pair: CalibratedPair, *, first: bool = False) -> VirtualTensor:
-    """Return the seed tensor <1, 2, 2> of two views, in which one view is also the third.
-
-    Parameters
-    ----------
-    pair : CalibratedPair
-        The cameras.
-    first : bool
-        Whether the first view is the third one, <1, 2, 1>; otherwise the second.
-
-    Returns
-    -------
-    VirtualTensor
-    """
+    """Return the seed tensor <1, 2, 2> of two views, in which one view is also the third."""
     P3, K = (np.eye(3, 4), pair.K1) if first else (pair.P2, pair.K2)
     return VirtualTensor(_tensor(pair.P2, P3), pair.P2, K)
 

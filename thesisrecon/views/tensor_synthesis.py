@@ -21,14 +21,8 @@ from thesisrecon.imaging.raster import run_in_strips
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
 from thesisrecon.views.tensor import CalibratedPair, VirtualCamera, VirtualTensor, seed_of_two
 
-SURFACE_PX = 1.0
-"""Largest difference of disparity between neighbouring pixels of one surface."""
-SPARSE = 16
-"""Subsampling step for medians."""
 AGREE_PX = 1.5
 """Tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise."""
-MIN_SEEN = 0.05
-"""Minimum share of the image that must show the scene."""
 
 
 @kernel
@@ -121,12 +115,14 @@ def _transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) ->
 
 def _surface_step(virtual: VirtualTensor, places: F32) -> float:
     """``SURFACE_PX`` as a difference of inverse depth in the third view, for the median pixel."""
-    known = np.isfinite(places[::SPARSE, ::SPARSE]).all(axis=2)
-    y, x = (SPARSE * index for index in np.nonzero(known))
+    surface_px = 1.0  # Largest difference of disparity between neighbouring pixels of one surface
+    sparse = 16  # Subsampling step for medians
+    known = np.isfinite(places[::sparse, ::sparse]).all(axis=2)
+    y, x = (sparse * index for index in np.nonzero(known))
     pixels = np.stack([x, y], axis=1).astype(np.float64)
     found = virtual.disparity_per_inverse_depth(pixels, places[y, x].astype(np.float64))
     found = found[np.isfinite(found)]
-    return SURFACE_PX / float(np.median(found)) if len(found) else np.inf
+    return surface_px / float(np.median(found)) if len(found) else np.inf
 
 
 def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
@@ -156,22 +152,12 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
 
 @dataclass(frozen=True)
 class TensorSynthesis:
-    """Two images prepared for view synthesis by :func:`prepare_synthesis`.
-
-    Parameters
-    ----------
-    pair, gain : CalibratedPair, ndarray (3,)
-        Cameras, and factor of the exposure of the second image.
-    levels : tuple of ndarray (H, W, 4)
-        Colours, and 1 where the correspondence is known, 0 where it is guessed.
-    places : tuple of ndarray (H, W, 2)
-        Corresponding pixels in the other image.
-    """
+    """Two images prepared for view synthesis by :func:`prepare_synthesis`."""
 
     pair: CalibratedPair
-    levels: tuple[F32, F32]
-    places: tuple[F32, F32]
-    gain: F32
+    levels: tuple[F32, F32]  #: (H, W, 4) colours, and 1 where the correspondence is known, 0 where guessed
+    places: tuple[F32, F32]  #: (H, W, 2) corresponding pixels in the other image
+    gain: F32  #: (3,) factor of the exposure of the second image
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -180,22 +166,8 @@ class TensorSynthesis:
         return (w1, h1), (w2, h2)
 
     def render(self, camera: VirtualCamera, *, threads: int = 1) -> U8:
-        """Render a virtual camera: both images blended by its position, holes filled from behind.
-
-        Parameters
-        ----------
-        camera, threads : VirtualCamera, int
-            Camera, and number of threads; the result does not depend on it.
-
-        Returns
-        -------
-        ndarray (H, W, 3) of uint8
-
-        Raises
-        ------
-        StageFailure
-            If the camera sees almost nothing of the scene.
-        """
+        """Render a virtual camera: both images blended by its position, holes filled from behind."""
+        min_seen = 0.05  # Minimum share of the image that must show the scene
         seed = seed_of_two(self.pair)
         moved = [s.moved(camera.rotation, camera.translation, K=camera.K) for s in (seed, seed.swapped)]
         step = _surface_step(moved[0], self.places[0])
@@ -205,10 +177,10 @@ class TensorSynthesis:
             source, front = forward_map(xy, near, size=camera.size, step=step, threads=threads)
             layers.append((sample(levels, source, threads=threads), front))
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
-        if not seen.mean() >= MIN_SEEN:
+        if not seen.mean() >= min_seen:
             raise StageFailure(
                 "the virtual camera sees almost nothing of the scene",
-                f"{100.0 * seen.mean():.1f} % of its image, needed {100.0 * MIN_SEEN:.0f} %",
+                f"{100.0 * seen.mean():.1f} % of its image, needed {100.0 * min_seen:.0f} %",
                 "move the camera less (in baselines) or rotate it back",
             )
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
@@ -263,28 +235,7 @@ def prepare_synthesis(
     gain: ArrayLike = (1.0, 1.0, 1.0),
     agree_px: float = AGREE_PX,
 ) -> TensorSynthesis:
-    """Complete the correspondences of all pixels and prepare the images for any virtual camera.
-
-    Parameters
-    ----------
-    pair, images : CalibratedPair, tuple of array_like (H, W, 3)
-        Cameras, guessed or known, and levels 0 to 255.
-    places : tuple of ndarray (H, W, 2)
-        Corresponding pixels in the other image, NaN if unknown.
-    gain : array_like (3,)
-        Factor of the exposure of the second image.
-    agree_px : float
-        Tolerance of the forward-backward check; inf if all correspondences are right.
-
-    Returns
-    -------
-    TensorSynthesis
-
-    Raises
-    ------
-    StageFailure
-        If no correspondence is known.
-    """
+    """Complete the correspondences of all pixels and prepare the images for any virtual camera."""
     known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
     for side in (0, 1):
         if not known[side].any():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Image
-from thesisrecon.stereo._planar import PlanarRectification
+from thesisrecon.stereo._frames import PlanarRectification
 from validation.references.libraries import cv2
 from validation.references.sift import detect_sift, grey_of
 

@@ -10,8 +10,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config import preset
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface._mesh import face_areas
-from thesisrecon.surface.linear import surface_from_depth
+from thesisrecon.surface._mesh import face_areas, surface_from_depth
 from thesisrecon.surface.model import SurfaceModel
 from validation.metrics.depth import true_depth, true_from_maps
 from validation.references.open3d_geometry import Nearest, OpenTsdf, poisson_mesh

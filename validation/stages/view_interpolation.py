@@ -17,7 +17,7 @@ from thesisrecon.arrays import F32, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
-from thesisrecon.views import _image_similarity as similarity
+from thesisrecon.views import render as similarity
 from thesisrecon.views.tensor import CalibratedPair, camera_at, default_intrinsics
 from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.references.libraries import one_thread

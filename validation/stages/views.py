@@ -15,7 +15,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMesh
 from thesisrecon.surface._texture_blending import depth_buffers, prepare_views
 from thesisrecon.surface.model import SurfaceModel
-from thesisrecon.views._image_similarity import covered_pixels, match_exposure, psnr_db, ssim
+from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, ssim
 from validation.references.open3d_geometry import OpenTsdf
 from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task, each, row
 from validation.runs.scenes import load_images

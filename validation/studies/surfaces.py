@@ -10,7 +10,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap
 from thesisrecon.surface.bspline import BSplineSurface
-from thesisrecon.surface.linear import LinearSurface
+from thesisrecon.surface.model import LinearSurface
 from validation.runs.study import Part
 from validation.runs.tables import Metric
 

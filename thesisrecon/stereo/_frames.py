@@ -1,13 +1,16 @@
-"""Planar rectification: homographies that map epipolar lines to common rows.
+"""Rectified frames of a pair: homographies (planar), and half epipolar lines as rows (polar).
 
-All such homographies have, with the line at infinity at phi + pi/2 of the pencil, the rows v = -L p(phi) and
-w = L p(phi + pi/2), so that y = v'x / w'x is the tangent of the angle of x minus phi in both views. Free
-parameters are phi, a unit of length and the first rows; the methods differ in their choice.
+All homographies that map epipolar lines to common rows have, with the line at infinity at phi + pi/2 of the
+pencil, the rows v = -L p(phi) and w = L p(phi + pi/2), so that y = v'x / w'x is the tangent of the angle of x
+minus phi in both views. Free parameters are phi, a unit of length and the first rows; the methods differ in
+their choice. Polar frames (Pollefeys, Koch and Van Gool, "A simple and efficient rectification method for
+general motion", ICCV 1999) allow epipoles anywhere, and their size is bounded.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -21,23 +24,53 @@ from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
     MIN_MATCHES,
     EpipolarPair,
+    EpipolarPencil,
+    HalfLines,
     common_crop,
     frame_size,
+    image_corners,
     plane_from_angle,
     scale_and_shift,
 )
-from thesisrecon.stereo._rectification_quality import (
-    disparity_gradients,
-    homography_jacobians,
-    singular_values,
-)
 
-SEARCH = 96
-"""Lines at infinity that are tried before the best is refined."""
-PRECISION = 1e-4
-"""Relative change of the distortion and of its parameters at which the descent ends."""
-MAX_LOG_SCALE, MAX_SHEAR = 0.05, 0.06
-"""Limits of the least-squares adjustment of the first rows."""
+
+def matches_in_frame(
+    rectification: Rectification, matches: Sequence[F64], *, within: bool = True
+) -> tuple[F64, F64]:
+    """Positions in the frame (M, 2) of the matches, two arrays (N, 2), that are mapped in both images."""
+    mapped = rectification.rectified_from_original
+    left, right = (mapped(side, xy, within=within) for side, xy in enumerate(matches))
+    seen = np.isfinite(left).all(axis=1) & np.isfinite(right).all(axis=1)
+    return left[seen], right[seen]
+
+
+def disparity_gradients(left: F64, right: F64) -> F64:
+    """Gradients (M, 2) of a quadratic polynomial fitted to the disparities of matches (N, 2), M <= 300."""
+    max_matches = 300  # Limit of the number of matches to which disparity gradients are fitted
+    every = max(len(left) // max_matches, 1)
+    left, right = left[::every], right[::every]
+    middle = 0.5 * (left + right)
+    middle = middle - middle.mean(axis=0)
+    unit = float(np.abs(middle).max(initial=1e-12))
+    x, y = (middle / unit).T
+    design = np.stack([x, y, x * x, x * y, y * y, np.ones_like(x)], axis=1)
+    # Minimum-norm solution for few or collinear matches.
+    c = np.linalg.lstsq(design, (left[:, 0] - right[:, 0]) / unit, rcond=1e-6)[0]
+    return np.stack([c[0] + 2.0 * c[2] * x + c[3] * y, c[1] + c[3] * x + 2.0 * c[4] * y], axis=1)
+
+
+def homography_jacobians(H: F64, xy: F64) -> F64:
+    """Derivatives (N, 2, 2) of a homography at positions (N, 2)."""
+    xh = homogenize(xy) @ H.T
+    moved = xh[:, :2] / xh[:, 2:]
+    return np.asarray((H[None, :2, :2] - moved[:, :, None] * H[2, :2]) / xh[:, 2, None, None])
+
+
+def singular_values(J: F64) -> F64:
+    """Singular values (N, 2) of 2 x 2 matrices, the larger first."""
+    a = 0.5 * np.hypot(J[:, 0, 0] + J[:, 1, 1], J[:, 1, 0] - J[:, 0, 1])
+    b = 0.5 * np.hypot(J[:, 0, 0] - J[:, 1, 1], J[:, 1, 0] + J[:, 0, 1])
+    return np.stack([a + b, np.abs(a - b)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -149,19 +182,21 @@ def minimum_distortion(pair: EpipolarPair) -> PlanarRectification:
     symmetric in enlargement and reduction, plus a quarter of the mean squared disparity gradient. Hartley
     makes the first image similar to the second, Loop and Zhang preserve each by itself; this is a compromise.
     """
+    precision = 1e-4  # Relative change of the distortion and of its parameters at which the descent ends
+    max_log_scale, max_shear = 0.05, 0.06  # Limits of the least-squares adjustment of the first rows
     low, high = _admissible_lines(pair)
     # Keep away from lines that touch the field of view, where derivatives are unbounded.
     inset = 0.01 * (high - low)
     start = np.zeros(5)
     start[0] = np.clip(_loop_zhang_line(pair), low + 2.0 * inset, high - 2.0 * inset)
-    bound = np.array([MAX_LOG_SCALE, MAX_SHEAR, MAX_LOG_SCALE, MAX_SHEAR])
+    bound = np.array([max_log_scale, max_shear, max_log_scale, max_shear])
     found = scipy.optimize.least_squares(
         lambda q: _distortion_residuals(pair, *_adjusted(pair, q)),
         start,
         bounds=(np.append(low + inset, -bound), np.append(high - inset, bound)),
         max_nfev=40,
-        ftol=PRECISION,
-        xtol=PRECISION,
+        ftol=precision,
+        xtol=precision,
     )
     return _crop_and_scale(pair, _homographies_of_rows(pair, *_adjusted(pair, found.x)))
 
@@ -191,6 +226,7 @@ def _distortion_residuals(pair: EpipolarPair, first: F64, rows: F64) -> F64:
 
 def _loop_zhang_line(pair: EpipolarPair) -> float:
     """phi of Loop and Zhang's line at infinity phi + pi/2: least variation of the third coordinate."""
+    search = 96  # Lines at infinity that are tried before the best is refined
     z = [homogenize(pair.pencil.normalized(s, pair.regions[s])) for s in (0, 1)]
 
     def variation(phi: F64) -> F64:
@@ -200,12 +236,12 @@ def _loop_zhang_line(pair: EpipolarPair) -> float:
 
     low, high = _admissible_lines(pair)
     # At the ends the line at infinity touches the field of view.
-    tried = low + (high - low) * (np.arange(SEARCH) + 0.5) / SEARCH
+    tried = low + (high - low) * (np.arange(search) + 0.5) / search
     with np.errstate(all="ignore"):
         costs = variation(tried)
     if not np.isfinite(costs).any():
         raise StageFailure("no line can be sent to infinity", advice="rectify in polar coordinates")
-    k, step = int(np.nanargmin(costs)), (high - low) / SEARCH
+    k, step = int(np.nanargmin(costs)), (high - low) / search
     bounds = max(low, tried[k] - step), min(high, tried[k] + step)
     found = scipy.optimize.minimize_scalar(variation, bounds=bounds, method="bounded")
     phi = float(found.x) if found.fun <= costs[k] else float(tried[k])
@@ -292,3 +328,132 @@ def _mapped(H: F64, xy: F64) -> F64:
         reason = "the line sent to infinity crosses the images"
         raise StageFailure(reason, advice="rectify in polar coordinates")
     return np.asarray(xh[:, :2] / xh[:, 2:])
+
+
+@dataclass(frozen=True)
+class PolarRectification(Rectification):
+    """Polar maps of two images to a common rectified frame.
+
+    Row r shows the half-plane ``angles[r]``, with linear interpolation between rows. The point s px farther
+    from the epipole than the image centre (nearer if the pencil is flipped) has the column ``scales[side]`` s
+    + ``shears[side]`` r - ``origins[side]``.
+    """
+
+    pencil: EpipolarPencil
+    angles: F64
+    scales: F64
+    shears: F64
+    origins: F64
+    size: tuple[int, int]
+
+    def _original(self, side: int, xy: F64) -> F64:
+        return self._on_lines(side, self.pencil.half_lines(side, self._angle_of(xy[:, 1])), xy)
+
+    def _on_lines(self, side: int, lines: HalfLines, xy: F64) -> F64:
+        along = (xy[:, 0] + self.origins[side] - self.shears[side] * xy[:, 1]) / self.scales[side]
+        t = self._sign * along / self.pencil.units[side] + lines.sagitta
+        pixels = self.pencil.pixels(side, lines.foot + t[:, None] * lines.direction)
+        return np.where(lines.on_half(t)[:, None], pixels, np.nan)
+
+    def _rectified(self, side: int, xy: F64) -> F64:
+        phi = self.pencil.angles(side, xy, about=0.5 * float(self.angles[0] + self.angles[-1]))
+        lines, rows = self.pencil.half_lines(side, phi), self._row_of(phi)
+        t = np.sum(self.pencil.normalized(side, xy) * lines.direction, axis=1)
+        along = self._sign * self.pencil.units[side] * (t - lines.sagitta)
+        columns = self.scales[side] * along + self.shears[side] * rows - self.origins[side]
+        return np.stack([columns, rows], axis=1)
+
+    def _lookup(self, side: int, rows: range) -> F64:
+        width = self.size[0]
+        lines = self.pencil.half_lines(side, self.angles[rows.start : rows.stop])
+        foot, direction, distance = (
+            np.repeat(part, width, axis=0) for part in (lines.foot, lines.direction, lines.distance)
+        )
+        columns = np.tile(np.arange(float(width)), len(rows))
+        xy = np.stack([columns, np.repeat(np.array(rows, dtype=np.float64), width)], axis=1)
+        found = self._on_lines(side, HalfLines(foot, direction, distance, lines.epipole), xy)
+        return found.reshape(len(rows), width, 2)
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.pencil.flipped else 1.0
+
+    def _angle_of(self, rows: F64) -> F64:
+        """Angles of rows (N,), which may be fractional; NaN more than half a row outside."""
+        last = len(self.angles) - 1
+        valid = (rows >= -0.5) & (rows <= last + 0.5)
+        k = np.clip(np.floor(np.where(valid, rows, 0.0)), 0, last - 1).astype(np.int64)
+        step = self.angles[k + 1] - self.angles[k]
+        return np.where(valid, self.angles[k] + (rows - k) * step, np.nan)
+
+    def _row_of(self, phi: F64) -> F64:
+        """Inverse of :meth:`_angle_of`."""
+        last = len(self.angles) - 1
+        k = np.searchsorted(self._sign * self.angles, self._sign * phi, side="right") - 1
+        k = np.clip(k, 0, last - 1)
+        rows = k + (phi - self.angles[k]) / (self.angles[k + 1] - self.angles[k])
+        return np.where((rows >= -0.5) & (rows <= last + 0.5), rows, np.nan)
+
+
+def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
+    """Rectify in polar coordinates with bounded reduction (2.5).
+
+    Adjacent rows are at most one pixel apart in the middle of each half-line, and closer where its end would
+    be reduced by more than ``MAX_SHRINK`` (1: no pixel is lost, as in the paper). The row spacing is a
+    function of the angle whose integral counts the rows, instead of walking from line to line.
+
+    ``aligned`` reduces the disparity gradients of the matches by shear and scale along the rows.
+    """
+    pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
+    phi = _half_planes(pair)
+    both = [pencil.chords(side, phi) for side in (0, 1)]
+    angles = _rows_of(pencil, phi, both)[::sign]
+    frame = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
+    frame = _align_disparities(frame, pair) if aligned else frame
+    ends = []
+    for side, (lines, enter, leave) in enumerate(both):
+        met = leave >= enter
+        rim = [(lines.foot + t[:, None] * lines.direction)[met] for t in (enter, leave)]
+        xy = frame.rectified_from_original(side, pencil.pixels(side, np.concatenate(rim)), within=False)
+        ends.append(xy[np.isfinite(xy).all(axis=1)])
+    low, high = common_crop(ends, matches_in_frame(frame, pair.matches, within=False))
+    extent = np.array([(high - low)[:, 0].max() + 1.0, len(angles)])
+    return replace(frame, origins=low[:, 0].copy(), size=frame_size(extent, pair))
+
+
+def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRectification:
+    max_log_scale, max_shear = 0.1, 0.06  # Limits of the alignment of the disparities along the rows
+    left, right = matches_in_frame(frame, pair.matches, within=False)
+    if len(left) < MIN_MATCHES:
+        return frame
+    # The disparity slope is the difference of the scales along x and of the shears along y.
+    slope = disparity_gradients(left, right).mean(axis=0)
+    scale = np.exp(np.clip(-slope[0], -max_log_scale, max_log_scale))
+    shear = np.clip(-0.5 * slope[1], -max_shear, max_shear)
+    scales = np.array([max(scale, 1.0), max(1.0 / scale, 1.0)])
+    return replace(frame, scales=scales, shears=np.array([shear, -shear]))
+
+
+def _half_planes(pair: EpipolarPair) -> F64:
+    """Angles over the arc, including those of the image corners, where the row spacing is extreme."""
+    angles = 4096  # Number of half-planes at which the row spacing is computed
+    low, high = pair.arc
+    corners, about = [image_corners(size) for size in pair.pencil.sizes], 0.5 * (low + high)
+    peaks = np.concatenate([pair.pencil.angles(side, xy, about=about) for side, xy in enumerate(corners)])
+    return np.unique(np.concatenate([np.linspace(low, high, angles), peaks[(peaks > low) & (peaks < high)]]))
+
+
+def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]]) -> F64:
+    """Angles of the rows, increasing (H,)."""
+    per_radian = np.zeros(len(phi))
+    for side, (lines, enter, leave) in enumerate(both):
+        met = leave >= enter
+        for t, shrink in ((0.5 * (enter + leave), 1.0), (enter, MAX_SHRINK), (leave, MAX_SHRINK)):
+            at = np.where(met, t, 0.0)[:, None]
+            sweep_rate = pencil.sweep_rate(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
+            per_radian = np.maximum(per_radian, np.where(met, sweep_rate / shrink, 0.0))
+    # The maximum of both ends bounds the reduction between the samples.
+    each = np.maximum(per_radian[:-1], per_radian[1:]) * np.diff(phi)
+    rows = np.concatenate([[0.0], np.cumsum(np.maximum(each, 1e-12))])
+    count = max(int(np.ceil(rows[-1])) + 1, 2)
+    return np.interp(np.linspace(0.0, rows[-1], count), rows, phi)
