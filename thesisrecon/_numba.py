@@ -1,8 +1,8 @@
-"""Compiled functions (kernels): numba with a disk cache that is keyed by all code a kernel is made from.
+"""Compiled functions (kernels), the threads that run them, and digests of code.
 
-numba's own cache looks at one file only: after an edit of a function that a kernel of another module calls,
-the old machine code would run. Here the key is a digest of the kernel's code, its constants and options, and
-the same of everything that it refers to.
+numba's own disk cache looks at one file only: after an edit of a function that a kernel of another module
+calls, the old machine code would run. Here the key is a digest of the kernel's code, its constants and
+options, and the same of everything that it refers to. Results of stages are stored under such digests, too.
 """
 
 # numba's own modules have no types.
@@ -11,18 +11,27 @@ the same of everything that it refers to.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import dis
+import functools
 import gc
 import hashlib
+import importlib.util
+import io
 import logging
 import os
 import pickle
 import stat
 import sys
+import sysconfig
 import tempfile
+import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
+from typing import Any, ParamSpec, TypeVar, overload
 
 import numba
 import numpy as np
@@ -33,14 +42,13 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numpy.typing import NDArray
 
-from thesisrecon._code_digest import code_digest
-
+P = ParamSpec("P")
+T = TypeVar("T")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _log = logging.getLogger(__name__)
 
-CACHE_VARIABLE = "NUMBA_CACHE_DIR"
-"""Environment variable: the folder of the compiled kernels."""
+CACHE_VARIABLE = "NUMBA_CACHE_DIR"  # Environment variable: the folder of the compiled kernels
 
 OPTIONS = {"nopython": True, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 
@@ -64,17 +72,8 @@ def kernel(**options: Any) -> Callable[[Function], Function]: ...
 def kernel(function: Any = None, **options: Any) -> Any:
     """Compile a function with numba on its first call and keep the machine code on disk.
 
-    Parameters
-    ----------
-    function : callable, optional
-        The function; without it, a decorator.
-    **options
-        Options of `numba.njit`, such as ``fastmath``.
-
-    Returns
-    -------
-    numba dispatcher or decorator
-        The compiled function. It releases the global interpreter lock, and divides by zero as NumPy does.
+    It releases the global interpreter lock, and divides by zero as NumPy does. ``options`` are those of
+    `numba.njit`, such as ``fastmath``; with options only, a decorator is returned.
     """
     if function is None:
         return lambda function: kernel(function, **options)
@@ -163,36 +162,28 @@ class KernelCache:
 
 @cache
 def _warn_once(folder: Path, reason: str) -> None:
-    _log.warning(
-        "compiled kernels cannot be kept in %s (%s): each process compiles them again; "
-        "set the variable %s to a writable folder",
-        folder,
-        reason,
-        CACHE_VARIABLE,
-    )
+    again = f"each process compiles them again; set the variable {CACHE_VARIABLE} to a writable folder"
+    _log.warning("compiled kernels cannot be kept in %s (%s): %s", folder, reason, again)
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: in NUMBA_CACHE_DIR, beside the package, or in the user's cache.
+    """Folder of the compiled kernels: NUMBA_CACHE_DIR, or the first of these that can be written to.
 
-    Returns
-    -------
-    Path
-        The first folder that can be written to; else an own one for temporary files.
+    They are one beside the package, one in the user's cache, and an own one for temporary files.
     """
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE]) / "thesisrecon"
     beside = PACKAGE / "__pycache__" / "kernels"
-    with contextlib.suppress(OSError):
-        beside.mkdir(parents=True, exist_ok=True)
-        if os.access(beside, os.W_OK):
-            return beside
+    places = [beside]
     # Path.home fails in a container whose user has neither HOME nor an entry of a name.
-    with contextlib.suppress(OSError, RuntimeError):
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "thesisrecon" / "kernels"
-        home.mkdir(parents=True, exist_ok=True)
-        if os.access(home, os.W_OK):
-            return home
+    with contextlib.suppress(RuntimeError):
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        places.append(home / "thesisrecon" / "kernels")
+    for place in places:
+        with contextlib.suppress(OSError):
+            place.mkdir(parents=True, exist_ok=True)
+            if os.access(place, os.W_OK):
+                return place
     with contextlib.suppress(OSError):
         own = Path(tempfile.gettempdir()) / f"thesisrecon-kernels-{os.getuid()}"
         own.mkdir(mode=0o700, exist_ok=True)
@@ -227,3 +218,229 @@ def copy_to(out: Any, values: Any) -> None:
     """Copy a vector inside kernels: ``out[:] = values`` without a check of the shapes and its message."""
     for k in range(len(out)):
         out[k] = values[k]
+
+
+class ThreadPool(ThreadPoolExecutor):
+    """A pool of threads. If none can be started (limit of a container or user), the calling thread works."""
+
+    def __init__(self, threads: int) -> None:
+        super().__init__(max(threads, 1))
+        self.alone = False
+        try:
+            super().submit(int)
+        except RuntimeError:
+            self.alone = True
+
+    def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Give a task to a thread, or process it."""
+        if not self.alone:
+            return super().submit(fn, *args, **kwargs)
+        done = Future[T]()
+        try:
+            done.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def _adjust_thread_count(self) -> None:
+        try:
+            super()._adjust_thread_count()
+        except RuntimeError:
+            # Those that could be started process all tasks.
+            if not self._threads:
+                raise
+
+
+_IMPORT = dis.opmap["IMPORT_NAME"]
+_LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
+
+# Only the names of these libraries are hashed, even if the value itself belongs to one.
+_BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
+_PLAIN = {int, float, str, bytes, bool, type(None)}
+
+
+def code_digest(*values: Any) -> str:
+    """SHA-256 digest of functions, classes or objects and of all code that they refer to.
+
+    Constants, defaults, closures, base classes, methods, fields and imports inside functions are followed.
+    Of an installed library only the name is hashed, unless a value belongs to it. Comments, docstrings and
+    line numbers have no effect. Objects are hashed by their pickled state; an object that cannot be pickled
+    (of a C++ library, for example) gives a new digest each time, so stored results are never used for it.
+    """
+    walk = _Walk({"thesisrecon", *(_package_of(value) for value in values)} - _BY_NAME)
+    walk.follow(values)
+    return hashlib.sha256("".join(f"{text}\0" for text in walk.found).encode()).hexdigest()
+
+
+def _package_of(value: Any) -> str:
+    module = getattr(value, "__module__", None) or type(value).__module__
+    return str(module).partition(".")[0]
+
+
+@cache
+def _is_library(package: str) -> bool:
+    if package in sys.builtin_module_names or package == "builtins":
+        return True
+    module = sys.modules.get(package)
+    # A library that is imported on use may not be loaded.
+    found = importlib.util.find_spec(package) if module is None else None
+    file = getattr(module, "__file__", None) or getattr(found, "origin", None)
+    # Functions defined at a prompt belong to __main__, whose file may be that of an installed command.
+    if package == "__main__" or not file:
+        return False
+    return any(Path(file).resolve().is_relative_to(folder) for folder in _LIBRARIES)
+
+
+class _Pickler(pickle.Pickler):
+    """Collects the functions and classes that an object refers to; pickle notes their names only."""
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        super().__init__(stream, 5)
+        self.code: list[Any] = []
+
+    def persistent_id(self, value: Any) -> str | None:
+        if isinstance(value, (FunctionType, type, ModuleType)) or hasattr(value, "py_func"):
+            self.code.append(value)
+            return str(value.__name__)
+        return None
+
+
+class _Walk:
+    """Collects as text everything that the behaviour of a value depends on."""
+
+    def __init__(self, packages: set[str]) -> None:
+        self._packages = packages
+        self._seen: dict[int, Any] = {}  # keeps the objects, so that no identity is used twice
+        self.found: list[str] = []
+
+    def _followed(self, module: str) -> bool:
+        package = str(module).partition(".")[0]
+        return package in self._packages or not _is_library(package)
+
+    def follow(self, value: Any) -> None:
+        """Add everything that the behaviour of a value depends on."""
+        if type(value) in _PLAIN:
+            self.found.append(repr(value))
+            return
+        # A kernel; other objects may answer to any name.
+        if hasattr(value, "targetoptions") and isinstance(getattr(value, "py_func", None), FunctionType):
+            self.follow(sorted(value.targetoptions.items()))
+            value = value.py_func
+        if isinstance(value, (staticmethod, classmethod, MethodType)):
+            value = value.__func__
+        if isinstance(value, FunctionType):
+            self._function(value)
+        elif isinstance(value, type):
+            self._class(value)
+        elif isinstance(value, property):
+            self.follow((value.fget, value.fset))
+        elif isinstance(value, functools.cached_property):
+            self.follow(value.func)
+        elif isinstance(value, functools.partial):
+            self.follow((value.func, value.args, value.keywords))
+        elif hasattr(value, "__wrapped__"):
+            self.follow(value.__wrapped__)
+        else:
+            self._plain(value)
+
+    def _plain(self, value: Any) -> None:
+        library = not self._followed(type(value).__module__)
+        if type(value) in (list, set, frozenset) or isinstance(value, tuple):
+            self.found.append(f"{type(value).__name__} {len(value)}")
+            # The order of a set changes from process to process.
+            for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
+                self.follow(item)
+        elif type(value) is MappingProxyType or (isinstance(value, dict) and library):
+            self.found.append(f"mapping {len(value)}")
+            for key, item in value.items():
+                self.follow((key, item))
+        elif isinstance(value, np.ndarray):
+            self.found.append(f"{value.dtype} {value.shape} {value.tobytes().hex()}")
+        elif isinstance(value, ModuleType):
+            self.found.append(value.__name__)
+        elif isinstance(value, (int, float, complex, str, bytes, np.generic, np.dtype, Path, type(None))):
+            self.found.append(repr(value))
+        else:
+            self._class(type(value))
+            if id(value) in self._seen:
+                return
+            self._seen[id(value)] = value
+            if dataclasses.is_dataclass(value):
+                for field in dataclasses.fields(value):
+                    self.follow((field.name, getattr(value, field.name, None)))
+            elif library and isinstance(name := getattr(value, "__qualname__", None), str):
+                owner = getattr(value, "__self__", None)
+                self.found.append(name)
+                self.follow(None if isinstance(owner, type) else owner)
+            else:
+                self._state(value)
+
+    def _state(self, value: Any) -> None:
+        """The pickled state of an object, and the functions and classes in it."""
+        stream = io.BytesIO()
+        pickler = _Pickler(stream)
+        try:
+            pickler.dump(value)
+            self.found.append(hashlib.sha256(stream.getvalue()).hexdigest())
+        except Exception:
+            # Any class may raise anything here.
+            self.found.append(uuid.uuid4().hex)
+        self.follow(pickler.code)
+
+    def _function(self, function: FunctionType) -> None:
+        self.found.append(f"{function.__module__}.{function.__qualname__}")
+        if id(function) in self._seen or not self._followed(function.__module__):
+            return
+        self._seen[id(function)] = function
+        self.follow((function.__defaults__, function.__kwdefaults__))
+        for cell in function.__closure__ or ():
+            try:
+                self.follow(cell.cell_contents)
+            except ValueError:  # not yet filled
+                self.found.append("empty")
+        self._code(function.__code__, function)
+
+    def _class(self, kind: type) -> None:
+        self.found.append(f"{kind.__module__}.{kind.__qualname__}")
+        if id(kind) in self._seen or not self._followed(kind.__module__):
+            return
+        self._seen[id(kind)] = kind
+        self.found.append(str(vars(kind).get("__annotations__", "")))
+        self.follow(kind.__bases__)
+        for name, member in list(vars(kind).items()):
+            # Python and its libraries note other things there, some of them when an instance is pickled.
+            noted = name.startswith("__") and not hasattr(member, "__get__")
+            if not noted and name not in ("_abc_impl", "_is_protocol", "_is_runtime_protocol"):
+                self.found.append(name)
+                self.follow(member)
+
+    def _code(self, code: CodeType, function: FunctionType) -> None:
+        self.found.append(code.co_code.hex())
+        names = f"{code.co_names} {code.co_varnames} {code.co_freevars}"
+        self.found.append(f"{names} {code.co_exceptiontable.hex()}")
+        for constant in code.co_consts:
+            if isinstance(constant, CodeType):
+                self._code(constant, function)
+            elif constant != function.__doc__:
+                self.follow(constant)
+        modules = []
+        for name in code.co_names:
+            if name in function.__globals__:
+                value = function.__globals__[name]
+                modules += [value] if isinstance(value, ModuleType) else []
+                self.found.append(name)
+                self.follow(value)
+        operations, arguments = code.co_code[::2], code.co_code[1::2]
+        # Few functions import.
+        places = [k for k, o in enumerate(operations) if o == _IMPORT] if _IMPORT in operations else []
+        for name in (code.co_names[arguments[k]] for k in places if arguments[k] < len(code.co_names)):
+            with contextlib.suppress(ImportError):
+                # `from . import name` has no module name.
+                modules += [importlib.import_module(name)] if name and self._followed(name) else []
+        for module in modules:
+            if self._followed(module.__name__):
+                for name in code.co_names:
+                    value = getattr(module, name, None)
+                    if isinstance(value, ModuleType) and value not in modules:
+                        modules.append(value)
+                    self.follow(value)

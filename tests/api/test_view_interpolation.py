@@ -199,7 +199,7 @@ def test_the_command_writes_frames_an_animation_and_a_page(tmp_path, capsys):
     said = capsys.readouterr()
     assert said.out.splitlines()[0] == f"3 frames of 512 x 384 px and interpolation.webp written to {out}"
     names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
-    assert sorted(path.name for path in out.iterdir()) == [*names, "strip.html"]
+    assert sorted(path.name for path in out.iterdir()) == [".lock", *names, "strip.html"]
     reported = json.loads((out / "frames.json").read_text(encoding="utf-8"))
     assert reported["images"] == ["0006.jpg", "0007.jpg"]
     assert reported["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}

@@ -13,21 +13,13 @@ from thesisrecon.cli.main import app
 PACKAGE = Path(thesisrecon.__file__).parent
 WRITERS = ("reconstruct", "demo", "compare", "render", "interpolate", "export")
 COMMANDS = {
-    "api/models.py": ("export",),
-    "api/export.py": ("export",),
-    "io/_images.py": ("export",),
-    "cli/compare.py": ("compare",),
-    "cli/export.py": ("export",),
-    "cli/runs.py": ("reconstruct",),
-    "cli/views.py _size": ("render",),
-    "cli/views.py _color": ("render",),
-    "cli/views.py interpolate": ("interpolate",),
-    "api/reconstruct.py": ("reconstruct",),
-    "io/_outputs.py": WRITERS,
-    "runtime/_run_folder.py": WRITERS,
-    "runtime/_executors.py": ("reconstruct",),
-    "cli/view_files.py": ("reconstruct",),
-}
+    "api/models.py": ("export",), "api/export.py": ("export",), "io/_images.py": ("export",),
+    "cli/results.py compare": ("compare",), "cli/results.py export": ("export",),
+    "cli/runs.py": ("reconstruct",), "cli/results.py _size": ("render",),
+    "cli/results.py _color": ("render",), "cli/results.py interpolate": ("interpolate",),
+    "api/reconstruct.py": ("reconstruct",), "io/_outputs.py": WRITERS, "runtime/_run_folder.py": WRITERS,
+    "runtime/_executors.py": ("reconstruct",), "cli/view_files.py": ("reconstruct",),
+}  # fmt: skip
 """Commands that print the messages of a file or function, unless the message names its command."""
 OPTION = re.compile(r"--[a-z][a-z-]+")
 

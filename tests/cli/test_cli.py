@@ -15,8 +15,6 @@ import pytest
 from tests.pipeline.fake_stages import kept_bytes, read
 from thesisrecon.cli import common, runs
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.runs import _duration, _intrinsic_lines
-from thesisrecon.config.text import build_config
 from thesisrecon.io import _images
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +67,7 @@ def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed)
     assert summary["registered"] == VIEWS
     assert summary["trusted"]
     truth = read(COURTYARD / "cameras.json")
-    focal = truth_focal(truth)
+    focal = truth["cameras"][0]["K"][0][0]
     assert summary["cameras"][0]["focal_px"]["value"] == pytest.approx(focal, rel=0.02)
     assert summary["points"] > 300
 
@@ -89,11 +87,6 @@ def test_the_preset_of_the_thesis_runs_to_the_end(photographs, tmp_path, capsys)
     summary = read(out / "summary.json")
     assert summary["registered"] >= 4
     assert summary["registered"] + len(summary["refused"]) == VIEWS
-
-
-def truth_focal(truth):
-    """The true focal length (px) of the courtyard's one camera."""
-    return float(truth["cameras"][0]["K"][0][0])
 
 
 def test_inspect_prints_the_results(killed_and_resumed, capsys):
@@ -183,44 +176,6 @@ def test_a_wrong_command_gets_one_sentence_and_exit_2(arguments, words, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_focal_length_is_given_as_in_the_readme(photographs, tmp_path, monkeypatch):
-    words = "--set intrinsics.focal_px=1200 --set intrinsics.focal_std_rel=0.05"
-    assert f"`{words}`" in (ROOT / "README.md").read_text(encoding="utf-8")
-    asked = []
-
-    def listen(*_, set, **__):
-        asked.append(build_config(settings=set).intrinsics)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", listen)
-    arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out"), *words.split()]
-    assert run_command(arguments) == 130
-    assert (asked[0].focal_px, asked[0].focal_std_rel) == (1200.0, 0.05)
-
-
-def test_the_last_line_states_the_time_of_this_run():
-    whole = {"seconds": {"total": 40.0}, "elapsed_seconds": 41.5, "resumed": []}
-    assert _duration(whole) == "41.5 s"
-    again = {**whole, "elapsed_seconds": 1.5, "resumed": ["features"]}
-    assert _duration(again) == "1.5 s (40.0 s including cached stages)"
-
-
-def test_every_camera_has_a_line_with_its_estimates():
-    def view(camera, focal, **more):
-        values = {"focal_px": focal, "principal_x_px": 5.0, "principal_y_px": 4.0, **more}
-        return {"camera": camera} | {
-            name: {"value": value, "std": 0.0 if value == 1.0 else 0.5, "source": "x"}
-            for name, value in values.items()
-        }
-
-    square, other = view(0, 900.0, aspect=1.0), view(1, 800.0, aspect=1.2, skew_px=2.0)
-    lines = _intrinsic_lines([square, square, other, {"camera": 0, "registered": False}])
-    assert len(lines) == 2
-    assert lines[0].startswith("camera 0: focal length 900.0 ± 0.5 px")
-    assert "aspect" not in lines[0]
-    assert lines[1].endswith("aspect ratio 1.20000 ± 0.50000, skew 2.00 ± 0.50 px")
-
-
 def test_ctrl_c_states_how_to_resume(photographs, tmp_path, monkeypatch, refused):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -254,7 +209,7 @@ def test_help_and_version(capsys):
 
 
 def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, refused):
-    monkeypatch.setattr(_images, "files", lambda _: tmp_path / "thesisrecon")
+    monkeypatch.setattr(_images, "__file__", str(tmp_path / "thesisrecon" / "io" / "_images.py"))
     assert str(tmp_path / "thesisrecon" / "courtyard") in refused(["demo", "-o", tmp_path / "out"])
 
 

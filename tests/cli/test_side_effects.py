@@ -7,7 +7,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from thesisrecon.io._images import DEMO_IMAGES, demo_images
+from thesisrecon.io._images import demo_images
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -49,11 +49,7 @@ def test_the_wheel_has_the_images_of_the_demo():
         assert (ROOT / source).is_file()
     images = [ROOT / source for source in included if source.endswith(".jpg")]
     assert sorted(images) == demo_images()
-    assert len(images) == DEMO_IMAGES
-
-
-def test_every_dependency_has_a_lowest_version():
-    assert all(">=" in line for line in PROJECT["project"]["dependencies"])
+    assert len(images) == 6
 
 
 def test_a_run_writes_only_into_its_folder_and_opens_no_connection(tmp_path):

@@ -68,8 +68,13 @@ def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
     said = capsys.readouterr()
     assert said.out == f"5 frames of 160 x 120 px and interpolate.webp written to {folder}\n"
     assert said.err == ""
-    names = sorted(path.name for path in folder.iterdir())
-    assert names == [*(f"frame-000{k}.png" for k in range(1, 6)), "frames.json", "interpolate.webp"]
+    frames = [f"frame-000{k}.png" for k in range(1, 6)]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        ".lock",
+        *frames,
+        "frames.json",
+        "interpolate.webp",
+    ]
     assert difference_from_photograph(folder / "frame-0001.png", 0) < 6
     assert difference_from_photograph(folder / "frame-0005.png", COUNT - 1) < 6
     with PIL.Image.open(folder / "interpolate.webp") as film:
@@ -87,7 +92,9 @@ def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run,
     for threads in ("1", "2"):
         assert run_command([*wanted, "-o", str(tmp_path / threads), "--threads", threads]) == 0
     one, two = tmp_path / "1", tmp_path / "2"
-    assert {p.name: p.read_bytes() for p in one.iterdir()} == {p.name: p.read_bytes() for p in two.iterdir()}
+    # The record lists the files in the order in which they were written.
+    written = [{p.name: p.read_bytes() for p in out.iterdir() if p.name != ".lock"} for out in (one, two)]
+    assert written[0] == written[1]
     frames = [pixels(one / f"frame-000{k}.png") for k in range(1, 7)]
     for frame in frames:
         assert frame.shape == (80, 120, 3)
@@ -123,7 +130,7 @@ def test_a_shorter_command_removes_the_earlier_frames(run):
     assert run_command([*small, "4"]) == 0
     assert run_command([*small, "2", "--path", "interpolate"]) == 0
     names = sorted(path.name for path in (run / "film").iterdir())
-    assert names == ["frame-0001.png", "frame-0002.png", "frames.json", "interpolate.webp"]
+    assert names == [".lock", "frame-0001.png", "frame-0002.png", "frames.json", "interpolate.webp"]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.camera import compose_camera, project_camera
-from thesisrecon.io._colmap_writing import write_colmap_model
+from thesisrecon.io._colmap import write_colmap_model
 from thesisrecon.records import Reconstruction, Tracks
 from validation.references.colmap import read_colmap_model
 

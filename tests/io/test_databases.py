@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import refuses
 from thesisrecon.errors import UsageError
-from thesisrecon.io._colmap_reading import read_database
+from thesisrecon.io._colmap import read_database
 
 PAIR = 2**31 - 1
 TABLES = {
@@ -97,7 +97,7 @@ def test_rows_that_claim_more_than_the_file_are_refused(tmp_path, monkeypatch):
     database(path, "UPDATE keypoints SET data = zeroblob(5000000), rows = 625000").close()
     assert len(read_database(path).keypoints[0]) == 625_000
     # The second image shares the pages of the first.
-    monkeypatch.setattr("thesisrecon.io._colmap_reading._states", lambda _: [(6_000_000, 0)])
+    monkeypatch.setattr("thesisrecon.io._colmap._states", lambda _: [(6_000_000, 0)])
     refuses(UsageError, "table keypoints claims more data than the file holds", read_database, path)
 
 
@@ -130,5 +130,5 @@ def test_values_that_cannot_be_are_one_sentence(tmp_path, change, sentence):
 def test_a_database_that_changes_meanwhile_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "busy.db"
     database(path).close()
-    monkeypatch.setattr("thesisrecon.io._colmap_reading._read_tables", lambda *_: os.utime(path, ns=(1, 1)))
+    monkeypatch.setattr("thesisrecon.io._colmap._read_tables", lambda *_: os.utime(path, ns=(1, 1)))
     refuses(UsageError, "was changed while it was read", read_database, path)

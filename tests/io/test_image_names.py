@@ -22,16 +22,8 @@ OUTSIDE = [
     "..\\x.png", "a\\..\\x.png", "\\\\host\\share\\x.png", "x\0.png", "//host/x.png",
 ]  # fmt: skip
 INSIDE = [
-    "\\x0ab.png",
-    "x.png",
-    "a/x.png",
-    "./x.png",
-    "a b/..x.png",
-    "...png",
-    "a\\x.png",
-    "\udcff.png",
-    "böld",
-]
+    "\\x0ab.png", "x.png", "a/x.png", "./x.png", "a b/..x.png", "...png", "a\\x.png", "\udcff.png", "böld",
+]  # fmt: skip
 RULE = "an image name must be a relative path inside the folder of images, without '..'"
 
 

@@ -1,6 +1,5 @@
 """Reading images: formats, orientation, bit depth, frames and resampling."""
 
-import io
 import threading
 import time
 
@@ -12,8 +11,8 @@ from tests.bad_input import files
 from tests.conftest import refuses
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
-from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
-from thesisrecon.io._images import MAX_DECODED_BYTES, list_images, read_images, scene_name
+from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_image
+from thesisrecon.io._images import list_images, read_images, scene_name
 from thesisrecon.records import Image
 
 
@@ -278,22 +277,6 @@ def test_threads_take_no_more_room_together_than_there_is():
         pass
 
 
-def opened(kind, image, **options):
-    stream = io.BytesIO()
-    image.save(stream, kind, **options)
-    return PIL.Image.open(stream)
-
-
-def test_memory_for_decoding_depends_on_the_format():
-    image = coloured(90, 90)
-    assert pixels.decoding_bytes(opened("PNG", image)) == 4 * 8100
-    assert pixels.decoding_bytes(opened("JPEG", image)) == 4 * 8100
-    assert pixels.decoding_bytes(opened("JPEG", image, progressive=True)) == 10 * 8100
-    assert pixels.decoding_bytes(opened("WEBP", image)) == 16 * 8100
-    # The largest sensors are read in every kind of JPEG.
-    assert MAX_DECODED_BYTES > 10 * 14204 * 10652
-
-
 def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path, monkeypatch):
     for name in ("a.webp", "b.png", "c.jpg"):
         options = {"progressive": True} if name == "c.jpg" else {}
@@ -314,17 +297,10 @@ def solid(k):
 
 
 def frames(folder, count):
-    return [write_frame(folder, k + 1, solid(k)) for k in range(count)]
-
-
-def test_frames_are_numbered_from_one_and_hold_their_picture(tmp_path):
-    written = frames(tmp_path / "new", 3)
-    assert [path.name for path in written] == ["frame-0001.png", "frame-0002.png", "frame-0003.png"]
-    assert frame_name(12345) == "frame-12345.png"
-    for k, path in enumerate(written):
-        with PIL.Image.open(path) as image:
-            np.testing.assert_array_equal(np.asarray(image), solid(k))
-    assert len(list((tmp_path / "new").iterdir())) == 3
+    paths = [folder / frame_name(k + 1) for k in range(count)]
+    for k, path in enumerate(paths):
+        write_image(path, solid(k))
+    return paths
 
 
 @pytest.mark.parametrize(("suffix", "apart"), [(".webp", 4.0), (".png", 0.0)])
@@ -349,5 +325,5 @@ def test_an_unwritable_animation_is_reported(tmp_path):
     (one,) = frames(tmp_path, 1)
     with pytest.raises(UsageError, match=r"absent\.png cannot be read"):
         write_animation(tmp_path / "all.webp", [one, tmp_path / "absent.png"])
-    refuses(UsageError, "cannot be written", write_frame, one, 1, solid(0))
+    refuses(UsageError, "cannot be written", write_image, one / "1.png", solid(0))
     assert not (tmp_path / "all.webp").exists()

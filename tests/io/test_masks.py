@@ -7,8 +7,7 @@ import pytest
 from tests.bad_input import files
 from tests.conftest import refuses
 from thesisrecon.errors import UsageError
-from thesisrecon.io._images import read_images
-from thesisrecon.io._masks import add_masks, check_masks_folder
+from thesisrecon.io._images import add_masks, check_masks_folder, read_images
 from thesisrecon.records import Image
 
 ROTATED = 6

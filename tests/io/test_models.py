@@ -227,14 +227,6 @@ def test_impossible_cameras_of_a_colmap_model_are_refused(tmp_path, camera, sent
 
 
 @pytest.mark.parametrize(
-    "pose", ["1 0 0 0 0 0 0 0", "1 0 0 0 1e300 0 0 0", "1 0 0 0 nan 0 0 1", "1 0 0 0 0 1 0 0 0 0 -1 0"]
-)
-def test_impossible_poses_of_a_trajectory_are_refused(tmp_path, pose):
-    (tmp_path / "poses.txt").write_text(pose + "\n")
-    refuses(UsageError, "line 1 of .* each line needs a pose", read_model, tmp_path / "poses.txt")
-
-
-@pytest.mark.parametrize(
     "change",
     [{"width": float("inf")}, {"width": 0}, {"height": -5}, {"K": [[100, 0, 64], [0, -100, 48], [0, 0, 1]]},
      {"K": [[float("nan"), 0, 64], [0, 100, 48], [0, 0, 1]]}, {"t": [0, 0, float("inf")]},

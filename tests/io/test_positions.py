@@ -8,7 +8,7 @@ import pytest
 from tests.api.test_alignment import make_model, true_positions
 from tests.conftest import refuses
 from thesisrecon import UsageError, align_to_positions
-from thesisrecon.io._positions import read_positions
+from thesisrecon.io._models import read_positions
 
 ORIGIN = (47.36998, 8.54012, 412.0)
 A, E2 = 6378137.0, 0.00669437999014

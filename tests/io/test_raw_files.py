@@ -9,8 +9,7 @@ from tests.bad_input import files
 from tests.conftest import refuses
 from thesisrecon import reconstruct
 from thesisrecon.errors import UsageError
-from thesisrecon.io._images import list_images, read_images
-from thesisrecon.io._masks import read_mask
+from thesisrecon.io._images import list_images, read_images, read_mask
 
 SENSOR, RGB, GREY = 32803, 2, 1
 RAW = "is a raw file: convert it to JPEG, PNG or TIFF"
@@ -21,15 +20,8 @@ def image(width, height, photometric=RGB, seed=0, **tags):
     bands = 3 if photometric == RGB else 1
     pixels = np.asarray(files.picture(seed, (width, height)))[..., :bands].tobytes()
     strip = {
-        "strip": pixels,
-        256: width,
-        257: height,
-        258: 8,
-        259: 1,
-        262: photometric,
-        277: bands,
-        278: height,
-    }
+        "strip": pixels, 256: width, 257: height, 258: 8, 259: 1, 262: photometric, 277: bands, 278: height,
+    }  # fmt: skip
     return strip | {279: len(pixels)} | {int(tag[1:]): value for tag, value in tags.items()}
 
 
@@ -181,34 +173,20 @@ def test_masks_are_not_read_from_raw_files(tmp_path):
 
 def test_files_are_listed_by_their_content(tmp_path):
     kinds = {
-        "a.jfif": "JPEG",
-        "b.mpo": "JPEG",
-        "c.insp": "JPEG",
-        "d": "PNG",
-        "e.jpg_large": "WEBP",
-        "f.x": "TIFF",
-        "g.image": "BMP",
-        "h.anim": "GIF",
-        "i.dat": "PPM",
-        "j.j2k": "JPEG2000",
+        "a.jfif": "JPEG", "b.mpo": "JPEG", "c.insp": "JPEG", "d": "PNG", "e.jpg_large": "WEBP",
+        "f.x": "TIFF", "g.image": "BMP", "h.anim": "GIF", "i.dat": "PPM", "j.j2k": "JPEG2000",
         "k.png": "JPEG",
-    }
+    }  # fmt: skip
     for seed, (name, kind) in enumerate(kinds.items()):
         files.picture(seed).save(tmp_path / name, kind)
     others = {
-        "notes.txt": b"P3 is the third point\n",
-        "BMW": b"BMW 320, and more about the car",
-        "a.xmp": b"<x:xmpmeta>",
-        ".DS_Store": b"\0\0\0\1Bud1",
-        "Thumbs.db": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1",
-        "x.json": b"{}",
-        "empty": b"",
-        "._a.jfif": b"\0\5\x16\7\0\2\0\0Mac OS X",
-        ".b.jpg": files.encoded("JPEG"),
-        "MVI.THM": files.encoded("JPEG"),
-        "clip.mp4": b"\0\0\0\x18ftypmp42",
+        "notes.txt": b"P3 is the third point\n", "BMW": b"BMW 320, and more about the car",
+        "a.xmp": b"<x:xmpmeta>", ".DS_Store": b"\0\0\0\1Bud1",
+        "Thumbs.db": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "x.json": b"{}", "empty": b"",
+        "._a.jfif": b"\0\5\x16\7\0\2\0\0Mac OS X", ".b.jpg": files.encoded("JPEG"),
+        "MVI.THM": files.encoded("JPEG"), "clip.mp4": b"\0\0\0\x18ftypmp42",
         "mesh.ply": b"ply\nformat ascii 1.0\n",
-    }
+    }  # fmt: skip
     for name, content in others.items():
         (tmp_path / name).write_bytes(content)
     (tmp_path / "folder").mkdir()
@@ -221,34 +199,14 @@ def test_files_are_listed_by_their_content(tmp_path):
 
 def test_numbers_in_names_are_compared_as_numbers(tmp_path):
     ordered = [
-        "IMG (2).png",
-        "IMG (10).png",
-        "f-3.png",
-        "f.png",
-        "f001.png",
-        "f1.png",
-        "f1b2.png",
-        "f1b10.png",
-        "f2.png",
-        "f9.png",
-        "f10.png",
-        "f0100.png",
-        "g.png",
-    ]
+        "IMG (2).png", "IMG (10).png", "f-3.png", "f.png", "f001.png", "f1.png", "f1b2.png", "f1b10.png",
+        "f2.png", "f9.png", "f10.png", "f0100.png", "g.png",
+    ]  # fmt: skip
     for seed, name in enumerate(sorted(ordered)):
         files.picture(seed).save(tmp_path / name)
     assert [path.name for path in list_images(tmp_path)] == ordered
     for given in (tmp_path, sorted(tmp_path.iterdir())):
         assert [one.name for one in read_images(given, max_size_px=1600).images] == ordered
-
-
-def test_neighbours_of_a_window_follow_the_numbers(tmp_path):
-    for n in range(1, 13):
-        files.picture(n).save(tmp_path / f"frame{n}.jpg")
-    found = reconstruct(tmp_path, tmp_path / "out", pairs="window:1", until="matches", max_size=80, threads=1)
-    names = [image.name for image in found.images]
-    assert names == [f"frame{n}.jpg" for n in range(1, 13)]
-    assert found.pair_choice.pairs.tolist() == [[n, n + 1] for n in range(11)]
 
 
 def test_many_files_left_out_for_one_reason_are_counted(tmp_path):

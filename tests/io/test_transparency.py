@@ -10,11 +10,9 @@ import pytest
 import thesisrecon
 from tests.bad_input import files
 from tests.conftest import refuses
-from tests.io.test_raw_files import tiff
 from thesisrecon import reconstruct
-from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.io._images import read_images, read_levels
-from thesisrecon.io._masks import USELESS_MASKS, add_masks
+from thesisrecon.errors import UsageError
+from thesisrecon.io._images import USELESS_MASKS, add_masks, read_images, read_levels
 
 SIZE = (180, 120)
 OPAQUE = np.zeros(SIZE[::-1], bool)
@@ -102,25 +100,6 @@ def test_palettes_grey_and_16_bits_have_transparency_too(tmp_path):
         image = read(tmp_path / name)
         np.testing.assert_array_equal(image.mask, OPAQUE, name)
         assert np.abs(image.rgb.astype(int) - rgb)[OPAQUE].max() <= 1, name
-
-
-def test_premultiplied_colours_are_divided_by_alpha(tmp_path):
-    alpha = np.where(OPAQUE, 200, 90).astype(np.uint8)
-    times = np.rint(colours() * (alpha[..., None] / 255.0)).astype(np.uint8)
-    strip = np.dstack([times, alpha]).tobytes()
-    tags = {256: SIZE[0], 257: SIZE[1], 258: (8, 8, 8, 8), 259: 1, 262: 2, 277: 4, 278: SIZE[1], 338: 1}
-    (tmp_path / "a.tif").write_bytes(tiff([tags | {"strip": strip, 279: len(strip)}]))
-    image = read(tmp_path / "a.tif")
-    np.testing.assert_array_equal(image.mask, OPAQUE)
-    assert np.abs(image.rgb.astype(int) - colours())[OPAQUE].max() <= 2
-
-
-def test_pixels_that_are_half_covered_are_used_with_their_own_colour(tmp_path):
-    alpha = np.tile(np.linspace(0, 255, SIZE[0]).astype(np.uint8), (SIZE[1], 1))
-    PIL.Image.fromarray(np.dstack([colours(), alpha])).save(tmp_path / "a.png")
-    image = read(tmp_path / "a.png")
-    np.testing.assert_array_equal(image.mask, alpha >= 128)
-    assert np.abs(image.rgb.astype(int) - colours())[alpha >= 128].max() <= 1
 
 
 @pytest.mark.parametrize("max_size_px", [1600, 150, 100])
@@ -250,15 +229,3 @@ def test_rectified_images_have_no_levels_where_they_are_transparent():
     known = np.isfinite(disparity)
     assert not known[~OPAQUE].any()
     assert np.median(disparity[known]) == pytest.approx(6, abs=0.3)
-
-
-def test_transparent_arrays_are_a_stage_failure():
-    nothing = np.zeros((*SIZE[::-1], 4), np.uint8)
-    refuses(StageFailure, "an image is blank: all its pixels are transparent", read_levels, nothing)
-    refuses(
-        StageFailure,
-        "all its pixels are transparent",
-        thesisrecon.match_pair,
-        colours(),
-        np.zeros((*SIZE[::-1], 4), np.uint8),
-    )

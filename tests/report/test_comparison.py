@@ -10,7 +10,7 @@ from tests.report import synthetic
 from thesisrecon import compare_models
 from thesisrecon.io._models import read_model
 from thesisrecon.records import Similarity
-from thesisrecon.report._comparison import comparison_page
+from thesisrecon.report._page import comparison_page
 
 pytestmark = pytest.mark.browser
 

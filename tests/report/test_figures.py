@@ -90,41 +90,11 @@ def test_a_pair_without_matches_is_no_error():
     assert min(drawn.width, drawn.height) > 100
 
 
-def test_lines_are_cut_at_the_edges_of_the_photograph():
-    level = drawing._clip_line(np.array([0.0, 1.0, -10.0]), 100, 50)
-    assert level == ((-0.5, 10.0), (99.5, 10.0))
-    upright = drawing._clip_line(np.array([1.0, 0.0, -10.0]), 100, 50)
-    assert upright == ((10.0, -0.5), (10.0, 49.5))
-    assert drawing._clip_line(np.array([0.0, 1.0, 20.0]), 100, 50) is None
-    assert drawing._clip_line(np.zeros(3), 100, 50) is None
-
-
-def test_spread_matches_are_different_and_far_apart():
-    xy = np.random.default_rng(0).uniform(0, 100, (500, 2))
-    chosen = drawing._spread_matches(xy, 12)
-    assert len(set(chosen.tolist())) == 12
-    gaps = np.linalg.norm(xy[chosen][:, None] - xy[chosen][None], axis=2) + np.eye(12) * 1e9
-    assert gaps.min() > 20
-    assert len(drawing._spread_matches(xy[:5], 12)) == 5
-    assert len(drawing._spread_matches(np.zeros((0, 2)), 12)) == 0
-
-
 def lightness(rgb):
     """CIE L* (...) of sRGB (..., 3)."""
     v = rgb / 255.0
     linear = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
     return np.asarray(116.0 * np.cbrt(linear @ (0.2126, 0.7152, 0.0722)) - 16.0)
-
-
-def test_equal_steps_of_the_colour_scale_are_equal_steps_of_lightness():
-    steps = np.diff(lightness(drawing._paint_scale(np.linspace(0, 1, 33)).astype(float)))
-    assert steps.min() > 1.8
-    assert steps.max() < 1.6 * steps.min()
-    ends = drawing._paint_scale(np.array([-3.0, 0.0, 1.0, 7.0, np.nan]))
-    assert ["#" + bytes(c).hex() for c in ends[:4]] == [
-        drawing.SCALE[0], drawing.SCALE[0], drawing.SCALE[-1], drawing.SCALE[-1],
-    ]  # fmt: skip
-    assert tuple(ends[4]) == drawing.UNKNOWN
 
 
 def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
@@ -237,16 +207,6 @@ def test_a_scene_in_map_coordinates_is_drawn_about_its_middle():
     for axis in ("xaxis", "yaxis", "zaxis"):
         low, high = drawn[1]["layout"]["scene"][axis]["range"]
         assert abs(low + high) < 1e-6 * extent
-
-
-def test_a_scene_without_points_still_shows_its_cameras():
-    data = made_up_run(points=50)
-    reconstruction = data.metric.reconstruction
-    nothing = {name: np.zeros_like(getattr(reconstruction, name)) for name in ("registered", "valid")}
-    assert figures.build_scene(replace(reconstruction, registered=nothing["registered"])) is None
-    scene = figures.build_scene(replace(reconstruction, valid=nothing["valid"]))
-    assert len(scene.points) == 0
-    assert len(scene.centres) == 8
 
 
 @pytest.mark.parametrize("shrink", [1.0, 1e-2, 1e-6])

@@ -12,6 +12,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ import pytest
 from tests.conftest import LOCAL, address, refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import fake_config, photographs
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
@@ -171,78 +172,6 @@ class SlowMatcher(fakes.FakeMatcher):
         return super().match(*views, **given)
 
 
-@dataclass(frozen=True)
-class UnevenMatcher(fakes.FakeMatcher):
-    """Writes the process of each pair; sleeps longer in one of them."""
-
-    reported: str = ""
-    slow: int = 0
-    slow_s: float = 0.0
-
-    def match(self, *views, **given):
-        with Path(self.reported).open("a", encoding="ascii") as file:
-            file.write(f"{os.getpid()}\n")
-        time.sleep(self.slow_s if os.getpid() == self.slow else 0.03)
-        return super().match(*views, **given)
-
-
-@pytest.mark.parametrize("how", ["slow", "stopped"])
-def test_a_slow_worker_gets_few_tasks_and_changes_no_byte(how, dask_cluster, tmp_path):
-    """One of two workers needs 0.6 s a task instead of 0.03, or stands still until most pairs are done."""
-    slow, other = (nanny.pid for nanny in dask_cluster.workers.values())
-    reported = tmp_path / "reported"
-    matcher = UnevenMatcher(reported=str(reported), slow=slow, slow_s=0.6 if how == "slow" else 0.03)
-    given = {"config": fake_config(matching=matcher), "until": "metric"}
-    reconstruct(photographs(8), tmp_path / "whole", threads=1, **given)
-    reported.unlink()
-    latest = threading.Timer(8.0, os.kill, (slow, signal.SIGCONT))
-
-    def stop(stage, done, _):
-        if how == "stopped" and stage == "matches" and done in (2, 22):
-            os.kill(slow, signal.SIGSTOP if done == 2 else signal.SIGCONT)
-
-    latest.start()
-    try:
-        executor = address(dask_cluster)
-        reconstruct(photographs(8), tmp_path / "out", executor=executor, progress=stop, **given)
-    finally:
-        latest.cancel()
-        os.kill(slow, signal.SIGCONT)
-    by = [int(line) for line in reported.read_text(encoding="ascii").split()]
-    assert len(by) >= 28
-    assert by.count(other) >= 18
-    assert results(tmp_path / "out") == results(tmp_path / "whole")
-
-
-@pytest.mark.parametrize("reachable", [True, False])
-def test_results_pass_the_scheduler_only_if_the_workers_cannot_be_reached(
-    reachable, dask_cluster, monkeypatch
-):
-    gathered, found = [], {}
-    handlers = dask_cluster.scheduler.handlers
-    gather = handlers["gather"]
-
-    def counted_gather(keys, **given):
-        gathered.extend(keys)
-        return gather(keys, **given)
-
-    monkeypatch.setitem(handlers, "gather", counted_gather)
-    if not reachable:
-        monkeypatch.setattr(workers, "_reachable", lambda _: False)
-    with Workers(1, address(dask_cluster)) as those:
-        those.run(pow, [(n, 2) for n in range(6)], found.__setitem__)
-    assert found == {n: n * n for n in range(6)}
-    assert len(gathered) == (0 if reachable else 6)
-
-
-def test_workers_are_reachable_if_their_ports_are():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        there = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        assert workers._reachable([there])
-        assert not workers._reachable([there, "inproc://a/b/c"])
-    assert not workers._reachable([there])
-
-
 class Recorder(futures.Executor):
     """Runs tasks at once and keeps their pickled results."""
 
@@ -338,14 +267,6 @@ def test_an_executor_is_given_few_tasks_at_a_time():
     assert done == 50
 
 
-def test_workers_may_become_fewer_in_the_middle():
-    there, done = iter([4]), list[int]()
-    with futures.ThreadPoolExecutor(1) as pool:
-        remote = workers._Remote(pool, lambda: next(there, 1))
-        workers._run_all(remote, abs, False, [(n,) for n in range(20)], lambda n, _: done.append(n))
-    assert sorted(done) == list(range(20))
-
-
 def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
     made = []
 
@@ -380,23 +301,8 @@ def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
         assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5
 
 
-def test_batches_of_a_band_of_pairs_have_near_the_fewest_views():
-    """Each view with the next eight: k + 8 views hold at most 8 k + 28 pairs."""
-    band = [(i, j) for i in range(200) for j in range(i + 1, min(i + 9, 200))]
-    for count in (4, 16):
-        batches = batch_pairs(band, range(len(band)), count, [3000] * 200)
-        assert sorted(n for batch in batches for n in batch) == list(range(len(band)))
-        views = [len({view for n in batch for view in band[n]}) for batch in batches]
-        fewest = len(batches[0]) / 8.0 + 4.5
-        assert sum(views) <= 1.5 * fewest * len(batches)
-
-
 def refuse(*_):
     raise RuntimeError("can't start new thread")
-
-
-def refuse_processes(*_):
-    raise BlockingIOError(11, "Resource temporarily unavailable")
 
 
 def test_without_further_threads_the_calling_thread_does_the_work(tmp_path, monkeypatch):
@@ -415,26 +321,11 @@ def test_without_worker_processes_this_process_does_the_work(refused, serial, tm
     if refused == "threads":
         monkeypatch.setattr(threading.Thread, "start", refuse)
     else:
-        monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", refuse_processes)
+        busy = BlockingIOError(11, "Resource temporarily unavailable")
+        monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", Mock(side_effect=busy))
     small_job(serial[0], tmp_path, threads=2, executor="processes")
     assert results(tmp_path) == results(serial[1])
     assert caplog.text.count("no worker processes can be started") == 1
-
-
-def test_some_threads_do_the_work_of_all(monkeypatch):
-    started, start = [], threading.Thread.start
-
-    def one_only(thread):
-        if started:
-            refuse()
-        started.append(thread)
-        start(thread)
-
-    monkeypatch.setattr(threading.Thread, "start", one_only)
-    with ThreadPool(3) as pool:
-        assert list(pool.map(lambda n: (n, threading.get_ident()), range(20))) == [
-            (n, started[0].ident) for n in range(20)
-        ]
 
 
 def test_the_calling_thread_passes_errors_and_nested_tasks_on(monkeypatch):

@@ -52,23 +52,6 @@ def test_kernels_are_compiled_once_and_up_to_the_last_stage(listed, tmp_path):
     assert len(list((tmp_path / "cache").rglob("_numba.copy_to-*"))) == 2
 
 
-@pytest.mark.parametrize(
-    ("kernels", "workers", "started"), [(1, 64, 1), (16, 64, 2), (17, 64, 3), (80, 2, 2)]
-)
-def test_no_more_processes_start_than_there_is_work_for(listed, monkeypatch, kernels, workers, started):
-    processes = []
-
-    def quick_start():
-        answer = "import sys\nfor line in sys.stdin: print('compiled', flush=True)"
-        pipe = subprocess.PIPE
-        processes.append(subprocess.Popen([sys.executable, "-c", answer], stdin=pipe, stdout=pipe, text=True))
-        return processes[-1]
-
-    monkeypatch.setattr(_precompilation, "_started", quick_start)
-    calls = listed("[features]", *[COPY] * kernels, workers=workers)
-    assert (len(processes), calls[-1]) == (started, ("kernels", kernels, kernels))
-
-
 def test_a_kernel_that_cannot_be_compiled_stops_nothing(listed):
     lines = ("[features]", "kernels.unknown(float64,)", COPY)
     assert listed(*lines)[-1] == ("kernels", 1, 2)

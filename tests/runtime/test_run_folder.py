@@ -18,10 +18,10 @@ from thesisrecon.runtime._run_folder import (
     ChangedRecord,
     RunDirectory,
     StageFolder,
-    _seal,
     bytes_from_record,
     key_of,
     read_record,
+    sealed,
 )
 from validation.studies.robustness import SmallRuns, different, disk_ends, outputs, refused_at
 
@@ -75,6 +75,7 @@ def test_another_key_or_absence_recomputes_and_damage_is_reported(tmp_path):
 
 def test_a_pickle_is_never_loaded(tmp_path):
     np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
+    (tmp_path / "a.npz").write_bytes(sealed((tmp_path / "a.npz").read_bytes()))
     refuses(ChangedRecord, "allow_pickle", StageFolder(tmp_path).load, "a", "key")
 
 
@@ -115,14 +116,11 @@ def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp
         directory.adopt(IDENTITY, overwrite=False)
     changed = [
         ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 and is now 6"),
-        ({**IDENTITY, "seed": 1}, "seed was 0 and is now 1"),
-        ({**IDENTITY, "images": {"a.jpg": "1"}}, "without 'b.jpg'"),
-        ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
-        (
-            {**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
-            "new 'c.jpg' and 1 more",
-        ),
-    ]
+        ({**IDENTITY, "seed": 1}, "seed was 0 and is now 1"), ({**IDENTITY, "images": {"a.jpg": "1"}},
+        "without 'b.jpg'"), ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
+        ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
+        "new 'c.jpg' and 1 more",),
+    ]  # fmt: skip
     for identity, words in changed:
         claim_is_refused(directory, words, identity)
     assert read_json(directory.path / "run.json") == IDENTITY
@@ -218,8 +216,7 @@ def saved(path, record, *, packed=False, **arrays):
     reported = json.dumps({"key": "k", "record": record}).encode()
     save = np.savez_compressed if packed else np.savez
     save(path, description=np.frombuffer(reported, dtype=np.uint8), **arrays)
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.comment = _seal(archive)
+    path.write_bytes(sealed(path.read_bytes()))
     return path
 
 
@@ -248,46 +245,26 @@ def test_nothing_is_unpacked(tmp_path):
         # An array that claims to be larger than the machine.
         head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + b"\n"
         archive.writestr("description.npy", b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head)
+    path.write_bytes(sealed(path.read_bytes()))
     assert refused(path)
 
 
-TRACKS = records.Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3)
-CHANGES = [
-    ("beyond the views", lambda parts: parts["array0"].__setitem__(1, 10**9)),
-    ("below zero", lambda parts: parts["array1"].__setitem__(1, -1)),
-    ("NaN", lambda parts: parts["array2"].__setitem__((0, 0), np.nan)),
-    ("one bit less", lambda parts: parts["array2"].__setitem__((0, 0), np.nextafter(1.0, 0.0))),
-    ("another type", lambda parts: parts.update(array0=parts["array0"].astype(np.int32))),
-    ("another shape", lambda parts: parts.update(array2=parts["array2"].T)),
-    ("fewer", lambda parts: parts.update(array1=parts["array1"][:2])),
-    ("missing", lambda parts: parts.pop("array1")),
-    ("more", lambda parts: parts.update(array3=np.zeros(3))),
-    ("exchanged", lambda parts: parts.update(array0=parts["array1"], array1=parts["array0"])),
-    ("a number of the description", lambda parts: parts.update(description=told_otherwise(parts))),
-]
-
-
-def told_otherwise(parts):
-    reported = parts["description"].tobytes().replace(b'"n_views": 1', b'"n_views": 2')
-    assert reported != parts["description"].tobytes()
-    return np.frombuffer(reported, dtype=np.uint8)
-
-
-@pytest.mark.parametrize("change", [change for _, change in CHANGES], ids=[name for name, _ in CHANGES])
-def test_records_changed_by_another_program_are_reported(change, tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(bytes_from_record(TRACKS, "k"))
+def test_records_changed_by_another_program_are_reported(tmp_path):
+    """Also if it copies the seal."""
+    path, tracks = (
+        tmp_path / "a.npz",
+        records.Tracks(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)), 1, 3),
+    )
+    path.write_bytes(bytes_from_record(tracks, "k"))
     assert read_record(path, "k").n_points == 3
     with np.load(path) as file:
-        parts = {name: file[name].copy() for name in file.files}
-        seal = file.zip.comment
-    change(parts)
+        parts, seal = {name: file[name].copy() for name in file.files}, file.zip.comment
+    parts["array2"][0, 0] = np.nextafter(1.0, 0.0)
     np.savez(path, **parts)
     assert refused(path, "seal")
     with zipfile.ZipFile(path, "a") as archive:
         archive.comment = seal
     assert refused(path, "seal")
-    assert read_record(path, "another") is None
 
 
 def run(out, **options):

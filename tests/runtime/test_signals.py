@@ -12,7 +12,7 @@ import pytest
 from thesisrecon.cli.main import run_command
 from thesisrecon.runtime._executors import ProcessPool
 from thesisrecon.runtime._signals import CODES, with_resume_advice
-from validation.studies.robustness import Stop, different, outputs, stop_table, stopped
+from validation.studies.robustness import different, outputs, stopped
 
 ROOT = Path(__file__).parents[2]
 COURTYARD = ROOT / "fixtures" / "courtyard" / "images"
@@ -152,16 +152,3 @@ def test_an_interrupt_carries_advice():
         with_resume_advice("go on"),
     ):
         raise KeyboardInterrupt
-
-
-def test_the_check_names_the_fault():
-    said = "thesisrecon: interrupted; the same command goes on\n"
-    well = Stop("5 % (0.4 s)", 0.1, 130, said, 0, 3)
-    bad = Stop("15 % (1.2 s)", 2.5, 1, "Traceback\nKeyboardInterrupt\n", 2, 4, ("points.ply",))
-    assert well.wrong(signal.SIGINT) == ""
-    assert well.wrong(signal.SIGTERM) == "exit code 130"
-    assert stop_table([well, bad], signal.SIGINT).splitlines()[2:] == [
-        "| 5 % (0.4 s) | 0.10 | 130 | 3 | nothing |",
-        "| 15 % (1.2 s) | 2.50 | 1 | 4 | took 2.5 s; exit code 1; not one sentence; 2 processes left; "
-        "differs: points.ply |",
-    ]

@@ -10,7 +10,7 @@ from PIL import Image
 pytest.importorskip("pycolmap")
 
 from tests.validation.test_metrics import N, V, _reconstruction, _truth
-from thesisrecon.io._colmap_writing import write_colmap_model
+from thesisrecon.io._colmap import write_colmap_model
 from validation.metrics.cameras import TrueCameras, measure_cameras
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.runs.results import read_gates

@@ -10,26 +10,27 @@ from pathlib import Path, PurePath
 
 import numpy as np
 
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.api.models import as_sparse_model
 from thesisrecon.arrays import F64, rows_of_views
 from thesisrecon.camera import undistort
 from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
-from thesisrecon.io import _export_formats as formats
-from thesisrecon.io._colmap_writing import COLMAP_FILES, has_skew, write_sparse_model
-from thesisrecon.io._export_formats import calibration, coefficients
-from thesisrecon.io._exports import write_image
+from thesisrecon.io import _exports as formats
+from thesisrecon.io._colmap import COLMAP_FILES, has_skew, write_sparse_model
+from thesisrecon.io._exports import calibration, coefficients, write_image
 from thesisrecon.io._files import first_repeated, read_json, require_image_name, write_atomically
 from thesisrecon.io._images import (
     MAX_DECODED_BYTES,
+    USELESS_MASKS,
     find_images,
+    find_masks,
     may_be_transparent,
     read_image,
+    read_mask,
     rotation_words,
 )
-from thesisrecon.io._masks import USELESS_MASKS, find_masks, read_mask
 from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder

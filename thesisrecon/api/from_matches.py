@@ -14,9 +14,8 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config.text import Config, Settings, build_config
 from thesisrecon.errors import UsageError
-from thesisrecon.io._colmap_reading import read_database
-from thesisrecon.io._images import images_folder
-from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
+from thesisrecon.io._colmap import read_database
+from thesisrecon.io._images import USELESS_MASKS, add_masks, check_masks_folder, images_folder
 from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted

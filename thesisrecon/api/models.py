@@ -19,8 +19,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, unknown_word
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.io._files import read_json
-from thesisrecon.io._models import read_model
-from thesisrecon.io._positions import read_positions
+from thesisrecon.io._models import read_model, read_positions
 from thesisrecon.pipeline.outputs import folder_with, load_run, save_result
 from thesisrecon.records import Similarity
 from thesisrecon.results import SUMMARY, RunResult, SparseModel

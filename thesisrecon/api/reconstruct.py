@@ -13,8 +13,17 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.config.text import Config, Pairs, Settings, build_config
 from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._frames import FrameSource
-from thesisrecon.io._images import ImageSet, ImageSource, images_folder, list_images, read_images, scene_name
-from thesisrecon.io._masks import USELESS_MASKS, add_masks, check_masks_folder
+from thesisrecon.io._images import (
+    USELESS_MASKS,
+    ImageSet,
+    ImageSource,
+    add_masks,
+    check_masks_folder,
+    images_folder,
+    list_images,
+    read_images,
+    scene_name,
+)
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
 from thesisrecon.pipeline.job import Job

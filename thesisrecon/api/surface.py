@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.api.arguments import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.arrays import F32, F64, I64, resizing_transform
 from thesisrecon.camera import Camera

@@ -17,7 +17,6 @@ from typing import Annotated, Any
 
 import typer
 
-from thesisrecon._threads import ThreadPool
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from thesisrecon.io._files import printable, shorten_middle, shortened
 from thesisrecon.runtime._executors import available_threads
@@ -48,28 +47,25 @@ def parse_folder(text: str | Path) -> Path:
     return Path(text)
 
 
+def folder_option(words: str, *flags: str, metavar: str = "") -> Any:
+    """An option that takes a folder; without a flag ``-o``."""
+    metavar = metavar or ("DIR" if flags else "FOLDER")
+    return typer.Option(*(flags or ("-o", "--out")), parser=parse_folder, metavar=metavar, help=words)
+
+
+def folder_argument(metavar: str, words: str) -> Any:
+    """An argument that is a folder or file."""
+    return typer.Argument(parser=parse_folder, metavar=metavar, help=words)
+
+
 Threads = Annotated[
     int, typer.Option("--threads", min=0, max=1024, help="Number of workers; 0 = one per processor.")
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
-MaxSize = Annotated[
-    int | None,
-    typer.Option("--max-size", help="Long side (px) to which larger images are reduced (default: 1600)."),
-]
-Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
-
-
-Overwrite = Annotated[
-    bool,
-    typer.Option("--overwrite", help="Replace existing files that thesisrecon did not write."),
-]
-
-
-def folder_option(words: str) -> Any:
-    """The option ``-o`` with this help."""
-    return typer.Option("-o", "--out", parser=parse_folder, metavar="FOLDER", help=words)
-
-
+_MAX_SIZE_HELP = "Long side (px) to which larger images are reduced (default: 1600)."
+MaxSize = Annotated[int | None, typer.Option("--max-size", help=_MAX_SIZE_HELP)]
+_OVERWRITE_HELP = "Replace existing files that thesisrecon did not write."
+Overwrite = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)]
 OutputFolder = Annotated[Path, folder_option("Output folder.")]
 
 
@@ -96,6 +92,8 @@ def progress_bars() -> Iterator[Any]:
     label, left = TextColumn("{task.description:>22}"), TextColumn("left")
     columns = (label, BarColumn(), MofNCompleteColumn(), Elapsed(), Left(), left)
     tasks: dict[str, Any] = {}
+    from thesisrecon._numba import ThreadPool
+
     with ThreadPool(1) as threads:
         alone = threads.alone
     with Progress(*columns, console=Console(stderr=True), auto_refresh=not alone) as bars:

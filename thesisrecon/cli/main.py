@@ -12,10 +12,8 @@ import typer
 
 from thesisrecon import __version__
 from thesisrecon.cli.common import DEBUG_VARIABLE, exit_code_of
-from thesisrecon.cli.compare import compare
-from thesisrecon.cli.export import export
+from thesisrecon.cli.results import compare, export, interpolate, render
 from thesisrecon.cli.runs import demo, inspect, reconstruct
-from thesisrecon.cli.views import interpolate, render
 from thesisrecon.runtime._signals import set_error_stream
 
 app = typer.Typer(

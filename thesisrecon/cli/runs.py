@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -15,104 +15,66 @@ from thesisrecon.cli.common import (
     Seed,
     Threads,
     cap_threads,
+    folder_argument,
+    folder_option,
     interruptible,
-    parse_folder,
     progress_bars,
 )
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import printable, read_json
 
-if TYPE_CHECKING:
-    from thesisrecon.results import RunResult
-
 _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 """Small depth maps: the demo should show a model soon."""
-OverwriteRun = Annotated[
-    bool,
-    typer.Option("--overwrite", help="Replace another run, or changed result files, in the output folder."),
-]
+Images = Annotated[Path | None, folder_argument("IMAGES", "Folder of images; with --every also a video.")]
+_EVERY_HELP = "Take the sharpest of each N frames of a video or folder."
+Every = Annotated[int | None, typer.Option("--every", min=1, metavar="N", help=_EVERY_HELP)]
+_SOURCE_HELP = (
+    "Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras are not used."
+)
+Source = Annotated[Path | None, folder_option(_SOURCE_HELP, "--from", metavar="DATABASE|SPARSE")]
+_IMAGES_HELP = "With --from: the folder of the images, for colours and the model."
+ImagesFolder = Annotated[Path | None, folder_option(_IMAGES_HELP, "--images")]
+Masks = Annotated[Path | None, folder_option("Folder of masks: black pixels are left out.", "--masks")]
+_PRESET_HELP = "Pipeline to start from (default: default)."
+Preset = Annotated[Literal["default", "thesis"] | None, typer.Option("--preset", help=_PRESET_HELP)]
+_CAMERAS_HELP = "One camera per image size, or one per image."
+Cameras = Annotated[Literal["shared", "per-image"] | None, typer.Option("--cameras", help=_CAMERAS_HELP)]
+_CONFIG_HELP = "TOML file of settings that override the preset."
+Config = Annotated[Path | None, typer.Option("--config", help=_CONFIG_HELP)]
+_SET_HELP = "One setting as stage.field=value; may be repeated."
+Settings = Annotated[list[str] | None, typer.Option("--set", help=_SET_HELP)]
+_PAIRS_HELP = (
+    "Image pairs to match: all, those that seem to overlap (the default above 30 images), each image with "
+    "the next N by name, or the pairs of a file with two names per line."
+)
+_PAIRS = "all|overlap|window:N|FILE"
+Pairs = Annotated[str | None, typer.Option("--pairs", metavar=_PAIRS, help=_PAIRS_HELP)]
+_UNTIL_HELP = "Last stage to run: features, matches, projective, metric, dense or model (the default)."
+Until = Annotated[str | None, typer.Option("--until", help=_UNTIL_HELP)]
+_EXECUTOR_HELP = "Run workers as threads (local), as processes, or on a Dask cluster."
+_EXECUTORS = "local|processes|dask://HOST:PORT"
+Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
+_OVERWRITE_HELP = "Replace another run, or changed result files, in the output folder."
+OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)]
 
 
 def reconstruct(
     out: OutputFolder,
-    images: Annotated[
-        Path | None,
-        typer.Argument(
-            parser=parse_folder, metavar="IMAGES", help="Folder of images; with --every also a video."
-        ),
-    ] = None,
-    every: Annotated[
-        int | None,
-        typer.Option(
-            "--every", min=1, metavar="N", help="Take the sharpest of each N frames of a video or folder."
-        ),
-    ] = None,
-    source: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            parser=parse_folder,
-            metavar="DATABASE|SPARSE",
-            help="Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras "
-            "are not used.",
-        ),
-    ] = None,
-    images_folder: Annotated[
-        Path | None,
-        typer.Option(
-            "--images",
-            parser=parse_folder,
-            metavar="DIR",
-            help="With --from: the folder of the images, for colours and the model.",
-        ),
-    ] = None,
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            "--masks", parser=parse_folder, metavar="DIR", help="Folder of masks: black pixels are left out."
-        ),
-    ] = None,
-    preset: Annotated[
-        Literal["default", "thesis"] | None,
-        typer.Option("--preset", help="Pipeline to start from (default: default)."),
-    ] = None,
-    cameras: Annotated[
-        Literal["shared", "per-image"] | None,
-        typer.Option("--cameras", help="One camera per image size, or one per image."),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", help="TOML file of settings that override the preset.")
-    ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting as stage.field=value; may be repeated.")
-    ] = None,
+    images: Images = None,
+    every: Every = None,
+    source: Source = None,
+    images_folder: ImagesFolder = None,
+    masks: Masks = None,
+    preset: Preset = None,
+    cameras: Cameras = None,
+    config: Config = None,
+    settings: Settings = None,
     seed: Seed = 0,
     threads: Threads = 0,
     max_size: MaxSize = None,
-    pairs: Annotated[
-        str | None,
-        typer.Option(
-            "--pairs",
-            metavar="all|overlap|window:N|FILE",
-            help="Image pairs to match: all, those that seem to overlap (the default above 30 images), each "
-            "image with the next N by name, or the pairs of a file with two names per line.",
-        ),
-    ] = None,
-    until: Annotated[
-        str | None,
-        typer.Option(
-            "--until",
-            help="Last stage to run: features, matches, projective, metric, dense or model (the default).",
-        ),
-    ] = None,
-    executor: Annotated[
-        str,
-        typer.Option(
-            "--executor",
-            metavar="local|processes|dask://HOST:PORT",
-            help="Run workers as threads (local), as processes, or on a Dask cluster.",
-        ),
-    ] = "local",
+    pairs: Pairs = None,
+    until: Until = None,
+    executor: Executor = "local",
     overwrite: OverwriteRun = False,
 ) -> None:
     """Reconstruct cameras, points and a textured model from images."""
@@ -131,7 +93,7 @@ def reconstruct(
         raise UsageError(
             "with --from the images are given by --images, and images and pairs are those of the source"
         )
-    _run_from(source, out, seed, chosen | options | {"images": images_folder})
+    _run(source, out, seed, chosen | options | {"images": images_folder}, matched=True)
 
 
 def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: OverwriteRun = False) -> None:
@@ -143,21 +105,12 @@ def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: 
     _run(demo_images(), out, 0, {"set": _DEMO_SETTINGS} | options)
 
 
-def _run(images: Path | list[Path], out: Path, seed: int, options: Mapping[str, Any]) -> None:
-    from thesisrecon.api.reconstruct import reconstruct as run_pipeline
+def _run(source: Any, out: Path, seed: int, options: Mapping[str, Any], *, matched: bool = False) -> None:
+    from thesisrecon.api import from_matches, reconstruct
 
-    _reported(run_pipeline, images, out, seed, options)
-
-
-def _run_from(source: Path, out: Path, seed: int, options: Mapping[str, Any]) -> None:
-    from thesisrecon.api.from_matches import reconstruct_from_colmap
-
-    _reported(reconstruct_from_colmap, source, out, seed, options)
-
-
-def _reported(
-    function: Callable[..., RunResult], source: Any, out: Path, seed: int, options: Mapping[str, Any]
-) -> None:
+    function: Callable[..., Any] = reconstruct.reconstruct
+    if matched:
+        function = from_matches.reconstruct_from_colmap
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"repeat the command to resume from {printable(str(out))}"
     with interruptible(advice), progress_bars() as progress:
@@ -165,12 +118,10 @@ def _reported(
     typer.echo(summary_text(result.summary, out))
 
 
-def inspect(
-    out: Annotated[Path, typer.Argument(parser=parse_folder, metavar="OUT", help="Output folder of a run.")],
-) -> None:
+def inspect(out: Annotated[Path, folder_argument("OUT", "Output folder of a run.")]) -> None:
     """Print the summary of a run, or where it stands if it has not finished."""
+    from thesisrecon.runtime._run import run_position
     from thesisrecon.runtime._run_folder import is_running
-    from thesisrecon.runtime._run_position import run_position
 
     summary = read_json(out / "summary.json")
     position = run_position(out) if summary is None or is_running(out) else ""

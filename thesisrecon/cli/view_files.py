@@ -25,11 +25,11 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, counted, made
-from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_frame
+from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_image
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
-from thesisrecon.io._outputs import OutputFolder, claim_folder
+from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
@@ -40,17 +40,11 @@ from thesisrecon.views.render import Light, Shading
 from thesisrecon.views.tensor import camera_at
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-PATHS = ("orbit", "interpolate")
-_FRAME_MS = 100
-"""Time per frame of an animation of ``interpolate``."""
-_DEFAULT_SIDE_PX = 1000
-_NO_MODEL = "No surface model was built"
-"""Beginning of the warning of a run whose surface stage failed."""
-_OWN = re.compile(r"frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)")
+_OWN = re.compile(
+    r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)"
+)
 """Names of the files of these commands."""
 _MIDWAY = 0.5
-_BEYOND = 0.5
-"""Length, in baselines, by which the sequence of the tensor extends beyond each camera."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,7 @@ def trilinear_sequence(
     matched = match_images(first, second, config=config, seed=seed)
     views = prepare_trilinear_views(matched, config=config)
     pair, sizes = views.pair, (first.size, second.size)
-    positions = np.linspace(-_BEYOND, 1.0 + _BEYOND, frames).tolist() if frames > 1 else [_MIDWAY]
+    positions = np.linspace(-0.5, 1.5, frames).tolist() if frames > 1 else [_MIDWAY]
     path = [camera_at(pair, s, sizes=sizes) for s in positions]
 
     def draw(k: int, threads: int) -> U8:
@@ -158,28 +152,31 @@ def render_run(
     """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
     with _claimed(folder, path, frames, overwrite=overwrite) as outputs:
-        size = size or cameras[0].scaled(min(1.0, _DEFAULT_SIDE_PX / max(cameras[0].size))).size
+        size = size or cameras[0].scaled(min(1.0, 1000 / max(cameras[0].size))).size
         views = _camera_path(mesh, cameras, path, frames, size)
-        listed = [_camera_entry(k, view) for k, view in enumerate(views)]
-        given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
         shading = _shading(mesh, cameras, light)
         report, done = progress or (lambda *_: None), 0
 
         def draw(k: int) -> None:
             view = render(mesh, views[k], shading=shading(views[k]), background=background)
-            write_frame(folder, k + 1, view.color)
+            write_image(folder / frame_name(k + 1), view.color)
 
         def finished(_: int, __: Any) -> None:
             nonlocal done
             done += 1
             # The last step is the animation.
-            report("views", done, len(views) + 1)
+            report("views", done, frames + 1)
 
-        with _described(outputs, path, {**given, "frames": listed}) as warnings:
-            Workers(threads).run(draw, [(k,) for k in range(len(views))], finished)
-            animation = _animate(folder, path, len(views), warnings)
-        finished(len(views), animation)
-    return _written(folder, len(views), size, animation, warnings)
+        _remove_old(outputs, frames)
+        Workers(threads).run(draw, [(k,) for k in range(frames)], finished)
+        warnings = list[str]()
+        animation = _animate(folder, path, frames, warnings)
+        given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
+        # The cameras as in cameras.json.
+        entries = [{key: getattr(view, key) for key in ("K", "R", "t", "centre")} for view in views]
+        _describe(folder, given, entries, warnings)
+        finished(frames, animation)
+    return _written(folder, frames, size, animation, warnings)
 
 
 def interpolate_images(
@@ -205,71 +202,59 @@ def interpolate_images(
         report("correspondence", 0, 1)
         sequence = METHODS[method](images, frames, config=config, seed=seed)
         report("correspondence", 1, 1)
-        listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(sequence.frame_metadata)]
-        drawn = []
-        content = {"method": method, **sequence.metadata, "frames": listed}
-        with _described(outputs, method, content) as warnings:
-            for k, caption in enumerate(sequence.captions):
-                rgb = sequence.draw(k, threads)
-                write_frame(folder, k + 1, rgb)
-                drawn.append((caption, rgb))
-                report("views", k + 1, frames + 2)
-            animation = _animate(folder, method, frames, warnings, milliseconds=_FRAME_MS)
-            report("views", frames + 1, frames + 2)
-            title = "Between " + " and ".join(image.name for image in images)
+        _remove_old(outputs, frames)
+        drawn, warnings = [], list[str]()
+        for k, caption in enumerate(sequence.captions):
+            rgb = sequence.draw(k, threads)
+            write_image(folder / frame_name(k + 1), rgb)
+            drawn.append((caption, rgb))
+            report("views", k + 1, frames + 2)
+        animation = _animate(folder, method, frames, warnings, milliseconds=100)
+        report("views", frames + 1, frames + 2)
+        title = "Between " + " and ".join(image.name for image in images)
 
-            def write_strip() -> None:
-                write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+        def write_strip() -> None:
+            write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
 
-            made(STRIP, write_strip, warnings, None)
+        made(STRIP, write_strip, warnings, None)
+        _describe(folder, {"method": method, **sequence.metadata}, sequence.frame_metadata, warnings)
         report("views", frames + 2, frames + 2)
     return _written(folder, frames, rgb.shape[1::-1], animation, warnings)
 
 
 @contextmanager
 def _claimed(folder: Path, name: str, frames: int, *, overwrite: bool) -> Iterator[OutputFolder]:
-    """Claim a folder in which ``frames.json`` records the files of an earlier command.
+    """Claim a folder in which only these commands wrote: an image may be called frame-0001.png."""
 
-    A folder without it may hold no file: an image may be called frame-0001.png.
-    """
-    there = None if (folder / FRAMES).is_symlink() else read_json(folder / FRAMES)
-    files = there.get("files") if isinstance(there, dict) else None
-    known: dict[str, str | None] = {FRAMES: None} if isinstance(files, dict) else {}
-    known |= {name: digest for name, digest in (files or {}).items() if known and _OWN.fullmatch(name)}
-
-    def check(_: OutputFolder) -> None:
-        strange = [] if known or overwrite or not os.path.lexists(folder) else sorted(folder.iterdir())
-        if foreign := [path.name for path in strange if not is_partial(path.name)]:
+    def check(outputs: OutputFolder) -> None:
+        known = overwrite or any(map(_OWN.fullmatch, outputs.digests)) or not os.path.lexists(folder)
+        strange = [] if known else sorted(path.name for path in folder.iterdir())
+        if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
             what = f"contains {foreign[0]!r}, which this command did not create"
             raise UsageError(f"the folder {folder} {what}; choose an empty or a new folder")
 
     names = [FRAMES, *_file_names(name, frames)]
-    with claim_folder(
-        folder, overwrite=overwrite, names=names, known=known, locked=False, check=check
-    ) as outputs:
+    with claim_folder(folder, overwrite=overwrite, names=names, check=check) as outputs:
         yield outputs
+
+
+def _remove_old(outputs: OutputFolder, frames: int) -> None:
+    """Remove the files of an earlier command but for frames that this one replaces."""
+    new = [frame_name(k + 1) for k in range(frames)]
+    outputs.remove([old for old in outputs.digests if _OWN.fullmatch(old) and old not in new])
+
+
+def _describe(
+    folder: Path, facts: dict[str, Any], entries: Sequence[dict[str, Any]], warnings: list[str]
+) -> None:
+    listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(entries)]
+    noted = {"warnings": warnings} if warnings else {}
+    write_json(folder / FRAMES, {**facts, "frames": listed, **noted})
 
 
 def _file_names(name: str, frames: int) -> list[str]:
     files = [frame_name(k + 1) for k in range(frames)] + [f"{name}{animation_suffix()}"]
     return [*files, STRIP] if name in METHODS else files
-
-
-@contextmanager
-def _described(outputs: OutputFolder, name: str, content: dict[str, Any]) -> Iterator[list[str]]:
-    """Remove the files of an earlier command and write ``frames.json``, at the end with digests.
-
-    Yields the list of warnings about files that could not be made.
-    """
-    names = _file_names(name, len(content["frames"]))
-    outputs.remove([Path(old) for old in outputs.digests if old not in (FRAMES, *names)])
-    # Written first, too, so that the files of an interrupted command are known.
-    write_json(outputs.path / FRAMES, {**content, "files": dict.fromkeys(names)})
-    warnings: list[str] = []
-    yield warnings
-    noted = {"warnings": warnings} if warnings else {}
-    files = {name: outputs.written.get(name) for name in names}
-    write_json(outputs.path / FRAMES, {**content, **noted, "files": files})
 
 
 def _check_images(paths: Sequence[Path]) -> None:
@@ -311,7 +296,7 @@ def _missing_model(out: Path) -> str:
     """Why a run has no model: its surface stage failed, or it has not been run."""
     summary = read_json(out / "summary.json")
     warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
-    if reason := next((str(w) for w in warnings if str(w).startswith(_NO_MODEL)), None):
+    if reason := next((str(w) for w in warnings if str(w).startswith("No surface model was built")), None):
         return f"the run in {out} has cameras but no model: {reason}"
     command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
     return f"the run in {out} has no model yet ({MODEL}); continue it with {command}"
@@ -343,8 +328,3 @@ def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[
 def _triple(vector: F64) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
-
-
-def _camera_entry(k: int, camera: Camera) -> dict[str, Any]:
-    """A frame in ``frames.json``, with its camera as in ``cameras.json``."""
-    return {"name": frame_name(k + 1), "K": camera.K, "R": camera.R, "t": camera.t, "centre": camera.centre}

@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from thesisrecon._numba import empty, kernel
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool, empty, kernel
 from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh

@@ -1,36 +1,234 @@
-"""Point clouds as PLY, ``cameras.json`` with the cameras of a run, frames and animations."""
+"""Point clouds, images, animations, ``cameras.json``, and sparse models in the formats of other programs.
+
+These are nerfstudio, OpenMVS, Bundler, OpenCV and Kalibr. Here the centre of the top-left pixel is (0, 0). It
+is (0.5, 0.5) in nerfstudio, and (0, 0) in OpenMVS, OpenCV and Kalibr; Bundler counts from the centre of the
+image with y up. nerfstudio and Bundler cameras look along -z with y up. Each writer of a format returns its
+main file; images lie in ``images/`` beside it, masks in ``masks/``.
+"""
 
 from __future__ import annotations
 
 import io
+import json
+import struct
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 import PIL.features
 import PIL.Image
 
-from thesisrecon.arrays import F64, U8
-from thesisrecon.camera import Camera
+from thesisrecon.arrays import F64, U8, rows_of_views
+from thesisrecon.camera import Camera, undistort
 from thesisrecon.errors import UsageError
-from thesisrecon.io._files import write_atomically
+from thesisrecon.io._colmap import PIXEL_CENTRE, colors_of
+from thesisrecon.io._files import write_atomically, write_json, write_text
+from thesisrecon.results import SparseModel, SparseView
 
-_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-_WEBP_QUALITY = 85
-"""Lossy (38 dB on textured frames): an eighth of the size of APNG, a quarter of GIF with all colours."""
-_WEBP_METHOD = 2
-"""Encoder effort, 0 to 6; more saves a few percent for twice the time."""
-_PNG_LEVEL = 3
-"""Compression effort, 0 to 9; 6 saves two percent for three times the time."""
-_JPEG_QUALITY = 95
+_LOOKS_BACK = np.diag([1.0, -1.0, -1.0])  # From axes x right, y down, z forward to x right, y up, z back
+
+
+def mask_name(to: str, image: str) -> str:
+    """File name of the mask of an image as the program expects it: OpenMVS drops folders and suffix."""
+    return f"masks/{PurePath(image).stem}.mask.png" if to == "openmvs" else f"masks/{image}.png"
+
+
+def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
+    """Write ``transforms.json`` (camera-to-world with OpenGL axes) and ``points.ply`` of pinhole views."""
+    cameras = [_nerfstudio_camera(view) for view in model.views]
+    shared = all(camera == cameras[0] for camera in cameras)
+    frames = []
+    for view, camera in zip(model.views, cameras, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = view.R.T @ _LOOKS_BACK, view.centre
+        own: dict[str, Any] = {} if shared else camera
+        if masked:
+            own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
+        frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
+    head = {"camera_model": "OPENCV", **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
+    write_point_cloud(folder / "points.ply", model.X, colors_of(model))
+    write_json(folder / "transforms.json", {**head, "frames": frames})
+    return folder / "transforms.json"
+
+
+def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
+    K, (width, height) = calibration(view)
+    cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
+    known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
+    return known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+
+
+def write_openmvs(folder: Path, model: SparseModel) -> Path:
+    """Write ``scene.mvs`` ("MVSI", version 2): one platform with all cameras, one pose per image."""
+    cameras, number = _distinct_cameras(model)
+    still = _matrices(np.eye(3), np.zeros(3))
+    # OpenMVS reads all versions up to its own; later ones add only optional fields.
+    parts = [b"MVSI", struct.pack("<II", 2, 0), _count(1), _text("platform"), _count(len(cameras))]
+    for i, view in enumerate(cameras):
+        K, size = calibration(view)
+        parts += [_text(f"camera{i}"), struct.pack("<II", *size), _matrices(K), still]
+    parts += [_count(len(model.views)), *(_matrices(view.R, view.centre) for view in model.views)]
+    parts.append(_count(len(model.views)))
+    for i, view in enumerate(model.views):
+        parts += [_text(f"images/{view.name}"), struct.pack("<III", 0, number[i], i)]
+    parts.append(_count(len(model.X)))
+    for X, seen in zip(model.X.tolist(), _observations_of_points(model), strict=True):
+        views = model.view_index[seen].tolist()
+        parts += [struct.pack("<3fQ", *X, len(views)), *(struct.pack("<If", view, 0.0) for view in views)]
+    colors = np.ascontiguousarray(colors_of(model)[:, ::-1]).tobytes()
+    # No normals; after the colours no lines, their normals and colours; the transform of the frame.
+    parts += [_count(0), _count(len(model.X)), colors, _count(0) * 3, _matrices(np.eye(4))]
+    write_atomically(folder / "scene.mvs", b"".join(parts))
+    return folder / "scene.mvs"
+
+
+def _count(number: int) -> bytes:
+    return struct.pack("<Q", number)
+
+
+def _text(text: str) -> bytes:
+    encoded = text.encode("utf-8", "surrogateescape")
+    return _count(len(encoded)) + encoded
+
+
+def _matrices(*values: F64) -> bytes:
+    return b"".join(np.ascontiguousarray(value, dtype="<f8").tobytes() for value in values)
+
+
+def write_bundler(folder: Path, model: SparseModel) -> Path:
+    """Write ``bundle.out`` (v0.3) and ``list.txt`` of pinhole views with one focal, centred, y up."""
+    lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
+    centre = np.zeros((len(model.views), 2))
+    for i, view in enumerate(model.views):
+        K, _ = calibration(view)
+        centre[i] = K[:2, 2]
+        rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
+        lines += [_numbers(row) for row in rows]
+    xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
+    keys = _keys(model)
+    points = zip(model.X, colors_of(model).tolist(), _observations_of_points(model), strict=True)
+    for X, rgb, seen in points:
+        entries = [f"{model.view_index[k]} {keys[k]} {_numbers(xy[k])}" for k in seen]
+        lines += [_numbers(X), " ".join(map(str, rgb)), " ".join([str(len(entries)), *entries])]
+    write_text(folder / "list.txt", "".join(f"images/{view.name}\n" for view in model.views))
+    write_text(folder / "bundle.out", "\n".join(lines) + "\n")
+    return folder / "bundle.out"
+
+
+def _keys(model: SparseModel) -> list[int]:
+    """Number of each observation among those of its view."""
+    keys = np.zeros(len(model.view_index), np.int64)
+    for here in rows_of_views(model.view_index, len(model.views)):
+        keys[here] = np.arange(len(here))
+    return keys.tolist()
+
+
+def write_opencv(folder: Path, model: SparseModel) -> Path:
+    """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images."""
+    cameras, number = _distinct_cameras(model)
+    head = "%YAML:1.0\n---\n"
+    for i, view in enumerate(cameras):
+        K, (width, height) = calibration(view)
+        k1, k2, k3 = coefficients(view)
+        entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
+        entries.append(_matrix("distortion_coefficients", np.array([[k1, k2, 0.0, 0.0, k3]])))
+        write_text(folder / f"camera_{i}.yml", head + "".join(entries))
+    images = []
+    for view, i in zip(model.views, number, strict=True):
+        name = f'name: {json.dumps(view.name, ensure_ascii=False)}\ncamera: "camera_{i}.yml"\n'
+        entry = name + _matrix("R", view.R) + _matrix("T", view.t[:, None])
+        images.append("   -\n" + "".join(f"      {line}\n" for line in entry.splitlines()))
+    write_text(folder / "poses.yml", f"{head}images:\n{''.join(images)}")
+    return folder / "poses.yml"
+
+
+def _matrix(name: str, values: F64) -> str:
+    rows, cols = values.shape
+    data = ", ".join(map(repr, values.ravel().tolist()))
+    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n"
+
+
+def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
+    """Write ``camchain.yaml`` of pinhole-radtan cameras without k3, and note the largest difference."""
+    lines, notes = list[str](), list[str]()
+    for i, view in enumerate(_distinct_cameras(model)[0]):
+        K, (width, height) = calibration(view)
+        (k1, k2), error_px = _two_coefficients(view)
+        if error_px > 0.0:
+            notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
+        lines += [
+            f"cam{i}:",
+            "  camera_model: pinhole",
+            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]",
+            "  distortion_model: radtan",
+            f"  distortion_coeffs: [{_numbers(np.array([k1, k2, 0.0, 0.0]), ', ')}]",
+            f"  resolution: [{width}, {height}]",
+            f"  rostopic: /cam{i}/image_raw",
+        ]
+    write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
+    return folder / "camchain.yaml", notes
+
+
+def _two_coefficients(view: SparseView) -> tuple[F64, float]:
+    """Best k1, k2 (least squares over the image area) for k1, k2, k3, and the largest difference (px)."""
+    k = coefficients(view)
+    if k[2] == 0.0:
+        return k[:2], 0.0
+    K, (width, height) = calibration(view)
+    corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)]) @ np.linalg.inv(K).T
+    r = np.linspace(0.0, float(np.linalg.norm(undistort(corners[:, :2], k), axis=1).max()), 500)[1:]
+    powers = r[:, None] ** [3, 5, 7]
+    # The area of a ring is proportional to r.
+    weight = np.sqrt(r)[:, None]
+    fitted = np.linalg.lstsq(weight * powers[:, :2], weight[:, 0] * (powers @ k), rcond=None)[0]
+    return np.asarray(fitted, np.float64), float(
+        np.abs(powers @ k - powers[:, :2] @ fitted).max() * max(K[0, 0], K[1, 1])
+    )
+
+
+def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
+    """Return one view per set of intrinsics and size, and the number of each view's set."""
+    first, number, cameras = dict[tuple[object, ...], int](), list[int](), list[SparseView]()
+    for view in model.views:
+        K, size = calibration(view)
+        key = (size, K.tobytes(), coefficients(view).tobytes())
+        if key not in first:
+            first[key] = len(cameras)
+            cameras.append(view)
+        number.append(first[key])
+    return cameras, number
+
+
+def coefficients(view: SparseView) -> F64:
+    """Distortion k1, k2, k3 of a view in which it is known."""
+    assert view.distortion is not None
+    return view.distortion
+
+
+def calibration(view: SparseView) -> tuple[F64, tuple[int, int]]:
+    """K and (width, height) of a view in which they are known."""
+    assert view.K is not None
+    assert view.size is not None
+    return view.K, view.size
+
+
+def _observations_of_points(model: SparseModel) -> list[list[int]]:
+    """Numbers of the observations of each point, by view."""
+    order = np.lexsort((model.view_index, model.point_index))
+    counts = np.bincount(model.point_index, minlength=len(model.X))
+    return [part.tolist() for part in np.split(order, np.cumsum(counts)[:-1])] if len(model.X) else []
+
+
+def _numbers(values: F64 | list[float], separator: str = " ") -> str:
+    return separator.join(repr(float(value)) for value in values)
 
 
 def write_point_cloud(path: Path, xyz: F64, rgb: U8) -> None:
     """Write coloured points (N, 3) as binary little-endian PLY with float32 coordinates."""
     if not (np.abs(xyz) < np.finfo(np.float32).max).all():
         raise ValueError("write_point_cloud needs finite coordinates")
-    vertices = np.empty(len(xyz), dtype=_VERTEX)
+    vertices = np.empty(len(xyz), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     vertices["xyz"], vertices["rgb"] = xyz, rgb
     properties = [f"property float {axis}\n" for axis in "xyz"]
     properties += [f"property uchar {name}\n" for name in ("red", "green", "blue")]
@@ -59,22 +257,16 @@ def write_image(path: Path, rgb: U8) -> None:
     """Write an RGB image as JPEG or, by the suffix, PNG."""
     encoded = io.BytesIO()
     if path.suffix.lower() == ".png":
-        PIL.Image.fromarray(rgb).save(encoded, "PNG", compress_level=_PNG_LEVEL)
+        # Level 6 saves two percent for three times the time.
+        PIL.Image.fromarray(rgb).save(encoded, "PNG", compress_level=3)
     else:
-        PIL.Image.fromarray(rgb).save(encoded, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+        PIL.Image.fromarray(rgb).save(encoded, "JPEG", quality=95, subsampling=0)
     write_atomically(path, encoded.getvalue())
 
 
 def frame_name(number: int) -> str:
     """File name of a frame, numbered from 1."""
     return f"frame-{number:04d}.png"
-
-
-def write_frame(folder: Path, number: int, rgb: U8) -> Path:
-    """Write one frame as PNG."""
-    path = folder / frame_name(number)
-    write_image(path, rgb)
-    return path
 
 
 def animation_suffix() -> str:
@@ -85,7 +277,8 @@ def animation_suffix() -> str:
 def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 40) -> Path:
     """Write an endless animation of frame files of the same size; equal frames give equal bytes."""
     encoded, webp = io.BytesIO(), path.suffix == ".webp"
-    lossy = {"quality": _WEBP_QUALITY, "method": _WEBP_METHOD} if webp else {}
+    # 38 dB on textured frames, at an eighth of the size of APNG; a higher method saves few percent.
+    lossy = {"quality": 85, "method": 2} if webp else {}
     kind = "WEBP" if webp else "PNG"
     _Sequence(frames).save(encoded, kind, save_all=True, duration=milliseconds, loop=0, **lossy)
     write_atomically(path, encoded.getvalue())

@@ -22,21 +22,13 @@ from typing import Any
 from thesisrecon.errors import OutputError, UsageError, in_words, made
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
-MAX_TEXT_BYTES = 2**26
-"""Limit of text files: far above any list of pairs, far below the memory of a computer."""
-_MAX_LINE = 2**14
-"""Characters of a line of a pair list; two file names with folders are shorter on every system."""
+MAX_TEXT_BYTES = 2**26  # Limit of text files: far above any list of pairs, far below the memory of a computer
 IMAGE_NAME_RULE = "an image name must be a relative path inside the folder of images, without '..'"
 _ABSOLUTE = re.compile(r"[A-Za-z]:|/|\\(?!x[0-9a-f]{2}|u[0-9a-f]{4})")
 """Beginning of an absolute path of any system; printable names have \\x.. and \\u.... for characters."""
 FRAMES_FOLDER = "00-frames"
 """The frames of a video in a run folder, written before the run is identified by their pixels."""
 SPECIAL_FILE = "a pipe, a device or a socket"
-
-_CONTROL_CATEGORIES = ("Cc", "Zl", "Zp")
-"""Unicode categories of control characters, line and paragraph separators."""
-_BIDI_MARKS = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
-"""Characters that change the direction of the text after them."""
 _PARTIAL = ".partial"
 
 
@@ -48,7 +40,10 @@ def printable(name: str) -> str:
 
 
 def _escaped(c: str) -> str:
-    if unicodedata.category(c) not in _CONTROL_CATEGORIES and c not in _BIDI_MARKS:
+    # Control characters, line and paragraph separators, and marks that change the direction of a text.
+    if unicodedata.category(c) not in ("Cc", "Zl", "Zp") and not (
+        "\u202a" <= c <= "\u202e" or "\u2066" <= c <= "\u2069"
+    ):
         return c
     return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
 
@@ -97,9 +92,8 @@ def shortened(text: str, longest: int = 60) -> str:
 
 def shorten_middle(text: str, longest: int = 600) -> str:
     """Cut the middle of a long text; its end often states the rule."""
-    if len(text) <= longest:
-        return text
-    return f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
+    cut = f"{text[: longest - longest // 4 - 5]} ... {text[-(longest // 4) :]}"
+    return text if len(text) <= longest else cut
 
 
 def read_bytes(path: Path, *, largest: int = MAX_TEXT_BYTES) -> bytes:
@@ -158,7 +152,7 @@ def write_atomically(path: Path, content: bytes, *, cached: bool = False) -> Non
         with suppress(OSError):
             partial.unlink()
         if claim is not None:
-            claim.forget(path)
+            claim.written.pop(claim.name_of(path), None)
         raise OutputError(path, error) if isinstance(error, OSError) else error from None
 
 
@@ -269,7 +263,7 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
 
 
 def _names(line: str) -> list[str]:
-    if len(line) > _MAX_LINE:
+    if len(line) > 2**14:  # Two file names with folders are shorter on every system.
         return []
     if "\t" in line and '"' not in line:
         return [name.strip() for name in line.strip().split("\t")]

@@ -30,15 +30,11 @@ from thesisrecon.io._outputs import OutputFolder, has_content, join_claim
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
 _CHOICE = "frames.json"
-_MEASURED_SIDE = 1024
-_CONTRAST_FLOOR = 64.0
-"""Added to the variance of the grey levels, so that the noise of a dark frame does not count as sharpness."""
 _FRAMES_HELD, _COPY_BYTES = 3, 12
 """Decoded frames in memory at a time without those of threads, and bytes per pixel of their copies as RGB."""
 _FRAME_BYTES, _MARGIN_PIXELS = 4, 2**20
 _UPRIGHT = {turn: EXIF_TRANSFORMS[k] for turn, k in ((90, 8), (-90, 6), (180, 3), (-180, 3))}
 """Transform to the upright image by the rotation (degrees, counter-clockwise) that a video states."""
-_INSTALL = 'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
 MapAll = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
 Progress = Callable[[str, int, int], None]
 
@@ -93,7 +89,8 @@ class FrameSource:
         with join_claim(out) as outputs:
             if os.path.lexists(record):
                 outputs.require_own(record)
-            known = read_json(record) if outputs.unchanged(record) else {}
+            unchanged = has_content(record, outputs.digests.get(outputs.name_of(record), ()))
+            known = read_json(record) if unchanged else {}
             own = list(zip(known.get("names", ()), known.get("digests", ()), strict=False))
             damaged = [name for name, found in own if not has_content(home / name, [found])]
             if known.get("digest") != digest or damaged:
@@ -135,7 +132,7 @@ class FrameSource:
             turn = _UPRIGHT.get(frame.rotation)
             image = frame.to_image()
             name = f"{FRAMES_FOLDER}/{self.path.stem}-{number:06d}.png"
-            outputs.trust(outputs.path / name)
+            outputs.damaged.add(name)
             write_image(outputs.path / name, np.array(image if turn is None else image.transpose(turn)))
             digests[name] = outputs.written[name]
             progress("frames", total, max(total, stated))
@@ -150,8 +147,9 @@ class FrameSource:
 def _sharpness(image: PIL.Image.Image) -> float:
     stored = StoredImage(image)
     grey = stored.rows(0, image.height).convert("RGBA" if stored.layered else "RGB").convert("L")
-    levels = np.asarray(grey.reduce(-(-max(grey.size) // _MEASURED_SIDE)), dtype=np.float32)
-    return float(gaussian_laplace(levels, 1.0).var() / (levels.var() + _CONTRAST_FLOOR))
+    levels = np.asarray(grey.reduce(-(-max(grey.size) // 1024)), dtype=np.float32)
+    # The term 8^2 keeps the noise of a dark frame from counting as sharpness.
+    return float(gaussian_laplace(levels, 1.0).var() / (levels.var() + 64.0))
 
 
 def _file_sharpness(path: Path) -> float:
@@ -188,7 +186,10 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
     try:
         av = import_module("av")
     except ImportError:
-        raise UsageError(f"{path} is read as a video by PyAV: {_INSTALL}") from None
+        install = (
+            'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
+        )
+        raise UsageError(f"{path} is read as a video by PyAV: {install}") from None
     damaged = 0
     try:
         # A stream, since FFmpeg reads some names as addresses, and playlists name other files.

@@ -1,4 +1,4 @@
-"""Image input: common file formats as 8-bit RGB at working size, and a reason for each unreadable file.
+"""Images and their masks: 8-bit RGB at working size from common file formats, or a reason for each file.
 
 Resizing uses one exact scale s along both axes, (x + 0.5) s - 0.5, so that square pixels stay square; the
 last row may be cut by less than a working pixel.
@@ -16,7 +16,6 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from importlib.resources import files
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -25,7 +24,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.errors import Notice, StageFailure, UsageError
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
@@ -38,34 +37,21 @@ from thesisrecon.io._files import (
 from thesisrecon.io._pixels import (
     EXIF_INVERSE,
     EXIF_TRANSFORMS,
+    RAW_FILE,
+    RAW_SIGNATURE,
+    RAW_SUFFIXES,
     MemoryBudget,
     StoredImage,
     UnusableImage,
     decoding_bytes,
     opaque_part,
+    refuse_raw_file,
     resized_to,
 )
-from thesisrecon.io._raw_files import RAW_FILE, RAW_SIGNATURE, RAW_SUFFIXES, refuse_raw_file
 from thesisrecon.records import Image
 
-DEMO_IMAGES = 6
-"""Enough neighbouring views for self-calibration, few enough for a small wheel."""
-
-
-def demo_images() -> list[Path]:
-    """Locate the demo images, sorted by name, in the installed package or in the source tree around it."""
-    package = Path(str(files("thesisrecon")))
-    for home in (package, package.parent / "fixtures"):
-        found = sorted((home / "courtyard" / "images").glob("*.jpg"))[:DEMO_IMAGES]
-        if len(found) == DEMO_IMAGES:
-            return found
-    raise UsageError(
-        f"the demo images are neither in {package / 'courtyard'} nor in fixtures/courtyard of the source "
-        "tree; reinstall the package, or reconstruct a folder of your own"
-    )
-
-
 T = TypeVar("T")
+MapAll: TypeAlias = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
 # Raw files, and HEIC files without their reader, are listed so that they are refused by name, not overlooked.
@@ -81,23 +67,12 @@ _SIGNATURE = re.compile(
     re.DOTALL,
 )
 """First bytes of images and raw files, under any name."""
-_SIGNATURE_BYTES = 256
-_THUMBNAIL_SUFFIXES = (".thm",)
-"""JPEG files of 160 x 120 pixels that cameras write beside their images and videos."""
-_HEIF_SUFFIXES = (".heic", ".heif")
-_GENERIC_FOLDERS = ("images", "photographs", "photos", "pictures", "dcim")
-MAX_FILE_BYTES = 2**31
-"""Uncompressed images of the largest sensors take less than half of it."""
+MAX_FILE_BYTES = 2**31  # Uncompressed images of the largest sensors take less than half of it
 MAX_DECODED_BYTES = 3 * 2**29
 """Memory of all images decoded at the same time: enough for 151 megapixels of progressive JPEG."""
 MIN_SIDE = 64
-BLANK_RANGE = 8
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
 """Formats that Pillow may open: some of its other readers start external programs."""
-_ORIENTATION, _EXIF_IFD, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
-_WIDTH_35MM = 36.0
-_FOCAL_RANGE_35MM = (1.0, 1e5)
-"""mm; values outside are mistakes."""
 _ANY_SIZE = int(np.iinfo(np.int32).max)
 _budget = MemoryBudget(MAX_DECODED_BYTES)
 
@@ -130,6 +105,19 @@ class ImageSet:
         return np.array([d.exif_focal_px for d in self.decoded])
 
 
+def demo_images() -> list[Path]:
+    """Locate the demo images, sorted by name, in the installed package or in the source tree around it."""
+    package = Path(__file__).parents[1]
+    for home in (package, package.parent / "fixtures"):
+        # The first six: enough neighbouring views for self-calibration, few enough for a small wheel.
+        if found := sorted((home / "courtyard" / "images").glob("*.jpg"))[:6]:
+            return found
+    raise UsageError(
+        f"the demo images are neither in {package / 'courtyard'} nor in fixtures/courtyard of the source "
+        "tree; reinstall the package, or reconstruct a folder of your own"
+    )
+
+
 def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
     """A grey image of (width, height) as a placeholder for one that is not available."""
     return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
@@ -153,11 +141,12 @@ def list_images(folder: Path) -> list[Path]:
 
 def _is_listed(path: Path) -> bool:
     suffix = path.suffix.lower()
-    if suffix in SUFFIXES or suffix in _THUMBNAIL_SUFFIXES or not path.is_file():
+    # Cameras write thumbnails (.thm) beside their images and videos.
+    if suffix in SUFFIXES or suffix == ".thm" or not path.is_file():
         return suffix in SUFFIXES
     try:
         with path.open("rb") as file:
-            return _SIGNATURE.match(file.read(_SIGNATURE_BYTES)) is not None
+            return _SIGNATURE.match(file.read(256)) is not None
     except OSError:
         return False
 
@@ -198,7 +187,8 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
 def scene_name(folder: Path) -> str:
     """Name a scene after its image folder, or after the parent of a folder called "images" or similar."""
     folder = folder.resolve()
-    return printable(folder.parent.name if folder.name.lower() in _GENERIC_FOLDERS else folder.name)
+    generic = folder.name.lower() in ("images", "photographs", "photos", "pictures", "dcim")
+    return printable(folder.parent.name if generic else folder.name)
 
 
 def read_image(source: Any, *, max_size_px: int, as_stored: bool = False) -> ImageSet:
@@ -216,7 +206,7 @@ def read_images(
     *,
     max_size_px: int,
     as_stored: bool = False,
-    map_all: Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]] = map,
+    map_all: MapAll = map,
 ) -> ImageSet:
     """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
 
@@ -295,7 +285,7 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     if min(rgb.shape[:2]) < MIN_SIDE:
         raise UnusableImage(Notice("too-small", rgb.shape[1], rgb.shape[0], MIN_SIDE, MIN_SIDE))
     used = rgb.reshape(-1, 3) if mask is None else rgb[mask]
-    if len(used) and np.ptp(used, axis=0).max() < BLANK_RANGE:
+    if len(used) and np.ptp(used, axis=0).max() < 8:
         raise UnusableImage(Notice("blank"))
     return decoded
 
@@ -331,7 +321,9 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
             with PIL.Image.open(stream, formats=_formats()) as file:
                 needed = decoding_bytes(file)
                 if needed > MAX_DECODED_BYTES:
-                    raise UnusableImage(_too_large(file, needed))
+                    kind = "progressive JPEG" if file.format == "JPEG" else file.format
+                    megapixels, limit = file.size[0] * file.size[1] / 1e6, MAX_DECODED_BYTES / 2**30
+                    raise UnusableImage(Notice("decoding-memory", megapixels, kind, needed / 2**30, limit))
                 with _budget.reserve(needed), closing(file):
                     return use(file)
     except UnusableImage:
@@ -342,9 +334,8 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
     except PIL.UnidentifiedImageError:
         if path.suffix.lower() in RAW_SUFFIXES:
             raise UnusableImage(RAW_FILE) from None
-        if path.suffix.lower() in _HEIF_SUFFIXES and "HEIF" not in _formats():
-            raise UnusableImage(Notice("heic")) from None
-        raise UnusableImage(Notice("unknown-format")) from None
+        heic = path.suffix.lower() in (".heic", ".heif") and "HEIF" not in _formats()
+        raise UnusableImage(Notice("heic" if heic else "unknown-format")) from None
     except MemoryError:
         raise UnusableImage(Notice("too-large-for-memory")) from None
     except Exception as error:
@@ -363,8 +354,8 @@ def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image
     # Cameras store a preview as a second frame of a JPEG (MPO).
     several = getattr(file, "n_frames", 1) > 1 and file.format not in ("JPEG", "MPO")
     stored, focal_35mm = load_pixels(file, as_stored=as_stored)
-    known = _FOCAL_RANGE_35MM[0] <= focal_35mm <= _FOCAL_RANGE_35MM[1]
-    focal = focal_35mm / _WIDTH_35MM * max(stored.size) if known else math.nan
+    # The film is 36 mm wide; a focal length outside of 1 to 1e5 mm is a mistake.
+    focal = focal_35mm / 36.0 * max(stored.size) if 1.0 <= focal_35mm <= 1e5 else math.nan
     image = _image(name, stored, max_size_px)
     return DecodedImage(image, "", focal, Notice("several-frames") if several else "")
 
@@ -375,17 +366,6 @@ def may_be_transparent(path: Path) -> bool:
         return decode_file(path, lambda file: StoredImage(file).layered)
     except UnusableImage:
         return False
-
-
-def _too_large(file: PIL.Image.Image, needed: int) -> str:
-    kind = "progressive JPEG" if file.format == "JPEG" else file.format
-    return Notice(
-        "decoding-memory",
-        file.size[0] * file.size[1] / 1e6,
-        kind,
-        needed / 2**30,
-        MAX_DECODED_BYTES / 2**30,
-    )
 
 
 @cache
@@ -419,7 +399,7 @@ def _exif(file: PIL.Image.Image) -> tuple[int, float]:
     """Orientation and 35 mm focal length of an opened file, 0 if unknown."""
     try:
         exif = file.getexif()
-        orientation, focal = exif.get(_ORIENTATION), float(exif.get_ifd(_EXIF_IFD).get(_FOCAL_35MM, 0))
+        orientation, focal = exif.get(0x0112), float(exif.get_ifd(0x8769).get(0xA405, 0))
     except Exception:
         # The pixels may be good even if the header is damaged.
         return 0, 0.0
@@ -453,3 +433,92 @@ def _full_image(side: Any) -> Image:
         return _image("", StoredImage(PIL.Image.fromarray(side)), _ANY_SIZE)
     except UnusableImage as refusal:
         raise StageFailure(Notice("unusable-image", refusal)) from None
+
+
+_MASK_NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
+USELESS_MASKS = Notice("useless-masks")
+
+
+def check_masks_folder(masks: Path, images: Path | None) -> Path:
+    """Absolute path; UsageError if the folder holds no masks or is the folder of the images."""
+    if not list_images(masks):
+        raise UsageError(f"there are no masks in {masks}; {_MASK_NAMES}")
+    if images is not None and images.is_dir() and masks.samefile(images):
+        raise UsageError(f"{masks} is the folder of the images; the masks need a folder of their own")
+    return masks.absolute()
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
+    """The masks of images by name, and warnings of the other files."""
+    files: dict[str, list[Path]] = {}
+    for path in list_images(folder):
+        files.setdefault(printable(path.stem), []).append(path)
+    owner: dict[Path, str] = {}
+    mask_of: dict[str, Path] = {}
+    for name in names:
+        # The names of files from several folders are paths.
+        found = files.get(Path(name).name) or files.get(Path(name).stem, [])
+        if len(found) > 1:
+            raise UsageError(f"{name} has two masks, {found[0]} and {found[1].name}; keep one")
+        if found:
+            first = owner.setdefault(found[0], name)
+            if first != name:
+                raise UsageError(f"the mask {found[0]} belongs to {first} and to {name}; {_MASK_NAMES}")
+            mask_of[name] = found[0]
+    if not mask_of:
+        raise UsageError(f"no file in {folder} is named like an image; {_MASK_NAMES}")
+    others = [path.name for paths in files.values() for path in paths if path not in owner]
+    return mask_of, [Notice("unused-mask", name) for name in others]
+
+
+def add_masks(
+    inputs: ImageSet,
+    folder: Path,
+    *,
+    as_stored: bool = False,
+    map_all: MapAll = map,
+) -> tuple[ImageSet, list[str]]:
+    """Set the masks of images named like files in a folder; return also warnings of the other files.
+
+    Masks are upright, or ``as_stored`` like the images.
+    """
+    names = [*(decoded.image.name for decoded in inputs.decoded), *inputs.refused]
+    mask_of, unused = find_masks(folder, names)
+
+    def masked(decoded: DecodedImage) -> DecodedImage:
+        image = decoded.image
+        if image.name not in mask_of:
+            return decoded
+        image = replace(image, mask=read_mask(mask_of[image.name], image, as_stored=as_stored))
+        return with_digest(replace(decoded, image=image))
+
+    return replace(inputs, decoded=tuple(map_all(masked, list(inputs.decoded)))), unused
+
+
+def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None:
+    """Pixels to use of an image at working size, by nearest neighbour, within its own mask; None: all."""
+    try:
+        full = decode_file(path, lambda file: load_pixels(file, as_stored=as_stored)[0].unmasked())
+    except UnusableImage as refusal:
+        raise UsageError(f"the mask {path} {refusal}; replace or remove it") from None
+    size, (width, height) = full.shape[::-1], image.original_size
+    # Each side of a mask of another size may be rounded.
+    if abs(size[0] * height - size[1] * width) > max(width, height):
+        raise UsageError(
+            f"the mask {path} has {size[0]} x {size[1]} pixels and its image {width} x {height} "
+            f"({rotation_words(as_stored)}); a mask may have another size, but not another ratio of width to "
+            "height"
+        )
+    steps = size[0] / width / image.scale, size[1] / height / image.scale
+    x, y = (
+        np.minimum(((np.arange(image.size[k]) + 0.5) * steps[k]).astype(np.int64), size[k] - 1)
+        for k in (0, 1)
+    )
+    mask = np.ascontiguousarray(full[np.ix_(y, x)])
+    if image.mask is not None:
+        mask &= image.mask
+    if not mask.any():
+        raise UsageError(
+            f"the mask {path} leaves no pixel of {image.name}: black pixels are left out, all others are used"
+        )
+    return None if mask.all() else mask

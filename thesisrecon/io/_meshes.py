@@ -20,17 +20,11 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, require_mesh
 
-_TEXTURE_FORMATS = ("JPEG", "PNG")
-_MAX_TEXELS = 2**26
-"""Many times the size of a run's texture, and within the limit of Pillow."""
-_JPEG_QUALITY = 92
-"""JPEG quality of the texture in a GLB: a quarter of the size of PNG without visible differences."""
-_MAX_MESH_BYTES = 2**31
+_MAX_TEXELS = 2**26  # Many times the size of a run's texture, and within the limit of Pillow
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 """Rotation by 180 degrees about x, between the camera axes and those of glTF; its own inverse."""
 
 _HEAD = struct.Struct("<4sIIII")
-_JSON = 0x4E4F534A
 
 
 def _require_plain_glb(content: bytes) -> None:
@@ -58,7 +52,7 @@ def _header(content: bytes) -> tuple[dict[str, Any], int]:
     if len(content) < _HEAD.size:
         raise ValueError(f"it ends after {len(content)} bytes")
     magic, version, _, size, kind = _HEAD.unpack_from(content)
-    if magic != b"glTF" or version != 2 or kind != _JSON:
+    if magic != b"glTF" or version != 2 or kind != 0x4E4F534A:
         raise ValueError("it is not a GLB of version 2")
     try:
         header = json.loads(content[_HEAD.size : _HEAD.size + size].decode("utf-8"))
@@ -82,7 +76,7 @@ def _viewed(header: dict[str, Any], image: dict[str, Any], data: bytes) -> bytes
 
 def _require_texture(blob: bytes) -> None:
     try:
-        with PIL.Image.open(io.BytesIO(blob), formats=_TEXTURE_FORMATS) as picture:
+        with PIL.Image.open(io.BytesIO(blob), formats=("JPEG", "PNG")) as picture:
             texels = math.prod(picture.size)
     except (PIL.UnidentifiedImageError, PIL.Image.DecompressionBombError):
         texels = _MAX_TEXELS + 1
@@ -127,7 +121,8 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
     else:
         vertices, faces, uv = _split_seams(mesh)
         packed = io.BytesIO()
-        PIL.Image.fromarray(mesh.texture).save(packed, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
+        # A quarter of the size of PNG without visible differences.
+        PIL.Image.fromarray(mesh.texture).save(packed, "JPEG", quality=92, subsampling=0)
         # trimesh gives these no types.
         new_material: Any = materials.PBRMaterial
         new_visual: Any = textures.TextureVisuals
@@ -152,7 +147,7 @@ def read_mesh(path: Path) -> TexturedMesh:
     import trimesh
 
     try:
-        content = read_bytes(path, largest=_MAX_MESH_BYTES)
+        content = read_bytes(path, largest=2**31)
         _require_plain_glb(content)
         return _mesh_of(trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"))
     except OSError as error:

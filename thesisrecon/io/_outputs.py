@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from io import BufferedReader
 from pathlib import Path
@@ -22,10 +22,6 @@ from pathlib import Path
 from thesisrecon.errors import OutputError, StageFailure, UsageError, WorkersLost
 
 LOCK_FILE = ".lock"
-_ENTRY = '["'
-"""Beginning of each line of a record: a JSON list of name and digest."""
-_MAX_RECORD_BYTES = 2**26
-"""Far above any record, far below the memory of a computer."""
 _claims: list[OutputFolder] = []
 
 
@@ -34,15 +30,15 @@ def digest_of(content: bytes) -> str:
     return f"{len(content)} {hashlib.sha256(content).hexdigest()}"
 
 
-def has_content(path: Path, digests: Collection[str | None]) -> bool:
-    """Whether a regular file (no link) has the content of one of these digests; None stands for any."""
+def has_content(path: Path, digests: Collection[str]) -> bool:
+    """Whether a regular file (no link) has the content of one of these digests."""
     try:
         with _open_regular(path) as file:
             size = f"{os.fstat(file.fileno()).st_size} "
             # A file of another size may be too large to be read.
-            if None in digests or not any(known and known.startswith(size) for known in digests):
-                return None in digests
-            return size + hashlib.file_digest(file, "sha256").hexdigest() in digests
+            return any(known.startswith(size) for known in digests) and (
+                size + hashlib.file_digest(file, "sha256").hexdigest() in digests
+            )
     except OSError:
         return False
 
@@ -57,7 +53,6 @@ def _open_regular(path: Path) -> BufferedReader:
 
 
 def _absolute(path: Path) -> str:
-    """The absolute path without ``..``; links are not followed."""
     return os.path.abspath(path)  # noqa: PTH100 (Path.resolve follows links)
 
 
@@ -69,18 +64,14 @@ def not_ours(path: Path, *, optional: bool = True) -> UsageError:
 
 
 class OutputFolder:
-    """A claimed folder: which of its files may be replaced or removed.
+    """A claimed folder: which of its files may be replaced or removed."""
 
-    ``known`` maps names to digests of files that thesisrecon wrote; None stands for any content.
-    """
-
-    def __init__(
-        self, path: Path, *, overwrite: bool | None, known: Mapping[str, str | None] | None = None
-    ) -> None:
+    def __init__(self, path: Path, *, overwrite: bool | None) -> None:
         self.path, self.overwrite = path, overwrite
         self.root = _absolute(path)
-        self.digests: dict[str, set[str | None]] = {name: {d} for name, d in (known or {}).items()}
-        self.written: dict[str, str] = {}
+        self.digests: dict[str, set[str]] = {}  #: of the files that thesisrecon wrote
+        self.written: dict[str, str] = {}  #: those of this command
+        self.damaged: set[str] = set()  #: own files that may be replaced whatever their content is now
         self.kept = False  #: whether the work of a command that fails is kept
         self._created: list[Path] = []
         self._stored: set[Path] = set()
@@ -99,16 +90,19 @@ class OutputFolder:
         """Whether a file may be replaced or removed."""
         if self._link_above(path) is not None or stat.S_ISDIR(os.lstat(path).st_mode):
             return False
-        return bool(self.overwrite) or has_content(path, self.digests.get(self.name_of(path), ()))
+        name = self.name_of(path)
+        damaged = name in self.damaged & self.digests.keys() and stat.S_ISREG(path.lstat().st_mode)
+        return bool(self.overwrite) or damaged or has_content(path, self.digests.get(name, ()))
 
     def _link_above(self, path: Path) -> Path | None:
         """The outermost link among the folders between this one and a file."""
         folders = [Path(self.root, part) for part in Path(self.name_of(path)).parents if part.name]
         return next((folder for folder in reversed(folders) if folder.is_symlink()), None)
 
-    def unchanged(self, path: Path) -> bool:
-        """Whether a file is there as thesisrecon wrote it."""
-        return has_content(path, self.digests.get(self.name_of(path), set()) - {None})
+    def _require_no_link(self, path: Path) -> None:
+        if (link := self._link_above(path)) is not None:
+            way = "replace the link by a folder, or choose another output folder"
+            raise UsageError(f"{path} is not written, because {link} is a link; {way}")
 
     def require(self, names: Sequence[str | Path]) -> None:
         """Raise ``UsageError`` if a file of these names must not be written."""
@@ -116,11 +110,6 @@ class OutputFolder:
             self._require_no_link(self.path / name)
         for path in self._existing(names):
             self.require_own(path)
-
-    def _require_no_link(self, path: Path) -> None:
-        if (link := self._link_above(path)) is not None:
-            way = "replace the link by a folder, or choose another output folder"
-            raise UsageError(f"{path} is not written, because {link} is a link; {way}")
 
     def require_own(self, path: Path) -> None:
         """Raise ``UsageError`` if an existing file must not be replaced."""
@@ -138,11 +127,6 @@ class OutputFolder:
             for name, pattern in zip(names, patterns, strict=True)
         ]
         return [path for paths in found for path in paths if os.path.lexists(path)]
-
-    def trust(self, path: Path) -> None:
-        """Allow to replace a file that the record lists, whatever its content is now."""
-        if own := self.digests.get(self.name_of(path)):
-            own.add(None)
 
     def admit(self, path: Path, content: bytes, *, cached: bool) -> bool:
         """Check and record that a file is written; False if it has this content already.
@@ -180,10 +164,6 @@ class OutputFolder:
             os.utime(self._record, ns=(before.st_atime_ns, before.st_mtime_ns))
         self.digests[name].add(digest)
         self.written[name] = digest
-
-    def forget(self, path: Path) -> None:
-        """Forget a file whose writing failed."""
-        self.written.pop(self.name_of(path), None)
 
     def make_parents(self, path: Path) -> None:
         """Create the folders of a file below this one, which is never created again."""
@@ -227,14 +207,14 @@ class OutputFolder:
         if (gone := next((path for path in files if not os.path.lexists(path)), None)) is not None:
             raise UsageError(f"{gone} was removed while the command was writing to {self.path}; repeat it")
 
-    def open(self, *, locked: bool) -> Callable[[], None]:
+    def open(self) -> Callable[[], None]:
         """Create and lock the folder; returns the function that ends it, without a trace if it is unused."""
         missing = [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
         lock, new = self.path / LOCK_FILE, not os.path.lexists(self.path / LOCK_FILE)
 
         def close() -> None:
             with suppress(OSError):
-                if locked and new and self._record >= 0 and not self._used:
+                if new and self._record >= 0 and not self._used:
                     lock.unlink()
                 for folder in missing if not self._used else ():
                     folder.rmdir()
@@ -245,8 +225,7 @@ class OutputFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            if locked:
-                self._record = _locked(lock)
+            self._record = _locked(lock)
         except OSError as error:
             close()
             raise OutputError(f"the output folder {self.path}", error) from None
@@ -261,11 +240,12 @@ class OutputFolder:
         if not os.path.lexists(lock):
             return
         try:
+            # At most 64 MiB: far above any record, far below the memory of a computer.
             with _open_regular(lock) as file:
-                lines = [line for line in file.read(_MAX_RECORD_BYTES).decode().splitlines() if line]
+                lines = [line for line in file.read(2**26).decode().splitlines() if line]
         except (OSError, UnicodeDecodeError):
             lines = ["of another program"]
-        if not all(line.startswith(_ENTRY) or line == _ENTRY[:1] for line in lines):
+        if not all(line.startswith('["') or line == "[" for line in lines):
             raise UsageError(f"{lock} was not written by thesisrecon; move it, or choose another folder")
         for line in lines:
             # The last line of a killed command may be incomplete.
@@ -319,23 +299,18 @@ def claim_folder(
     *,
     overwrite: bool | None = False,
     names: Sequence[str | Path] = (),
-    known: Mapping[str, str | None] | None = None,
-    locked: bool = True,
     check: Callable[[OutputFolder], object] = lambda _: None,
 ) -> Iterator[OutputFolder]:
-    """Claim an output folder for the block, in which :func:`write_atomically` obeys the rule.
+    """Lock an output folder for the block, in which :func:`write_atomically` obeys the rule.
 
-    ``names``: files that the command writes; ``overwrite``: None if the command has no such option;
-    ``known``: own files by another record; ``locked``: lock the folder and keep a record in it; ``check`` may
-    refuse it.
+    ``names``: files that the command writes; ``overwrite``: None if the command has no such option; ``check``
+    may refuse the folder.
     """
-
-    outputs = OutputFolder(path, overwrite=overwrite, known=known)
+    outputs = OutputFolder(path, overwrite=overwrite)
 
     def judge() -> None:
         try:
-            if locked:
-                outputs.read_record()
+            outputs.read_record()
             check(outputs)
         except OSError as error:
             raise OutputError(f"the output folder {path}", error) from None
@@ -344,7 +319,7 @@ def claim_folder(
     # A refused command creates nothing; a folder in use is locked before it is judged.
     if not os.path.lexists(path / LOCK_FILE):
         judge()
-    close = outputs.open(locked=locked)
+    close = outputs.open()
     try:
         judge()
         _claims.append(outputs)

@@ -1,4 +1,4 @@
-"""Decoded images as 8-bit RGB at working size, within a known amount of memory.
+"""Decoded images as 8-bit RGB at working size, within a known amount of memory, and refused raw files.
 
 The decoded image is held once, in the mode of its file. Rotation, conversion and reduction process a few rows
 at a time: on the whole image each of them would need another four bytes per pixel.
@@ -7,29 +7,26 @@ at a time: on the whole image each of them would need another four bytes per pix
 from __future__ import annotations
 
 import math
+import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
+from typing import Any, BinaryIO
 
 import numpy as np
 import PIL.Image
 from PIL.Image import Transpose
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.errors import Notice
 
-_STRIPE_ROWS = 256
-"""Rows converted at a time."""
-_REDUCING_GAP = 3.0
-"""Reduction left to the Lanczos filter; larger reductions average whole pixels first."""
+_STRIPE_ROWS = 256  # Rows converted at a time
 _LANCZOS = PIL.Image.Resampling.LANCZOS
-OPAQUE = 128
-"""Least alpha of a pixel that is used: at least half of it is covered."""
-_DECODED_BYTES, _COEFFICIENT_BYTES = 4, 2
-_DECODED_BYTES_OF = {"WEBP": 16, "AVIF": 14, "HEIF": 14, "JPEG2000": 20}
-"""Measured bytes per pixel at the peak of decoding; these decoders hold the image several times."""
+OPAQUE = 128  # Least alpha of a pixel that is used: at least half of it is covered
 
 
 class UnusableImage(Exception):
@@ -58,9 +55,10 @@ class MemoryBudget:
 
 def decoding_bytes(file: PIL.Image.Image) -> int:
     """Estimate the peak memory of decoding; a progressive JPEG also holds all its coefficients."""
-    each = _DECODED_BYTES_OF.get(file.format or "", _DECODED_BYTES)
+    # Measured bytes per pixel at the peak; these decoders hold the image several times.
+    each = {"WEBP": 16, "AVIF": 14, "HEIF": 14, "JPEG2000": 20}.get(file.format or "", 4)
     if file.info.get("progressive"):
-        each += _COEFFICIENT_BYTES * len(file.getbands())
+        each += 2 * len(file.getbands())
     return each * file.size[0] * file.size[1]
 
 
@@ -213,7 +211,8 @@ def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, flo
     These are the steps of Pillow's ``resize`` with a ``reducing_gap``, all but the last stripe by stripe.
     (Pillow itself may begin with the columns if an image is more than twice as high as wide.)
     """
-    by = [max(int(e / s / _REDUCING_GAP), 1) for e, s in zip(extent, size, strict=True)]
+    # The filter reduces by 3; larger reductions average whole pixels first.
+    by = [max(int(e / s / 3.0), 1) for e, s in zip(extent, size, strict=True)]
     mode = "RGBa" if image.layered else "RGB"
     narrow = PIL.Image.new(mode, (size[0], -(-image.size[1] // by[1])))
     for start, stop in image.stripes(max(_STRIPE_ROWS // by[1], 1) * by[1]):
@@ -221,3 +220,73 @@ def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, flo
         box = (0.0, 0.0, extent[0] / by[0], float(part.height))
         narrow.paste(part.resize((size[0], part.height), _LANCZOS, box=box), (0, start // by[1]))
     return _straight(narrow.resize(size, _LANCZOS, box=(0.0, 0.0, float(size[0]), extent[1] / by[1])))
+
+
+RAW_SUFFIXES = (
+    *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".rw2", ".rwl", ".orf", ".raf"),
+    *(".pef", ".srw", ".3fr", ".fff", ".iiq", ".erf", ".kdc", ".dcr", ".mrw", ".mos", ".mef", ".x3f", ".gpr"),
+)
+RAW_FILE = Notice("raw-file")
+RAW_SIGNATURE = re.compile(
+    rb"FUJIFILMCCD-RAW|IIR[OS]|MMOR|IIU\0|FOVb|\0MRM|II\x1a\0\0\0HEAPCCDR|....ftypcrx |II\*\0....CR\x02\0",
+    re.DOTALL,
+)
+"""First bytes of raw files; only the last kind (CR2) is a TIFF file."""
+_Tags = Mapping[int, Any]
+
+
+def refuse_raw_file(stream: BinaryIO, suffix: str) -> None:
+    """Raise ``UnusableImage`` if the image that Pillow would read is not the main one of the file."""
+    head = stream.read(32)
+    if RAW_SIGNATURE.match(head):
+        raise UnusableImage(RAW_FILE)
+    if not re.match(rb"II[*+]\0|MM\0[*+]", head):
+        return
+    if suffix.lower() in RAW_SUFFIXES:
+        raise UnusableImage(RAW_FILE)
+    pages = list(_tiff_pages(stream, head))
+    if not pages:
+        return
+    first, size = pages[0], _size(pages[0])
+    inner = [tags for page in pages for tags in _inner_images(page, stream, head)]
+    # Colour filter array, or linear raw; the version of a DNG.
+    sensor = any(tags.get(262) in (32803, 34892) for tags in chain(pages, inner)) or 50706 in first
+    if sensor or any(math.prod(_size(tags)) > math.prod(size) for tags in inner):
+        raise UnusableImage(RAW_FILE)
+    reduced = first.get(254, 0) & 1 or first.get(255, 0) == 2
+    if (reduced and len(pages) > 1) or any(_enlarges(_size(page), size) for page in pages[1:]):
+        raise UnusableImage(Notice("reduced-image", size[0], size[1]))
+
+
+def _size(tags: _Tags) -> tuple[int, int]:
+    return tags.get(256, 0), tags.get(257, 0)
+
+
+def _enlarges(size: tuple[int, int], first: tuple[int, int]) -> bool:
+    """Whether an image is larger than the first, and of the same ratio of sides within rounding."""
+    return size[0] > first[0] and abs(size[0] * first[1] - size[1] * first[0]) <= max(size)
+
+
+def _directory(stream: BinaryIO, head: bytes, at: int = 0) -> ImageFileDirectory_v2:
+    """The tags of an image of a TIFF file, and the place of the next one; at 0 only that of the first."""
+    tags = ImageFileDirectory_v2(head[: 16 if b"+" in head[2:4] else 8])
+    if at:
+        stream.seek(min(at, 2**62))
+        tags.load(stream)
+    return tags
+
+
+def _tiff_pages(stream: BinaryIO, head: bytes) -> Iterator[_Tags]:
+    """The tags of each page, until the file ends or repeats."""
+    at, seen = _directory(stream, head).next, set[int]()
+    while at and at not in seen and len(seen) < 1000:
+        seen.add(at)
+        tags = _directory(stream, head, at)
+        yield tags
+        at = tags.next
+
+
+def _inner_images(tags: _Tags, stream: BinaryIO, head: bytes) -> list[_Tags]:
+    """The tags of the images inside a page, which has at most a few."""
+    places = tags.get(330, ())
+    return [_directory(stream, head, at) for at in (places if isinstance(places, tuple) else (places,))[:16]]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import project_camera
 from thesisrecon.config import PipelineConfig, SelfCalibrator

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.errors import StageFailure
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.pipeline.job import Job

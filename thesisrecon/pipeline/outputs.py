@@ -14,12 +14,12 @@ from typing import Any, get_args
 import numpy as np
 
 from thesisrecon import __version__
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F32, I64, U8
 from thesisrecon.camera import finite_cameras
 from thesisrecon.config.text import toml_from_config
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
-from thesisrecon.io._colmap_writing import COLMAP_FILES, write_colmap_model
+from thesisrecon.io._colmap import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import as_read, read_json, write_atomically, write_json, write_text
 from thesisrecon.io._images import image_without_pixels

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, StageFailure

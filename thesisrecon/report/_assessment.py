@@ -1,4 +1,4 @@
-"""Sentences and numbers of the report: the assessment of a run, its key facts, and number formatting."""
+"""Sentences, tables and numbers of the pages: the assessment of a run, its key facts, a comparison."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from thesisrecon.errors import counted
 from thesisrecon.records import IntrinsicInterval, TexturedMesh, TwoView
 from thesisrecon.report._data import ReportData, ResidualSummary
+from thesisrecon.results import THRESHOLDS, ModelComparison
 
 Level = Literal["good", "doubt", "open", "bad"]
 _THIN = "\u202f"  # narrow no-break space
@@ -21,7 +22,6 @@ _STAGE_RESULTS = {
     "projective": "a projective reconstruction was computed (without focal lengths and angles)",
     "metric": "metric cameras and points were computed",
 }
-_UNITS = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,19 @@ def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
     if undetermined := sum(pair.undetermined for pair in accepted):
         note += f"; {count_of(undetermined, 'pair')} with degenerate epipolar geometry"
     return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
+
+
+def pair_text(pair: TwoView) -> str:
+    """Matches, noise and degeneracy of a pair."""
+    share = f" ({100 * pair.inliers / pair.candidates:.0f} %)" if pair.candidates else ""
+    text = f"{grouped(pair.inliers)} verified of {grouped(pair.candidates)} candidate matches{share}"
+    if np.isfinite(pair.sigma_px):
+        text += f", noise {pair.sigma_px:.2f} px per coordinate"
+    if np.isfinite(pair.homography_inlier_ratio):
+        text += f", {100 * pair.homography_inlier_ratio:.0f} % homography inliers"
+    if pair.undetermined and pair.degeneracy is not None:
+        text += f"; degenerate epipolar geometry: {pair.degeneracy.reasons[0]}"
+    return text
 
 
 def pair_selection_text(data: ReportData) -> str:
@@ -221,11 +234,12 @@ def duration(seconds: float) -> str:
 def _named_number(name: str, value: float) -> tuple[str, str]:
     """Format a key and its value with the unit of its suffix: sigma_px -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
+    units = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
     text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     if float(value).is_integer() and abs(value) < 1e15:
         text = grouped(int(value))
-    if stem and suffix in _UNITS:
-        return stem.replace("_", " "), f"{text}{_THIN}{_UNITS[suffix]}"
+    if stem and suffix in units:
+        return stem.replace("_", " "), f"{text}{_THIN}{units[suffix]}"
     if stem and suffix == "rel":
         return stem.replace("_", " "), f"{100 * value:.3g}{_THIN}%"
     return name.replace("_", " "), text
@@ -245,3 +259,58 @@ def _sentence(text: str) -> str:
     """Capitalize a clause and end it with a full stop."""
     text = text.strip()
     return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
+
+
+def _four_digits(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else "–"
+
+
+_COLUMNS = {
+    "centre_error": ("centre (unit of B)", 1.0),
+    "rotation_error_deg": ("rotation (deg)", 1.0),
+    "focal_error_rel": ("focal length (%)", 100.0),
+    "principal_point_error_px": ("principal point (px)", 1.0),
+}
+
+Table = list[list[str]]
+
+
+def summary_table(comparison: ModelComparison) -> Table:
+    """Statistics of the absolute errors that are known, with a head row."""
+    rows = [["error of A", "median", "mean", "RMS", "largest"]]
+    for name, statistics in comparison.summary.items():
+        label, factor = _COLUMNS[name]
+        rows.append([label, *(_four_digits(factor * value) for value in statistics.values())])
+    return rows
+
+
+def camera_table(comparison: ModelComparison) -> Table:
+    """Errors of each common camera, with a head row."""
+    rows = [["camera", *(label for label, _ in _COLUMNS.values())]]
+    errors = [factor * getattr(comparison, name) for name, (_, factor) in _COLUMNS.items()]
+    columns = zip(comparison.names, *errors, strict=True)
+    return rows + [[name, *map(_four_digits, numbers)] for name, *numbers in columns]
+
+
+def point_table(comparison: ModelComparison) -> Table:
+    """Distances of the points in both directions, with a head row; empty without them."""
+    found = comparison.points
+    if found is None:
+        return []
+    rows = [["points", "A to nearest of B", "B to nearest of A"]]
+    rows.append(["median distance (unit of B)", _four_digits(found.a_to_b), _four_digits(found.b_to_a)])
+    columns = (THRESHOLDS, found.thresholds, found.a_within, found.b_within)
+    for share, limit, *within in zip(*columns, strict=True):
+        label = f"within {_four_digits(limit)} ({100 * share:g} % of the scene)"
+        rows.append([label, *(f"{100 * part:.1f} %" for part in within)])
+    return rows
+
+
+def headline(comparison: ModelComparison) -> str:
+    """Number of common cameras, and of those of one model only."""
+    text = count_of(len(comparison.names), "common camera")
+    for which, only in (("A", comparison.only_a), ("B", comparison.only_b)):
+        if only:
+            text += f", {len(only)} only in {which}"
+    scale = comparison.similarity
+    return text if scale is None else f"{text}; one unit of A is {_four_digits(scale.scale)} units of B"

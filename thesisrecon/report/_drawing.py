@@ -16,8 +16,6 @@ from thesisrecon.records import HeldOut, Image, TwoView
 
 Point = tuple[float, float]
 
-_THUMBNAIL_BYTES = 2_000_000
-_SAMPLES_PX, _PANEL_LONG_SIDE = 800, 640
 _GAP = 8
 # Distinct hues of similar lightness; the drawn numbers serve colour-blind readers.
 HUES = (
@@ -25,11 +23,7 @@ HUES = (
     "#c77dff", "#80ffdb", "#ffadad", "#72b0ff", "#fdffb6", "#ff9ff3",
 )  # fmt: skip
 
-_DEPTH_BYTES = 1_500_000
-_DEPTH_SIDE = 360
-_HELD_OUT_SIDE = 640
-DIFFERENCE_LIMIT = 64.0
-"""Grey levels; larger differences have one colour."""
+DIFFERENCE_LIMIT = 64.0  # Grey levels; larger differences have one colour
 
 # CIELAB lightness rises by 5 per colour: perceptually uniform, ordered in grey and for colour-blind readers;
 # the hue runs from violet to yellow in Oklch (Ottosson 2020).
@@ -51,7 +45,7 @@ class EmbeddedImage:
 
 def thumbnail(image: Image, how_many: int) -> EmbeddedImage:
     """A small JPEG of an image; all ``how_many`` of the page together take about 2 MB."""
-    share = _THUMBNAIL_BYTES / max(how_many, 1)
+    share = 2_000_000 / max(how_many, 1)
     # A JPEG of this quality takes about 0.25 bytes per pixel, 0.33 in base64, more for noise.
     side = float(np.clip(np.sqrt(1.5 * share / 0.33), 64, 360))
     while True:
@@ -72,7 +66,7 @@ def embed_jpeg(picture: PillowImage.Image, *, quality: int) -> EmbeddedImage:
 
 
 def _sampled(image: Image) -> PillowImage.Image:
-    step = max(1, max(image.size) // _SAMPLES_PX)
+    step = max(1, max(image.size) // 800)
     return PillowImage.fromarray(image.rgb[::step, ::step])
 
 
@@ -138,7 +132,7 @@ def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Im
 def _faded(image: Image) -> tuple[PillowImage.Image, float]:
     """Return the dimmed image at twice the panel size, and its scale from working pixels."""
     width, height = image.size
-    s = 2.0 * _PANEL_LONG_SIDE / max(width, height)
+    s = 2.0 * 640 / max(width, height)
     even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
     colour = _sampled(image)
     grey = colour.convert("L").convert("RGB")
@@ -183,7 +177,7 @@ def _paint_scale(values: F64) -> NDArray[np.uint8]:
 
 def depth_side(how_many: int) -> int:
     """Long side (px) of the depth images, which together take about 1.5 MB."""
-    return int(np.clip(np.sqrt(_DEPTH_BYTES / max(how_many, 1) / 0.33), 96, _DEPTH_SIDE))
+    return int(np.clip(np.sqrt(1_500_000 / max(how_many, 1) / 0.33), 96, 360))
 
 
 def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, EmbeddedImage]:
@@ -192,7 +186,7 @@ def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, Embe
     difference = np.where(held_out.compared, difference / DIFFERENCE_LIMIT, np.nan)
     rendered = np.where(held_out.compared[..., None], held_out.rendered, np.array(UNKNOWN, np.uint8))
     sheets = map(PillowImage.fromarray, (held_out.real, rendered, _paint_scale(difference)))
-    real, model, apart = (_small(sheet, _HELD_OUT_SIDE) for sheet in sheets)
+    real, model, apart = (_small(sheet, 640) for sheet in sheets)
     return real, model, apart
 
 

@@ -1,4 +1,4 @@
-"""Interactive figures of the report as plotly.js mappings, and histograms as SVG paths.
+"""Interactive figures as plotly.js mappings, data of the model for ``viewer.js``, and histograms in SVG.
 
 The scene is drawn upright and without outliers. Plain mappings instead of plotly's classes work with every
 version of plotly.
@@ -6,6 +6,7 @@ version of plotly.
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -13,31 +14,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import decompose_camera, finite_cameras
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.records import Reconstruction, TwoView
-from thesisrecon.results import SparseModel
+from thesisrecon.records import Reconstruction, TexturedMesh, TwoView
+from thesisrecon.report._data import pictured
+from thesisrecon.report._drawing import embed_jpeg
+from thesisrecon.results import ModelComparison, SparseModel
 
 MAX_POINTS = 25_000
-_BINS = 28
-# Possible ends of the common histogram axis.
-_ROUND_LIMITS_PX = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
-_INK, _ACCENT, _PANEL = "#1b2733", "#ff9f43", "#131a22"
+_ACCENT = "#ff9f43"
 # Lightness falls evenly, so that the order is visible in grey and for colour-blind readers.
 _PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1f8089"], [1.0, "#0b4a5c"]]
-_REFUSED_SCALE = [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]]
 MAX_MATRIX, MAX_CELLS = 200, 100
 """Largest number of views in the matrix of pairs, and cells per side for more."""
-_FAR = 50.0
-"""Distance of an affine camera that is drawn as one at infinity, in radii of 80 % of the points."""
-_LONGEST_EDGE = 3.0
-"""Longest edge of a pyramid relative to its depth: that of a camera with a field of view of 140 degrees."""
-MAX_PYRAMIDS = 250
-"""Cameras that are drawn as pyramids; of more, these are evenly spread."""
-_MAX_ANNOTATED = 14
+MAX_PYRAMIDS = 250  # Cameras that are drawn as pyramids; of more, these are evenly spread
+COMPARED_COLORS = {"a": ("#ff9f43", "#ffc78a"), "b": ("#3fb8ff", "#9fd8f7")}
+"""Cameras and points of each model in a comparison."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +117,8 @@ def _near(reconstruction: Reconstruction, views: I64) -> B8:
     middle = np.median(X, axis=0) if len(X) else np.zeros(3)
     radius = np.quantile(np.linalg.norm(X - middle, axis=1), 0.8) if len(X) else np.inf
     centres = dehomogenize(camera_centre(reconstruction.P[views]))
-    return np.asarray(np.linalg.norm(centres - middle, axis=1) <= _FAR * radius)
+    # Farther than 50 radii of 80 % of the points a camera is as good as at infinity.
+    return np.asarray(np.linalg.norm(centres - middle, axis=1) <= 50.0 * radius)
 
 
 def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
@@ -140,8 +137,8 @@ def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
     width, height = float(size[0]), float(size[1])
     xy = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     rays = homogenize(xy) @ np.linalg.inv(K).T
-    # Affine cameras may have any K: no pyramid is much longer than its depth.
-    return np.asarray(rays / max(1.0, float(np.linalg.norm(rays, axis=1).max()) / _LONGEST_EDGE))
+    # Affine cameras may have any K: no edge is longer than 3 depths, as with a field of view of 140 degrees.
+    return np.asarray(rays / max(1.0, float(np.linalg.norm(rays, axis=1).max()) / 3.0))
 
 
 def _pyramid_depth(centres: F64, points: F64) -> float:
@@ -176,7 +173,7 @@ def scene_figure(
     axes = {f"{name}axis": {"visible": False, "range": [low, high]} for name, low, high in ranges}
     ratio = dict(zip("xyz", aspect.tolist(), strict=True))
     layout = {
-        "paper_bgcolor": _PANEL,
+        "paper_bgcolor": "#131a22",
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "showlegend": False,
         "scene": {**axes, "aspectmode": "manual", "aspectratio": ratio, "dragmode": "turntable"},
@@ -214,49 +211,66 @@ def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
     return {**kind, **columns}
 
 
+def comparison_figure(comparison: ModelComparison) -> dict[str, Any]:
+    """Both models in the world of B as one plotly.js figure, upright."""
+    upright = upright_rotation(np.stack([view.R for view in comparison.b.views]))
+    models = {"b": comparison.b, "a": comparison.a}
+    # Both models take half a megabyte together.
+    scenes = {key: model_scene(model, upright, max_points=10_000) for key, model in models.items()}
+    low = np.min([scene.low for scene in scenes.values()], axis=0)
+    high = np.max([scene.high for scene in scenes.values()], axis=0)
+    figure: dict[str, Any] = {}
+    for key, scene in scenes.items():
+        accent, paint = COMPARED_COLORS[key]
+        names = [f"{key.upper()}: {name}" for name in models[key].names]
+        drawn = scene_figure(replace(scene, low=low, high=high), names, paint, accent=accent)
+        figure = {**drawn, "data": [*figure.get("data", []), *drawn["data"]]}
+    return figure
+
+
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:
     """Matrix of verified matches on a logarithmic scale, rejected pairs in red, of many views by blocks."""
     block = 1 if len(names) <= MAX_MATRIX else -(-len(names) // MAX_CELLS)
-    labels = [_block_label(first, block, names) for first in range(0, len(names), block)]
-    accepted, refused = (_count_matrix(pairs, len(labels), block, wanted) for wanted in (True, False))
+    # plotly.js interprets some HTML in labels.
+    labels = [
+        f"{k + 1} · {escape(names[k])}" if block == 1 else f"views {k + 1}–{min(k + block, len(names))}"
+        for k in range(0, len(names), block)
+    ]
+    # The largest number of verified matches per cell, -1 without pairs.
+    accepted, refused = (np.full((len(labels), len(labels)), -1, dtype=np.int64) for _ in range(2))
+    for pair in pairs:
+        best, (a, b) = accepted if pair.accepted else refused, (pair.i // block, pair.j // block)
+        best[a, b] = best[b, a] = max(int(best[a, b]), pair.inliers)
     refused[accepted >= 0] = -1
     counts = accepted[accepted >= 0] if (accepted >= 0).any() else refused[refused >= 0]
     # The scale spans at least a factor of ten, so that small differences look small.
     high = max(1.0, float(np.log10(counts.max(initial=10))))
     low = max(0.0, min(float(np.log10(max(counts.min(initial=10**9), 1))), high - 1.0))
-    scale = {"zmin": low, "zmax": high}
-    good = _heat(accepted, labels, "", "verified matches")
-    good |= {"colorscale": _PAIR_SCALE, "colorbar": _count_bar()}
+    ticks = [1, 3, 10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 5000, 10_000, 30_000]
+    values = [round(float(np.log10(n)), 3) for n in ticks]
+    bar: Figure = {
+        "tickvals": values,
+        "ticktext": [str(n) for n in ticks],
+        "thickness": 12,
+        "outlinewidth": 0,
+    }
+    bar |= {"x": 1.01, "xpad": 4, "len": 1.0}
+    good = _heat(accepted, labels, "", "verified matches") | {"colorscale": _PAIR_SCALE, "colorbar": bar}
     bad = _heat(refused, labels, "× ", "verified matches, not accepted")
-    bad |= {"colorscale": _REFUSED_SCALE, "showscale": False}
+    bad |= {"colorscale": [[0.0, "#f9dcd7"], [1.0, "#f0a99f"]], "showscale": False}
+    scale = {"zmin": low, "zmax": high}
     return {"data": [good | scale, bad | scale], "layout": _matrix_layout(labels, block)}
-
-
-def _count_matrix(pairs: Sequence[TwoView], cells: int, block: int, accepted: bool) -> I64:
-    """Return the (cells, cells) largest number of verified matches per cell, -1 without pairs."""
-    best = np.full((cells, cells), -1, dtype=np.int64)
-    for pair in pairs:
-        if pair.accepted == accepted:
-            a, b = pair.i // block, pair.j // block
-            best[a, b] = best[b, a] = max(int(best[a, b]), pair.inliers)
-    return best
 
 
 def _heat(counts: I64, labels: list[str], mark: str, words: str) -> Figure:
     rows = counts.tolist()
     gap = 2 if len(labels) <= 30 else (1 if len(labels) <= 80 else 0)
-    heat: Figure = {
-        "type": "heatmap",
-        "x": labels,
-        "y": labels,
-        "z": [[None if n < 0 else round(float(np.log10(max(n, 1))), 3) for n in row] for row in rows],
-        "customdata": [[None if n < 0 else n for n in row] for row in rows],
-        "xgap": gap,
-        "ygap": gap,
-        "hoverongaps": False,
-        "hovertemplate": "%{y}<br>%{x}<br><b>%{customdata}</b> " + words + "<extra></extra>",
-    }
-    if len(labels) <= _MAX_ANNOTATED:
+    heat: Figure = {"type": "heatmap", "x": labels, "y": labels, "xgap": gap, "ygap": gap}
+    heat["z"] = [[None if n < 0 else round(float(np.log10(max(n, 1))), 3) for n in row] for row in rows]
+    heat["customdata"] = [[None if n < 0 else n for n in row] for row in rows]
+    heat["hoverongaps"] = False
+    heat["hovertemplate"] = "%{y}<br>%{x}<br><b>%{customdata}</b> " + words + "<extra></extra>"
+    if len(labels) <= 14:
         heat["text"] = [["" if n < 0 else f"{mark}{n}" for n in row] for row in rows]
         heat["texttemplate"] = "%{text}"
     return heat
@@ -272,36 +286,25 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "#e9edf0",
         "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
-        "font": {"family": "system-ui, sans-serif", "size": 12, "color": _INK},
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1b2733"},
         "showlegend": False,
         "xaxis": {**axis, "side": "top"},
         "yaxis": {**axis, "autorange": "reversed", "scaleanchor": "x"},
     }
 
 
-def _count_bar() -> Figure:
-    counts = [1, 3, 10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 5000, 10_000, 30_000]
-    values = [round(float(np.log10(n)), 3) for n in counts]
-    size = {"thickness": 12, "outlinewidth": 0, "x": 1.01, "xpad": 4, "len": 1.0}
-    return {"tickvals": values, "ticktext": [str(n) for n in counts], **size}
-
-
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
     """Upper end of the distances (px, 98 % of them) and their histograms as SVG paths in equal boxes."""
-    limit_px = _common_limit_px(np.concatenate([np.zeros(0), *distances]))
-    shares = [_histogram_shares(d, limit_px) for d in distances]
-    tallest = max((float(s.max()) for s in shares if len(s)), default=1.0)
+    everything = np.concatenate([np.zeros(0), *distances])
+    needed = float(np.quantile(everything, 0.98)) if len(everything) else 1.0
+    round_px = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
+    limit_px = next((limit for limit in round_px if limit >= needed), float(np.ceil(needed)))
+    shares = []
+    for d in distances:
+        counts, _ = np.histogram(np.minimum(d, limit_px), bins=28, range=(0.0, limit_px))
+        shares.append(counts / max(len(d), 1))
+    tallest = max((float(s.max()) for s in shares), default=1.0)
     return limit_px, [_histogram_path(s, tallest, width, height) for s in shares]
-
-
-def _common_limit_px(distances: F64) -> float:
-    needed = float(np.quantile(distances, 0.98)) if len(distances) else 1.0
-    return next((limit for limit in _ROUND_LIMITS_PX if limit >= needed), float(np.ceil(needed)))
-
-
-def _histogram_shares(distances: F64, limit_px: float) -> F64:
-    counts, _ = np.histogram(np.minimum(distances, limit_px), bins=_BINS, range=(0.0, limit_px))
-    return counts / max(len(distances), 1)
 
 
 def _histogram_path(shares: F64, tallest: float, width: float, height: float) -> str:
@@ -315,12 +318,6 @@ def _histogram_path(shares: F64, tallest: float, width: float, height: float) ->
     return "".join(strokes)
 
 
-def _block_label(first: int, block: int, names: Sequence[str]) -> str:
-    last = min(first + block, len(names))
-    # plotly.js interprets some HTML in labels.
-    return f"{first + 1} · {escape(names[first])}" if block == 1 else f"views {first + 1}–{last}"
-
-
 def _useful_digits(scene: Scene) -> int:
     """Return the decimals that keep 1e-4 of the scene size."""
     extent = float((scene.high - scene.low).max())
@@ -329,3 +326,110 @@ def _useful_digits(scene: Scene) -> int:
 
 def _xyz(points: F64, digits: int) -> Figure:
     return {name: np.round(points[:, d], digits).tolist() for d, name in enumerate("xyz")}
+
+
+LEVELS = 65535  # Quantization levels along each axis of the bounding box and of the texture
+MAX_TEXELS = 2100 * 2100
+"""Larger textures are reduced: with 45,000 faces they then add less than 3 MB to the page."""
+_DIRECTIONS = (
+    ("Behind the cameras", (0.35, -1.45, 0.6)),
+    ("From above", (0.0, -0.01, 1.9)),
+    ("From the left", (-1.3, -0.9, 0.5)),
+    ("From the right", (1.3, -0.9, 0.5)),
+)
+"""Viewing directions; z is up and the mean viewing direction of the cameras is along y."""
+
+
+def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Any]:
+    """Build the JSON data of the 3D viewer; z is up.
+
+    ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
+    uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints`` of the
+    images with pictures, the most central one as ``start``. Faces beyond 8 times the 95 % quantile from the
+    median are left out.
+    """
+    mesh = _without_outliers(mesh)
+    views = np.flatnonzero(reconstruction.registered).tolist()
+    rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
+    upright = upright_rotation(rotations)
+    vertices = mesh.vertices @ upright.T
+    low, high = (end(vertices[mesh.faces], axis=(0, 1)) for end in (np.min, np.max))
+    steps = np.where(high > low, high - low, 1.0) / LEVELS
+    positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
+    color, faces, vertex = _colored(mesh)
+    shown = sorted(set(views) & set(pictured(len(names)))) or views[:1]
+    places = _viewpoints(mesh, reconstruction, upright, names, shown)
+    eyes = np.array([place["eye"] for place in places])
+    middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
+    return {
+        "low": low.tolist(),
+        "high": (low + steps * LEVELS).tolist(),
+        "positions": _packed(positions[vertex]),
+        "indices": _packed(faces.astype("<u4")),
+        **color,
+        "viewpoints": places,
+        "start": middle,
+        "directions": [{"name": name, "from": list(direction)} for name, direction in _DIRECTIONS],
+    }
+
+
+def _without_outliers(mesh: TexturedMesh) -> TexturedMesh:
+    """Remove far faces, which would leave few quantization levels for the rest, if there is a rest."""
+    distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
+    keep = (distance <= 8.0 * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    if not keep.any():
+        return mesh
+    return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
+
+
+def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
+    """Return the colour data, the faces (M, 3) and the vertex of each corner."""
+    every = np.arange(len(mesh.vertices))
+    if mesh.texture is None or mesh.uv is None:
+        colors = mesh.colors
+        if colors is None:
+            colors = np.tile(np.full(3, 200, dtype=np.uint8), (len(mesh.vertices), 1))
+        return {"colors": _packed(colors)}, mesh.faces, every
+    height, width = mesh.texture.shape[:2]
+    # (0, 0) is the centre of the first texel; WebGL counts from its corner.
+    uv = np.clip((mesh.uv + 0.5) / (width, height), 0.0, 1.0)
+    corners = np.column_stack([mesh.faces.ravel(), np.rint(LEVELS * uv.reshape(-1, 2)).astype(np.int64)])
+    # Sorting one integer key per corner is ten times faster than sorting rows.
+    key = (corners[:, 0] * (LEVELS + 1) + corners[:, 1]) * (LEVELS + 1) + corners[:, 2]
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    texture = embed_jpeg(_within(mesh.texture), quality=82).uri
+    color = {"uv": _packed(corners[first, 1:].astype("<u2")), "texture": texture}
+    return color, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
+
+
+def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
+    """Reduce the texture to at most ``MAX_TEXELS``."""
+    picture = PillowImage.fromarray(texture)
+    scale = np.sqrt(MAX_TEXELS / (picture.width * picture.height))
+    if scale >= 1.0:
+        return picture
+    size = max(1, int(scale * picture.width)), max(1, int(scale * picture.height))
+    return picture.resize(size, PillowImage.Resampling.BOX)
+
+
+def _viewpoints(
+    mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str], views: list[int]
+) -> list[dict[str, Any]]:
+    """The viewpoints of images, in the axes of the viewer, with target and field of view."""
+    found = []
+    for i in views:
+        K, R, t = decompose_camera(reconstruction.P[i])
+        size = reconstruction.sizes[i].astype(np.float64)
+        field = size / 2 / np.diag(K)[:2]
+        local = mesh.vertices @ R.T + t
+        with np.errstate(divide="ignore", invalid="ignore"):
+            seen = (local[:, 2] > 0) & (np.abs(local[:, :2] / local[:, 2:]) < field).all(axis=1)
+        depth = float(np.median(local[seen, 2])) if seen.any() else float(np.linalg.norm(t)) or 1.0
+        eye = upright @ (-R.T @ t)
+        name, target = f"{i + 1} · {names[i]}", eye + depth * (upright @ R[2])
+        found.append({"name": name, "eye": eye.tolist(), "target": target.tolist(), "field": field.tolist()})
+    return found
+
+
+def _packed(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -1,4 +1,4 @@
-"""``report.html`` of a run and ``strip.html`` of a view sequence: single files without network access.
+"""``report.html`` of a run, and the pages of a view sequence and a comparison: files without network access.
 
 A page loads nothing from the network, and no file name can run as code: the template escapes all text, data
 for scripts is JSON that cannot close its element, and a content security policy lists the scripts by their
@@ -13,29 +13,20 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from thesisrecon import __version__
 from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import made
-from thesisrecon.records import Reconstruction, StageReport, TwoView
-from thesisrecon.report._assessment import (
-    assess,
-    count_of,
-    decimals,
-    duration,
-    grouped,
-    key_facts,
-    model_text,
-    named_numbers,
-    pair_selection_text,
-    plus_minus,
-    significant,
-)
+from thesisrecon.records import Reconstruction, StageReport
+from thesisrecon.report import _assessment as words
+from thesisrecon.report import _drawing as drawing
+from thesisrecon.report import _figures as figures
 from thesisrecon.report._data import (
     MAX_PICTURED,
     ReportData,
@@ -44,32 +35,9 @@ from thesisrecon.report._data import (
     reprojection_distances,
     summarize_distances,
 )
-from thesisrecon.report._drawing import (
-    DIFFERENCE_LIMIT,
-    SCALE,
-    depth_side,
-    draw_depth,
-    draw_held_out,
-    draw_pair,
-    embed_jpeg,
-    thumbnail,
-)
-from thesisrecon.report._figures import (
-    MAX_POINTS,
-    MAX_PYRAMIDS,
-    Figure,
-    build_scene,
-    histograms,
-    pair_matrix_figure,
-    scene_figure,
-)
-from thesisrecon.report._viewer import viewer_data
+from thesisrecon.results import ModelComparison
 
-_FRAME_SIDE_PX, _FRAME_QUALITY = 960, 85
-"""Size and JPEG quality of the frames on a strip page; the files beside it have full size and quality."""
 _HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
-_MAX_LISTED_PAIRS = 120
-_AFFINE_POINTS = 5_000
 _INTRINSICS = {
     "focal_px": "Focal length (px)",
     "aspect": "Aspect (fy/fx)",
@@ -81,7 +49,6 @@ _INTRINSICS = {
     "k3": "k3",
 }
 T = TypeVar("T")
-_ALWAYS_SHOWN = ("focal_px", "principal_x_px", "principal_y_px", "k1")
 
 
 def render_page(
@@ -114,7 +81,7 @@ def _compiled(template: str, filters: tuple[tuple[str, Callable[..., str]], ...]
 
 def page_resource(name: str) -> str:
     """Read a style, script or template of this folder."""
-    return files("thesisrecon.report").joinpath(name).read_text(encoding="utf-8")
+    return (Path(__file__).parent / name).read_text(encoding="utf-8")
 
 
 @cache
@@ -131,31 +98,46 @@ def _packed(script: str) -> str:
     return base64.b64encode(gzip.compress(script.encode("utf-8"), mtime=0)).decode("ascii")
 
 
-def figure_content(figures: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
+def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
     """Return the scripts that draw plotly.js figures by element id, and their values for the template."""
-    library = plotly_script() if figures else ""
-    scripts = [page_resource("unpack.js"), page_resource("page.js")] if figures else []
+    scripts = [page_resource("unpack.js"), page_resource("page.js")] if drawn else []
+    library = plotly_script() if drawn else ""
     # page.js adds the unpacked library as a script, which the policy of the page must list too.
-    allowed = [*scripts, library] if figures else []
-    return allowed, {"figures": figures, "figure_scripts": scripts, "plotly": _packed(library)}
+    allowed = [*scripts, library] if drawn else []
+    return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
 
 
 def strip_page(
     title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
 ) -> str:
     """Render the page of a view sequence."""
-    if not frames:
-        raise ValueError("a strip page needs at least one frame")
-    script = page_resource("strip.js")
-    shown = [{"caption": caption, "image": _embedded(rgb)} for caption, rgb in frames]
+    script, shown = page_resource("strip.js"), []
+    for caption, rgb in frames:
+        # The files beside the page have full size and quality.
+        picture = PillowImage.fromarray(rgb)
+        picture.thumbnail((960, 960), PillowImage.Resampling.LANCZOS)
+        shown.append({"caption": caption, "image": drawing.embed_jpeg(picture, quality=85).uri})
     template = page_resource("strip.html.j2")
     return render_page(template, [script], title=title, frames=shown, notes=list(notes), script=script)
 
 
-def _embedded(rgb: NDArray[np.uint8]) -> str:
-    picture = PillowImage.fromarray(rgb)
-    picture.thumbnail((_FRAME_SIDE_PX, _FRAME_SIDE_PX), PillowImage.Resampling.LANCZOS)
-    return embed_jpeg(picture, quality=_FRAME_QUALITY).uri
+def comparison_page(comparison: ModelComparison, a: str, b: str) -> str:
+    """Render the page of a comparison; ``a`` and ``b`` name the models."""
+    aligned = comparison.similarity is not None
+    drawn = {"scene-figure": figures.comparison_figure(comparison)} if aligned else {}
+    scripts, content = _figure_content(drawn)
+    return render_page(
+        page_resource("comparison.html.j2"),
+        scripts,
+        **content,
+        version=__version__,
+        names={"a": a, "b": b},
+        colors={key: cameras for key, (cameras, _) in figures.COMPARED_COLORS.items()},
+        headline=words.headline(comparison),
+        notes=[note[:1].upper() + note[1:] + "." for note in comparison.notes],
+        tables=[t for t in (words.summary_table(comparison), words.point_table(comparison)) if t],
+        cameras=words.camera_table(comparison),
+    )
 
 
 class _Pictures:
@@ -174,65 +156,63 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     Pictures that cannot be drawn are left out and added to ``warnings``.
     """
     pictures = _Pictures([] if warnings is None else warnings)
-    best = data.best_reconstruction
+    best, names = data.best_reconstruction, [image.name for image in data.images]
     working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
-    everything = np.concatenate([np.zeros(0), *distances])
-    overall = summarize_distances(everything)
+    overall = summarize_distances(np.concatenate([np.zeros(0), *distances]))
     size = {"width": _HISTOGRAM_WIDTH, "height": _HISTOGRAM_HEIGHT}
-    drawn = pictures.make("the histograms of the residuals", histograms, distances, **size)
+    drawn = pictures.make("the histograms of the residuals", figures.histograms, distances, **size)
     limit_px, bars = drawn or (1.0, [""] * len(distances))
-    figures, shown, omitted = _figures(data, pictures)
+    plotted, shown, omitted = _figures(data, names, pictures)
     model = None
-    if data.model is not None and len(data.model.faces) and data.metric is not None:
-        names = [image.name for image in data.images]
-        model = pictures.make("the model", viewer_data, data.model, data.metric.reconstruction, names)
-    side = depth_side(_sharing(len(data.depth_maps)))
-    depths = [
-        (i + 1, data.images[i].name, picture)
-        for i in pictured(len(data.images))
-        if i in data.depth_maps
-        and (picture := pictures.make("a depth map", draw_depth, data.depth_maps[i], side=side))
-    ]
     held_out = None
+    if data.model is not None and len(data.model.faces) and data.metric is not None:
+        given = (data.model, data.metric.reconstruction, names)
+        model = pictures.make("the model", figures.viewer_data, *given)
+    side = drawing.depth_side(_sharing(len(data.depth_maps)))
+    depths = [
+        (i + 1, names[i], picture)
+        for i in pictured(len(names))
+        if i in data.depth_maps
+        and (picture := pictures.make("a depth map", drawing.draw_depth, data.depth_maps[i], side=side))
+    ]
     if data.held_out is not None:
-        held_out = pictures.make("the held-out image", draw_held_out, data.held_out)
-    drawn_pairs = _drawn_pairs(data, pictures)
-    figure_scripts, drawing = figure_content(figures)
+        held_out = pictures.make("the held-out image", drawing.draw_held_out, data.held_out)
+    scripts, content = _figure_content(plotted)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     cards = _cards(data, distances, bars, pictures)
     return render_page(
         page_resource("template.html.j2"),
-        [*figure_scripts, *model_scripts],
-        filters={"grouped": grouped, "decimals": decimals, "significant": significant},
-        count_of=count_of,
+        [*scripts, *model_scripts],
+        filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
+        count_of=words.count_of,
         data=data,
-        assessment=assess(data),
-        facts=key_facts(data, overall),
+        assessment=words.assess(data),
+        facts=words.key_facts(data, overall),
         overall=overall,
         cards=cards,
         unpictured=[card for card in cards if card["picture"] is None],
         intrinsic_columns=_intrinsic_columns(data),
         limit_px=limit_px,
         model=model,
-        model_text=model_text(data.model) if data.model is not None else "",
+        model_text=words.model_text(data.model) if data.model is not None else "",
         depths=depths,
         held_out=held_out,
-        scale=SCALE,
-        difference_limit=round(DIFFERENCE_LIMIT),
-        **drawing,
+        scale=drawing.SCALE,
+        difference_limit=round(drawing.DIFFERENCE_LIMIT),
+        **content,
         shown_points=shown,
         omitted=omitted,
-        most_points=MAX_POINTS,
-        most_pyramids=MAX_PYRAMIDS,
+        most_points=figures.MAX_POINTS,
+        most_pyramids=figures.MAX_PYRAMIDS,
         all_points=int(best.valid.sum()) if best is not None else 0,
-        pair_selection=pair_selection_text(data),
-        drawn_pairs=drawn_pairs,
-        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:_MAX_LISTED_PAIRS],
+        pair_selection=words.pair_selection_text(data),
+        drawn_pairs=_drawn_pairs(data, pictures),
+        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:120],
         stages=_stages(data.reports),
         warnings=_warnings(data, pictures.warnings),
         limit_known=drawn is not None,
-        self_check=named_numbers(data.metric.self_check) if data.metric is not None else [],
+        self_check=words.named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(_shortened(data.summary), indent=2, ensure_ascii=False, default=str),
         model_scripts=model_scripts,
         histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
@@ -254,73 +234,67 @@ def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
     }
 
 
-def _figures(data: ReportData, pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
+def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
     """The figures by element id (not "scene", which plotly.js uses), the points in 3D, the cameras left out.
 
     The cameras that are left out are those of the affine figure.
     """
-    names = [image.name for image in data.images]
-    figures: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     points = omitted = 0
 
-    def draw_scene(best: Reconstruction, colors: U8 | None, most: int) -> tuple[Figure | None, int, int]:
-        scene, cameras = build_scene(best, max_points=most), int(best.registered.sum())
+    def draw_scene(
+        best: Reconstruction, colors: U8 | None, most: int
+    ) -> tuple[figures.Figure | None, int, int]:
+        scene, cameras = figures.build_scene(best, max_points=most), int(best.registered.sum())
         if scene is None:
             return None, 0, cameras
-        return scene_figure(scene, names, colors), len(scene.points), cameras - len(scene.views)
+        drawn = figures.scene_figure(scene, names, colors)
+        return drawn, len(scene.points), cameras - len(scene.views)
 
     if data.metric is not None:
-        best = data.metric.reconstruction
-        drawn = pictures.make("the figure of cameras and points", draw_scene, best, data.colors, MAX_POINTS)
-        if drawn is not None:
-            figures["scene-figure"], points, _ = drawn
+        given = data.metric.reconstruction, data.colors, figures.MAX_POINTS
+        if drawn := pictures.make("the figure of cameras and points", draw_scene, *given):
+            found["scene-figure"], points, _ = drawn
     if data.metric is not None and (affine := data.affine) is not None:
         drawn = pictures.make(
             "the figure of the affine stratum",
-            lambda: draw_scene(affine, point_colors(affine, data.images), _AFFINE_POINTS),
+            lambda: draw_scene(affine, point_colors(affine, data.images), 5_000),
         )
         if drawn is not None:
-            figures["affine-figure"], _, omitted = drawn
+            found["affine-figure"], _, omitted = drawn
     if data.pairs:
-        matrix = pictures.make("the matrix of pairs", pair_matrix_figure, data.pairs, names)
-        figures["matrix-figure"] = matrix
-    return {name: figure for name, figure in figures.items() if figure is not None}, points, omitted
+        matrix = pictures.make("the matrix of pairs", figures.pair_matrix_figure, data.pairs, names)
+        found["matrix-figure"] = matrix
+    return {name: figure for name, figure in found.items() if figure is not None}, points, omitted
 
 
 def _cards(
     data: ReportData, distances: list[F64], bars: list[str], pictures: _Pictures
 ) -> list[dict[str, Any]]:
     """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
-    cards, intrinsics = [], data.original_intrinsics
-    shown = pictured(len(data.images))
+    cards, intrinsics, count = [], data.original_intrinsics, len(data.images)
+    shown = pictured(count)
     for i, image in enumerate(data.images):
         state, level, reason = _state(data, i)
         (width, height), (w, h) = image.original_size, image.size
         processed = "" if (width, height) == (w, h) else f", processed at {w} × {h}"
         masked = "" if image.mask is None else f", {1.0 - image.mask.mean():.0%} masked"
-        card = {
-            "number": i + 1,
-            "name": image.name,
-            "state": state,
-            "level": level,
-            "reason": reason,
-            "size": f"{width} × {height} px{processed}{masked}",
-            "picture": pictures.make("a thumbnail", thumbnail, image, _sharing(len(data.images)))
-            if i in shown
-            else None,
-            "residuals": summarize_distances(distances[i]),
-            "bars": bars[i],
-            "intrinsics": {name: plus_minus(v.value, v.std) for name, v in intrinsics[i].items()},
-        }
-        cards.append(card)
+        picture = None
+        if i in shown:
+            picture = pictures.make("a thumbnail", drawing.thumbnail, image, _sharing(count))
+        card = {"number": i + 1, "name": image.name, "state": state, "level": level, "reason": reason}
+        card |= {"size": f"{width} × {height} px{processed}{masked}", "picture": picture}
+        card |= {"residuals": summarize_distances(distances[i]), "bars": bars[i]}
+        estimated = {name: words.plus_minus(v.value, v.std) for name, v in intrinsics[i].items()}
+        cards.append({**card, "intrinsics": estimated})
     return cards
 
 
 def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
     """Return (name, heading) of the table columns: the usual intrinsics and all estimated ones."""
-    views = data.original_intrinsics
-    estimated = {name for view in views for name, interval in view.items() if interval.std != 0.0}
-    return [(name, text) for name, text in _INTRINSICS.items() if name in _ALWAYS_SHOWN or name in estimated]
+    views, usual = data.original_intrinsics, {"focal_px", "principal_x_px", "principal_y_px", "k1"}
+    shown = usual | {name for view in views for name, interval in view.items() if interval.std != 0.0}
+    return [(name, text) for name, text in _INTRINSICS.items() if name in shown]
 
 
 def _state(data: ReportData, i: int) -> tuple[str, str, str]:
@@ -343,23 +317,11 @@ def _drawn_pairs(data: ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
         titles.append(("Weakest accepted pair", ranked[-1]))
     drawn = []
     for title, pair in titles:
-        first, second = data.images[pair.i], data.images[pair.j]
-        sides = {"names": (first.name, second.name), "numbers": (pair.i + 1, pair.j + 1)}
-        if picture := pictures.make(f"the picture of the {title.lower()}", draw_pair, pair, first, second):
-            drawn.append({"title": title, **sides, "facts": _pair_text(pair), "picture": picture})
+        given = pair, data.images[pair.i], data.images[pair.j]
+        sides = {"names": (given[1].name, given[2].name), "numbers": (pair.i + 1, pair.j + 1)}
+        if picture := pictures.make(f"the picture of the {title.lower()}", drawing.draw_pair, *given):
+            drawn.append({"title": title, **sides, "facts": words.pair_text(pair), "picture": picture})
     return drawn
-
-
-def _pair_text(pair: TwoView) -> str:
-    share = f" ({100 * pair.inliers / pair.candidates:.0f} %)" if pair.candidates else ""
-    words = f"{grouped(pair.inliers)} verified of {grouped(pair.candidates)} candidate matches{share}"
-    if np.isfinite(pair.sigma_px):
-        words += f", noise {pair.sigma_px:.2f} px per coordinate"
-    if np.isfinite(pair.homography_inlier_ratio):
-        words += f", {100 * pair.homography_inlier_ratio:.0f} % homography inliers"
-    if pair.undetermined and pair.degeneracy is not None:
-        words += f"; degenerate epipolar geometry: {pair.degeneracy.reasons[0]}"
-    return words
 
 
 def _warnings(data: ReportData, of_page: Sequence[str]) -> list[tuple[str, str]]:
@@ -375,9 +337,9 @@ def _stages(reports: tuple[StageReport, ...]) -> list[dict[str, Any]]:
     return [
         {
             "name": report.stage,
-            "seconds": duration(report.seconds),
+            "seconds": words.duration(report.seconds),
             "share": round(100 * report.seconds / longest, 1),
-            "numbers": named_numbers(report.counts) + named_numbers(report.metrics),
+            "numbers": words.named_numbers(report.counts) + words.named_numbers(report.metrics),
         }
         for report in reports
     ]

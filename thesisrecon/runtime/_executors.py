@@ -25,9 +25,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
-from thesisrecon._threads import ThreadPool
 from thesisrecon.errors import UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
 
@@ -37,37 +36,24 @@ Task = tuple[Any, ...]
 Finished = Callable[[int, Any], None]
 
 NAMES = ("local", "processes", "dask://HOST:PORT")
-AHEAD = 2
-"""Tasks submitted per worker: enough to keep it busy, but few in memory."""
-SIGTERM_DELAY_S = 1.0
-"""Time a worker process waits for its parent to end after SIGTERM."""
-CHECK_S = 5.0
-"""Time without results after which the workers are checked."""
-SCHEME = "dask://"
-ANSWER_S = 10.0
-"""Timeout of the scheduler, and of the first worker."""
-WORKERLESS_S = 60.0
-"""Time a cluster may be without workers during a run, so that they can be restarted."""
-REACH_S = 2.0
-"""Timeout of a connection from this machine to a worker."""
-START_S = 60.0
-"""Time in which worker processes start."""
+AHEAD = 2  # Tasks submitted per worker: enough to keep it busy, but few in memory
+CHECK_S = 5.0  # Time without results after which the workers are checked
+ANSWER_S = 10.0  # Timeout of the scheduler, and of the first worker
+WORKERLESS_S = 60.0  # Time a cluster may be without workers during a run, so that they can be restarted
 _log = logging.getLogger(__name__)
-_ADDRESS = re.compile(r"(?P<host>[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
 
 
-def is_dask_address(executor: object) -> bool:
-    """Whether an executor is given as a Dask address."""
+def _is_dask_address(executor: object) -> bool:
     return isinstance(executor, str) and executor.partition(":")[0].lower() == "dask"
 
 
-def tcp_address(executor: str) -> str:
-    """Convert ``dask://HOST:PORT`` to ``tcp://HOST:PORT``."""
-    found = _ADDRESS.fullmatch(executor.removeprefix(SCHEME)) if executor.startswith(SCHEME) else None
-    if found is None or not 0 < int(found["port"]) < 65536:
+def _dask_place(executor: str) -> str:
+    """HOST:PORT of ``dask://HOST:PORT``."""
+    found = re.fullmatch(r"dask://((?:[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5}))", executor)
+    if found is None or not 0 < int(found[2]) < 65536:
         form = "dask://HOST:PORT, for example dask://localhost:8786"
         raise UsageError(f"a Dask scheduler must be given as {form}; got {executor!r}")
-    return f"tcp://{found[0]}"
+    return found[1]
 
 
 @dataclass
@@ -77,7 +63,7 @@ class Cluster:
     address: str
     client: Any
     executor: futures.Executor
-    _alone_since: float | None = field(default=None, repr=False)
+    _alone_since: float = 0.0
 
     def parallel(self) -> int:
         """Number of worker threads, at least 1: a worker may come back."""
@@ -85,12 +71,9 @@ class Cluster:
 
     def check(self) -> None:
         """Raise ``WorkersLost`` if the scheduler is gone or has had no worker for ``WORKERLESS_S``."""
-        if self._threads():
-            self._alone_since = None
-            return
         now = time.monotonic()
-        self._alone_since = self._alone_since or now
-        if now - self._alone_since > WORKERLESS_S:
+        self._alone_since = 0.0 if self._threads() else self._alone_since or now
+        if self._alone_since and now - self._alone_since > WORKERLESS_S:
             alone = f"has had no worker for {WORKERLESS_S:.0f} s"
             raise WorkersLost(f"the Dask scheduler at {self.address} {alone}")
 
@@ -108,9 +91,9 @@ class Cluster:
 
 
 @contextmanager
-def connect_dask(executor: str) -> Iterator[Cluster]:
+def _connect_dask(executor: str) -> Iterator[Cluster]:
     """Connect to a Dask scheduler for the duration of a block."""
-    address = tcp_address(executor)
+    place = _dask_place(executor)
     try:
         import dask
         from distributed import Client
@@ -119,10 +102,9 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
         raise UsageError(f"--executor {executor} {missing}") from None
     # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
-    place = address.removeprefix("tcp://")
     with _quiet("distributed"), dask.config.set(settings):
         try:
-            client = Client(address, timeout=ANSWER_S, set_as_default=False)
+            client = Client(f"tcp://{place}", timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
             raise UsageError(
                 f"no Dask scheduler answers at {place} within {ANSWER_S:.0f} s; "
@@ -132,7 +114,7 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
             try:
                 client.wait_for_workers(1, timeout=ANSWER_S)
             except (OSError, futures.TimeoutError):
-                advice = f"start some with: dask worker {address}"
+                advice = f"start some with: dask worker tcp://{place}"
                 raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
             # By default results pass through the scheduler. Arguments must: scattered ones would be lost with
             # their worker.
@@ -149,7 +131,7 @@ def _reachable(workers: Iterable[str]) -> bool:
     for worker in workers:
         host, _, port = worker.rpartition("://")[2].rpartition(":")
         try:
-            socket.create_connection((host.strip("[]"), int(port)), REACH_S).close()
+            socket.create_connection((host.strip("[]"), int(port)), timeout=2.0).close()
         except (OSError, ValueError):
             return False
     return True
@@ -158,15 +140,14 @@ def _reachable(workers: Iterable[str]) -> bool:
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
     """Silence a logger and its children."""
-    loggers = [logging.getLogger(name)]
-    loggers += [logging.getLogger(n) for n in logging.root.manager.loggerDict if n.startswith(f"{name}.")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
+    names = [name, *(n for n in logging.root.manager.loggerDict if n.startswith(f"{name}."))]
+    levels = {logger: logger.level for logger in map(logging.getLogger, names)}
+    for logger in levels:
         logger.setLevel(logging.CRITICAL + 1)
     try:
         yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
+        for logger, level in levels.items():
             logger.setLevel(level)
 
 
@@ -202,8 +183,8 @@ class Workers:
         if not isinstance(self.executor, str | futures.Executor):
             known = f"{', '.join(NAMES)} or a concurrent.futures.Executor"
             raise UsageError(f"executor must be {known}; got {self.executor!r}")
-        if is_dask_address(self.executor):
-            tcp_address(str(self.executor))
+        if _is_dask_address(self.executor):
+            _dask_place(str(self.executor))
         elif isinstance(self.executor, str) and self.executor not in NAMES:
             raise UsageError(unknown_word("executor", self.executor, NAMES))
 
@@ -225,7 +206,7 @@ class Workers:
     def __enter__(self) -> Workers:
         """Connect to the cluster; processes start when needed."""
         self._open_stack = ExitStack()
-        if is_dask_address(self.executor):
+        if _is_dask_address(self.executor):
             self._remote = self._open_stack.enter_context(self._opened())
         return self
 
@@ -253,21 +234,18 @@ class Workers:
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Map a function over items in threads, for short tasks such as reading files."""
-        with ThreadPool(self.threads) as pool:
+        with _thread_pool(self.threads) as pool:
             return list(pool.map(function, items))
 
     @contextmanager
     def _opened(self) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
-        elif self.executor == "local":
-            with ThreadPool(self.threads) as threads:
-                yield _Remote(threads, lambda: self.threads)
-        elif is_dask_address(self.executor):
-            with connect_dask(self.executor) as cluster:
+        elif _is_dask_address(self.executor):
+            with _connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
-        elif (pool := _processes(self.threads)) is None:
-            with ThreadPool(self.threads) as threads:
+        elif self.executor == "local" or (pool := _processes(self.threads)) is None:
+            with _thread_pool(self.threads) as threads:
                 yield _Remote(threads, lambda: self.threads)
         else:
             try:
@@ -278,6 +256,13 @@ class Workers:
                 pool.abandon()
 
 
+def _thread_pool(threads: int) -> futures.ThreadPoolExecutor:
+    # Imported here: `thesisrecon --help` needs no compiler.
+    from thesisrecon._numba import ThreadPool
+
+    return ThreadPool(threads)
+
+
 def _processes(count: int) -> ProcessPool | None:
     """Start worker processes; None, with a warning, if the system starts none."""
     with ExitStack() as opened:
@@ -285,7 +270,7 @@ def _processes(count: int) -> ProcessPool | None:
             pool = ProcessPool(count)
             opened.callback(pool.abandon)
             for started in [pool.submit(int) for _ in range(count)]:
-                started.result(START_S)
+                started.result(timeout=60.0)
         except (OSError, RuntimeError) as error:
             _log.warning("no worker processes can be started (%s): this process does their work", error)
             return None
@@ -293,8 +278,7 @@ def _processes(count: int) -> ProcessPool | None:
         return pool
 
 
-@dataclass(frozen=True)
-class _Remote:
+class _Remote(NamedTuple):
     """A running executor, its number of workers and its cluster, if any."""
 
     executor: futures.Executor
@@ -396,7 +380,7 @@ def _end_with_parent(watched: multiprocessing.connection.Connection) -> None:
     def end_on_sigterm() -> None:
         signal.sigwait({signal.SIGTERM})
         # If the whole program is terminated, the parent ends first and kills this process.
-        time.sleep(SIGTERM_DELAY_S)
+        time.sleep(1.0)
         os._exit(CODES[signal.SIGTERM])
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -31,23 +31,19 @@ sys.path.insert(0, {str(PACKAGE.parent)!r})
 from {__name__} import compile_requested
 compile_requested()
 """
-POLL_S = 0.1
 COMPILED = "compiled\n"
-KERNELS_PER_WORKER = 8
-"""A worker takes a second to start and 150 MB, a kernel on average less than a second to compile."""
 
 
 def listed_kernels(until: str) -> list[str]:
     """Lines of ``kernels.txt`` up to a stage: ``module.function(types of the arguments)``."""
-    lines: list[str] = []
-    stage = ""
-    for line in LIST.read_text(encoding="utf-8").splitlines():
-        if line.startswith("["):
-            if stage == until:
-                break
-            stage = line.strip("[]")
-        elif line:
+    lines, stage = list[str](), ""
+    for line in filter(None, LIST.read_text(encoding="utf-8").splitlines()):
+        if not line.startswith("["):
             lines.append(line)
+        elif stage == until:
+            break
+        else:
+            stage = line.strip("[]")
     return lines
 
 
@@ -90,19 +86,17 @@ def _code_and_machine(lines: Sequence[str]) -> str:
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:
-    waiting = iter(lines)
-    taking = threading.Lock()
-    finished: list[str] = []
-
-    def next_line() -> str | None:
-        with taking:
-            return next(waiting, None)
+    waiting, taking, finished = iter(lines), threading.Lock(), list[str]()
 
     def feed(worker: subprocess.Popen[str]) -> None:
         assert worker.stdin is not None
         assert worker.stdout is not None
         with suppress(OSError):
-            while (line := next_line()) is not None:
+            while True:
+                with taking:
+                    line = next(waiting, None)
+                if line is None:
+                    break
                 worker.stdin.write(line + "\n")
                 worker.stdin.flush()
                 if not (answer := worker.stdout.readline()):
@@ -112,9 +106,10 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
             worker.stdin.close()
 
     workers = list[subprocess.Popen[str]]()
-    # An embedded Python has no executable, and processes and threads may be limited.
+    # An embedded Python has no executable, and processes and threads may be limited. A worker takes a second
+    # to start and 150 MB, a kernel on average less than a second to compile.
     with suppress(OSError), starting_processes():
-        for _ in range(min(count, -(-len(lines) // KERNELS_PER_WORKER))):
+        for _ in range(min(count, -(-len(lines) // 8))):
             workers.append(_started())
 
     def kill() -> None:
@@ -129,13 +124,13 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
         try:
             for thread in feeding:
                 while thread.is_alive():
-                    thread.join(POLL_S)
+                    thread.join(0.1)
                     progress("kernels", len(finished), len(lines))
             # All may have ended before the first look.
             progress("kernels", len(finished), len(lines))
         finally:
+            kill()
             for worker in workers:
-                worker.kill()
                 with suppress(OSError), worker:  # closes its pipes
                     pass
     return len(finished)
@@ -143,15 +138,10 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
 
 def _started() -> subprocess.Popen[str]:
     # multiprocessing would import the script of the user again. In a session of its own the process does not
-    # get the Ctrl-C of the terminal; without its input it ends.
-    return subprocess.Popen(
-        [sys.executable or "python3", "-P", "-c", WORKER],  # -P: no imports from the current folder
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        start_new_session=True,
-    )
+    # get the Ctrl-C of the terminal; without its input it ends. -P: no imports from the current folder.
+    pipe, command = subprocess.PIPE, [sys.executable or "python3", "-P", "-c", WORKER]
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=quiet, text=True, start_new_session=True)
 
 
 def compile_requested() -> None:

@@ -1,7 +1,8 @@
-"""One run: options, random streams, workers and folder, and the clock, cache and reports of its stages."""
+"""One run: options, random streams, workers, folder and progress, and the cache and reports of its stages."""
 
 from __future__ import annotations
 
+import math
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,13 +14,24 @@ from typing import Any, Literal, TypedDict, get_args
 
 import numpy as np
 
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
-from thesisrecon.errors import Notice, OutputError, UsageError, WorkersLost, unknown_word
+from thesisrecon.errors import Notice, OutputError, UsageError, WorkersLost, counted, unknown_word
+from thesisrecon.io._files import read_json
+from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import StageReport
 from thesisrecon.runtime._executors import Workers, available_threads
-from thesisrecon.runtime._run_folder import ChangedRecord, RunDirectory, StageFolder, key_of
+from thesisrecon.runtime._run_folder import (
+    MANIFEST_FILE,
+    RUN_FILE,
+    ChangedRecord,
+    RunDirectory,
+    StageFolder,
+    is_running,
+    key_of,
+    read_record,
+)
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -282,3 +294,62 @@ def start_run(
     report = progress or (lambda *_: None)
     run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
     return until, run, bool(options.get("overwrite", False))
+
+
+def run_position(folder: Path) -> str:
+    """One sentence: running or interrupted, the stage, the items done, the time left; empty without a run."""
+    content = read_json(folder / RUN_FILE)
+    if not isinstance(content, dict):
+        return ""
+    stage, items, since = _latest_stage(folder)
+    total = _total(folder, stage, len(content.get("images", ())))
+    where = f"{stage} begins" if not items else f"{stage}, {counted(len(items), 'item')} done"
+    if items and total:
+        where = f"{stage}, {len(items)} of {total} done" if len(items) < total else f"{stage} is done"
+    if not is_running(folder):
+        return f"interrupted: {where}; repeat the command to resume"
+    left = _seconds_left(items, total, max(since, (folder / LOCK_FILE).stat().st_mtime))
+    return f"running: {where}" + (f", about {_in_words(left)} left in this stage" if left else "")
+
+
+def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
+    """The last stage that was written to, the times of its items, and when the one before it ended."""
+    started = ended = (folder / RUN_FILE).stat().st_mtime
+    found = ("images", list[float](), ended)
+    for stage, name in FOLDERS.items():
+        every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
+        # Older records belong to a replaced run and were not reused.
+        times = sorted(when for when in every if when >= started)
+        if times:
+            found = (stage, times, ended)
+            manifest = folder / name / MANIFEST_FILE
+            ended = max(ended, manifest.stat().st_mtime if manifest.exists() else times[-1])
+    return found
+
+
+def _total(folder: Path, stage: str, images: int) -> int:
+    """Number of items of a stage, 0 if it is not known."""
+    if stage == "features":
+        return images
+    if stage == "matches":
+        manifest = read_json(folder / FOLDERS["pairs"] / MANIFEST_FILE)
+        keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
+        choice = read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
+        return 0 if choice is None else len(choice.pairs)
+    return 0
+
+
+def _seconds_left(items: Sequence[float], total: int, since: float) -> float:
+    """Remaining time at the rate of this run's items, without those of an earlier run; 0 if unknown."""
+    new = [when for when in items if when > since]
+    if len(new) < 3 or len(items) >= total:
+        return 0.0
+    rate = (time.time() - since) / len(new)
+    return rate * (total - len(items))
+
+
+def _in_words(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{math.ceil(seconds)} s"
+    minutes = math.ceil(seconds / 60.0)
+    return f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"

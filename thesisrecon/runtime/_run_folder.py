@@ -12,12 +12,11 @@ import hashlib
 import io
 import json
 import os
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -29,15 +28,17 @@ from thesisrecon.io._files import (
     link,
     read_bytes,
     read_json,
+    shortened,
     write_atomically,
     write_json,
 )
 from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_part
 from thesisrecon.records import StageReport
 
-FORMAT = 2
+FORMAT = 3
 RUN_FILE, MANIFEST_FILE = "run.json", "manifest.json"
 _DESCRIPTION = "description"
+_MAX_BYTES = 2**40
 
 
 class ChangedRecord(Exception):
@@ -51,19 +52,21 @@ def bytes_from_record(record: Any, key: str) -> bytes:
     stream = io.BytesIO()
     named: dict[str, Any] = {_DESCRIPTION: np.frombuffer(description.encode(), dtype=np.uint8), **arrays}
     np.savez(stream, **named)
-    with zipfile.ZipFile(stream, "a") as archive:
-        archive.comment = _seal(archive)
-    return stream.getvalue()
+    return sealed(stream.getvalue())
 
 
-def _seal(archive: zipfile.ZipFile) -> bytes:
-    """Digest of the checksums of all parts, stored as the comment of the archive.
+def sealed(archive: bytes) -> bytes:
+    """A zip archive with the digest of its bytes as its comment, which follows a length of two bytes.
 
-    Kernels do not check their input, so a record is used only if it is unchanged: damaged parts do not match
-    their checksum, rewritten parts not this digest. It detects accidents, not forgery.
+    Kernels do not check their input, so a record is used only if it is unchanged. The seal detects accidents,
+    not forgery.
     """
-    parts = [(part.filename, part.CRC, part.file_size) for part in archive.infolist()]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32].encode()
+    return archive[:-2] + b"\x20\0" + hashlib.sha256(archive).digest()
+
+
+def _require_sealed(content: bytes) -> None:
+    if sealed(content[:-34] + b"\0\0") != content:
+        raise ValueError("a record has the seal of its content")
 
 
 def _describe(value: Any, arrays: dict[str, np.ndarray[Any, Any]]) -> Any:
@@ -105,45 +108,28 @@ def read_record(path: Path, key: str) -> Any:
     if not os.path.lexists(path):
         return None
     try:
-        # Opening a pipe would block.
-        _require(path.is_file(), "a record is a file")
-        # np.load leaves an unreadable file open.
-        with path.open("rb") as stream:
-            seal = _seal_of_plain(stream)
-            with np.load(stream, allow_pickle=False) as file:
-                description = json.loads(bytes(file[_DESCRIPTION]).decode())
-                if description["key"] != key:
-                    return None
-                _require(file.zip.comment == seal, "a record has the seal of its content")
-                return _rebuild(description["record"], {name: file[name] for name in file.files})
+        content = read_bytes(path, largest=_MAX_BYTES)
+        _require_sealed(content)
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            # A compressed one may be a zip bomb.
+            if any(part.compress_type for part in file.zip.infolist()):
+                raise ValueError("a record is not compressed")
+            description = json.loads(bytes(file[_DESCRIPTION]).decode())
+            if description["key"] != key:
+                return None
+            return _rebuild(description["record"], {name: file[name] for name in file.files})
     except Exception as error:
         # The readers raise many types for damaged files.
         raise ChangedRecord(f"{path}: {error}") from None
 
 
-def _require(holds: bool, rule: str) -> None:
-    if not holds:
-        raise ValueError(rule)
-
-
 def _is_record(path: Path) -> bool:
     """Whether a file is a record, with any key."""
     try:
-        with path.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-            return not path.is_symlink() and archive.comment == _seal(archive)
-    except (OSError, ValueError, zipfile.BadZipFile):
+        _require_sealed(b"" if path.is_symlink() else read_bytes(path, largest=_MAX_BYTES))
+    except (OSError, ValueError):
         return False
-
-
-def _seal_of_plain(stream: BinaryIO) -> bytes:
-    """Expected seal of an archive; ``ValueError`` if it is compressed, since it may be a zip bomb."""
-    with zipfile.ZipFile(stream) as archive:
-        packed = [entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()]
-        size = sum(entry.file_size for entry in archive.infolist())
-        seal = _seal(archive)
-    _require(not any(packed) and size <= stream.seek(0, os.SEEK_END), "a record is not compressed")
-    stream.seek(0)
-    return seal
+    return True
 
 
 def key_of(*parts: Any) -> str:
@@ -253,13 +239,11 @@ class RunDirectory:
             with lock_part(whole, self.path):
                 yield
             return
-        claim = claim_folder(
-            self.path,
-            overwrite=overwrite,
-            names=results,
-            check=lambda outputs: self._check(identity, overwrite, outputs),
-        )
-        with claim as outputs:
+
+        def check(outputs: OutputFolder) -> bool:
+            return self._check(identity, overwrite, outputs)
+
+        with claim_folder(self.path, overwrite=overwrite, names=results, check=check) as outputs:
             yield
             if outputs.kept:
                 outputs.require_complete([RUN_FILE])
@@ -297,9 +281,10 @@ class RunDirectory:
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
         difference = difference or next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
-            replaced = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
-            advice = f"choose another folder, or {replaced}"
-            raise UsageError(f"the output folder {self.path} holds another run ({difference}); {advice}")
+            raise UsageError(
+                f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
+                "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
+            )
         return bool(difference)
 
     def _identity(self) -> tuple[Any, str]:
@@ -315,11 +300,23 @@ class RunDirectory:
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
     """Differences of two JSON values in words."""
     if place == "source":
-        yield from _source_differences(there, here)
+        # A source that was only moved is the same.
+        sources = [source if isinstance(source, dict) else {} for source in (there, here)]
+        digests = [str(source.get("digest", "")) for source in sources]
+        if digests[0] != digests[1]:
+            was, now = (
+                f"{source.get('name')} (digest {digest[:12]})" if digest else "images"
+                for source, digest in zip(sources, digests, strict=True)
+            )
+            yield f"it was made from {was}, this run starts from {now}"
+    elif place == "images" and isinstance(there, dict) and isinstance(here, dict):
+        changed = [n for n in here if n in there and there[n] != here[n]]
+        missing, new = [n for n in there if n not in here], [n for n in here if n not in there]
+        for what, names in (("without", missing), ("with a new", new), ("with a changed", changed)):
+            if names:
+                more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+                yield f"other images: this run is {what} {names[0]!r}{more}"
     elif isinstance(there, dict) and isinstance(here, dict):
-        if place == "images":
-            yield from _image_differences(there, here)
-            return
         # Another source mostly comes with other settings.
         for name in sorted(here | there, key=lambda name: name != "source"):
             yield from _differences(there.get(name), here.get(name), f"{place}.{name}" if place else name)
@@ -327,30 +324,8 @@ def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
         yield f"{place.removeprefix('settings.')} was {_short(there)} and is now {_short(here)}"
 
 
-def _image_differences(there: dict[str, str], here: dict[str, str]) -> Iterator[str]:
-    missing, new = [n for n in there if n not in here], [n for n in here if n not in there]
-    changed = [n for n in here if n in there and there[n] != here[n]]
-    for what, names in (("without", missing), ("with a new", new), ("with a changed", changed)):
-        if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            yield f"other images: this run is {what} {names[0]!r}{more}"
-
-
-def _source_differences(there: Any, here: Any) -> Iterator[str]:
-    """A source that was only moved is the same."""
-    sources = [source if isinstance(source, dict) else {} for source in (there, here)]
-    digests = [str(source.get("digest", "")) for source in sources]
-    if digests[0] != digests[1]:
-        was, now = (
-            f"{source.get('name')} (digest {digest[:12]})" if digest else "images"
-            for source, digest in zip(sources, digests, strict=True)
-        )
-        yield f"it was made from {was}, this run starts from {now}"
-
-
 def _short(value: Any) -> str:
-    text = "not set" if value is None else json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return "not set" if value is None else shortened(json.dumps(value, ensure_ascii=False))
 
 
 def is_running(folder: Path) -> bool:

@@ -20,12 +20,9 @@ from contextlib import contextmanager, suppress
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 """Exit codes: 128 plus the number of the signal, as in shells."""
 REASONS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-START_S = 0.5
-"""Time to wait for a starting process, so that it can be killed."""
-STDERR = 2
-_SHOW_CURSOR = "\x1b[?25h\n"
+START_S = 0.5  # Time to wait for a starting process, so that it can be killed
 
-_stderr = [STDERR]
+_stderr = [2]
 _advice: list[str] = []
 _kills: list[Callable[[], object]] = []
 _leaving: list[signal.Signals] = []
@@ -120,7 +117,7 @@ def _say(sentence: str) -> None:
     """Write to the descriptor: the main thread may hold the lock of ``sys.stderr``, the reader may hang."""
     with suppress(OSError, ValueError):
         # A progress bar hides the cursor and leaves it in the middle of a line.
-        start = _SHOW_CURSOR if os.isatty(_stderr[-1]) else ""
+        start = "\x1b[?25h\n" if os.isatty(_stderr[-1]) else ""
         line = f"{start}{' '.join(sentence.split())}\n"
         if select.select([], [_stderr[-1]], [], START_S)[1]:
             os.write(_stderr[-1], line.encode("utf-8", "backslashreplace"))

@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon._numba import empty, kernel, zeros
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool, empty, kernel, zeros
 from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface._mesh import components, face_areas, remove_unused_vertices

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from thesisrecon._numba import empty, kernel, zeros
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.imaging.on_demand import OnDemand

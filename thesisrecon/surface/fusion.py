@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I32, I64
 from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import StageFailure

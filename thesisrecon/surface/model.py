@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thesisrecon._numba import kernel
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool, kernel
 from thesisrecon.arrays import B8, F32, F64, I64, U8, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, StageFailure

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import thesisrecon
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.config import KINDS, PipelineConfig, preset
 from thesisrecon.config.text import (
     config_from_tables,

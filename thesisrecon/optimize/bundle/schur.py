@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon._threads import ThreadPool
+from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 from thesisrecon.optimize.bundle.elimination import (

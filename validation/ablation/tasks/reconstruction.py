@@ -11,7 +11,7 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 
 import thesisrecon
-from thesisrecon._code_digest import code_digest
+from thesisrecon._numba import code_digest
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import UsageError, unknown_word

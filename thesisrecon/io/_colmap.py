@@ -1,4 +1,10 @@
-"""COLMAP databases, and sparse models of any camera kind, in our conventions; see ``_colmap_writing.py``."""
+"""COLMAP sparse models of any camera kind, databases, and COLMAP's conventions.
+
+COLMAP puts the centre of the top-left pixel at (0.5, 0.5), numbers from 1, separates cameras from images and
+stores quaternions as (w, x, y, z). Its SIMPLE_RADIAL distortion is the one used here, x (1 + k1 r^2) on
+normalized points; FULL_OPENCV adds k2 and k3. Since COLMAP 3.12 a model has rigs and frames: each camera is
+its own rig and each image its own frame here.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +18,23 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64, U8, rows_of_views
+from thesisrecon.camera import project_camera
 from thesisrecon.errors import UsageError, in_words
-from thesisrecon.io._colmap_writing import PIXEL_CENTRE, POINT_2D
-from thesisrecon.io._files import first_repeated, read_bytes, require_image_name
+from thesisrecon.io._files import first_repeated, read_bytes, require_image_name, write_atomically
+from thesisrecon.records import Reconstruction
 from thesisrecon.results import SparseModel, SparseView
 
+PIXEL_CENTRE = 0.5
+COLMAP_FILES = tuple(f"sparse/0/{name}.bin" for name in ("rigs", "cameras", "frames", "images", "points3D"))
+POINT_2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 _FILES = ("cameras", "images", "points3D")
-_MAX_BYTES = 2**32
 MAX_SIDE_PX = 2**24
-_MAX_IMAGES = 2**31 - 1
-"""COLMAP numbers the pair of images a < b as a times this plus b."""
-_NO_POINT = str(2**64 - 1)
 _KINDS = (
     ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8),
     ("OPENCV_FISHEYE", 8), ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4),
@@ -78,8 +84,12 @@ def read_colmap_model(folder: Path) -> SparseModel:
     image the first is kept. Views have no K if their camera has no focal length (EQUIRECTANGULAR).
     """
     binary = all((folder / f"{name}.bin").is_file() for name in _FILES)
-    kind, parsers = (".bin", _BINARY) if binary else (".txt", _TEXT)
-    cameras, images, points = (_parsed(folder / (name + kind), parsers[name]) for name in _FILES)
+    readers = (_binary_camera, _binary_image, _binary_point)
+    parsers: Sequence[Callable[[bytes], Iterator[Any]]] = (_text_cameras, _text_images, _text_points)
+    if binary:
+        parsers = [partial(_binary, reader) for reader in readers]
+    files = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in _FILES]
+    cameras, images, points = (_parsed(*given) for given in zip(files, parsers, strict=True))
     known = {camera.number: camera for camera in cameras}
     ids = np.array([point.number for point in points], np.int64)
     view, point, xy = _observations(images, ids)
@@ -93,7 +103,7 @@ def read_colmap_model(folder: Path) -> SparseModel:
 
 def _parsed(file: Path, parse: Callable[[bytes], Iterator[Any]]) -> list[Any]:
     try:
-        return list(parse(read_bytes(file, largest=_MAX_BYTES)))
+        return list(parse(read_bytes(file, largest=2**32)))
     except (struct.error, ValueError, OverflowError, IndexError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UsageError(
@@ -174,7 +184,7 @@ def _text_images(data: bytes) -> Iterator[_Image]:
         if len(words) % 3:
             raise ValueError(f"image {name!r} needs three numbers per observation")
         xy = np.array([words[0::3], words[1::3]]).T.astype(np.float64)
-        point = np.array([-1 if word == _NO_POINT else int(word) for word in words[2::3]], np.int64)
+        point = np.array([-1 if word == str(2**64 - 1) else int(word) for word in words[2::3]], np.int64)
         yield _image(int(camera), name, [float(word) for word in pose], xy, point)
 
 
@@ -183,15 +193,6 @@ def _text_points(data: bytes) -> Iterator[_Point]:
         x, y, z = (float(word) for word in words[1:4])
         r, g, b = (int(word) for word in words[4:7])
         yield _Point(int(np.int64(words[0])), (x, y, z), bytes([r, g, b]))
-
-
-_Parsers: TypeAlias = dict[str, Callable[[bytes], Iterator[Any]]]
-_BINARY: _Parsers = {
-    "cameras": partial(_binary, _binary_camera),
-    "images": partial(_binary, _binary_image),
-    "points3D": partial(_binary, _binary_point),
-}
-_TEXT: _Parsers = {"cameras": _text_cameras, "images": _text_images, "points3D": _text_points}
 
 
 def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
@@ -238,11 +239,6 @@ class Database:
     matches: dict[tuple[int, int], I64]
 
 
-_MAX_BLOB = 2**28
-"""Bytes of a value: ten million keypoints with their shapes."""
-_MIN_ROW = 4
-"""Bytes that a row takes in a file at least."""
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")
 _TABLES = {
     "cameras": "camera_id, width, height",
     "images": "image_id, name, camera_id",
@@ -296,7 +292,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     if journal.is_file():
         with journal.open("rb") as file:
             # SQLite may delete a file that the journal names.
-            if file.read(len(_JOURNAL)) == _JOURNAL:
+            if file.read(8) == bytes.fromhex("d9d505f920a163d7"):
                 advice = "open the database once in COLMAP, which completes the change"
                 raise UsageError(f"{path} has an interrupted change in {journal.name}; {advice}")
     with TemporaryDirectory() as folder:
@@ -306,7 +302,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             shutil.copyfile(path, place)
             shutil.copyfile(log, _beside(place, "wal"))
         with closing(sqlite3.connect(f"{place.as_uri()}?{mode}", uri=True)) as base:
-            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_BLOB)
+            # A value has at most the bytes of ten million keypoints with their shapes.
+            base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**28)
             base.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
             base.execute("PRAGMA trusted_schema = OFF")
             yield base
@@ -321,7 +318,8 @@ def _rows(base: sqlite3.Connection, table: str, size: int) -> Iterator[tuple[Any
         raise ValueError(f"it has no stored table {table}, but perhaps a view; make it with COLMAP")
     total = 0
     for row in base.execute(f"SELECT {_TABLES[table]} FROM {table}"):
-        total += _MIN_ROW + sum(len(value) for value in row if isinstance(value, bytes | str))
+        # A row takes at least four bytes in a file.
+        total += 4 + sum(len(value) for value in row if isinstance(value, bytes | str))
         if total > size:
             raise ValueError(f"its table {table} claims more data than the file holds")
         yield row
@@ -368,12 +366,169 @@ def _read_tables(base: sqlite3.Connection, path: Path, size: int) -> Database:
         for pair, rows, cols, data in _rows(base, table, size):
             if not rows:
                 continue
-            if not isinstance(pair, int) or any(image not in number for image in divmod(pair, _MAX_IMAGES)):
+            # COLMAP numbers the pair of images a < b as (2^31 - 1) a + b.
+            numbers = divmod(pair, 2**31 - 1) if isinstance(pair, int) else (None,)
+            if any(image not in number for image in numbers):
                 raise ValueError(f"its table {table} has a pair {in_words(pair)} of images that are missing")
-            i, j = (number[image] for image in divmod(pair, _MAX_IMAGES))
+            i, j = (number[image] for image in numbers)
             what = f"the matches of {in_words(names[i])} and {in_words(names[j])}"
             found[i, j] = _array(what, rows, cols, data, "<u4").astype(np.int64)
         if found:
             sizes = np.array([row[2] for row in images], dtype=np.int64)
             return Database(names, sizes, keypoints, found)
     raise UsageError(f"{path} holds no matches; run COLMAP's matcher first")
+
+
+def write_colmap_model(
+    folder: str | Path,
+    reconstruction: Reconstruction,
+    names: Sequence[str],
+    *,
+    colors: U8,
+    groups: I64,
+    scales: F64,
+    original_sizes: I64,
+) -> int:
+    """Write a metric reconstruction as a binary COLMAP model in original pixels; return 0.
+
+    It contains the registered views and the valid points with at least two inlier observations in them; view
+    i is image i + 1 and point j is point j + 1. The error of a point is its mean distance in original pixels.
+    Views of one of the ``groups`` share a camera if their intrinsics and sizes are equal. COLMAP has no
+    camera with skew: then nothing is written, and the number of such views is returned.
+    """
+    r = reconstruction
+    assert r.K is not None
+    assert r.distortion is not None
+    skewed = r.registered & has_skew(r.K)
+    if skewed.any():
+        return int(skewed.sum())
+    view, point = r.tracks.view_index, r.tracks.point_index
+    kept = r.used
+    kept &= np.bincount(point[kept], minlength=len(r.X))[point] >= 2
+    view, point, xy = view[kept], point[kept], r.tracks.xy[kept]
+    posed, distance = dict[int, _PosedImage](), np.zeros(len(view))
+    rows = rows_of_views(view, len(r.P))
+    for i in np.flatnonzero(r.registered).tolist():
+        width, height = (int(size) for size in original_sizes[i])
+        camera = (int(groups[i]), width, height, *_camera_params(r.K[i], r.distortion[i], scales[i]))
+        R, t = _pose(r.K[i], r.P[i])
+        posed[i] = _PosedImage(names[i], R, t, camera)
+        here = rows[i]
+        seen = project_camera(r.K[i], R, t, _points(r.X[point[here]]), distortion=r.distortion[i])
+        distance[here] = np.linalg.norm((seen - xy[here]) * scales[i], axis=1)
+    observed = _Observations(view, point, (xy + PIXEL_CENTRE) * scales[view, None], distance)
+    _write(Path(folder), posed, observed, np.unique(point), (r.X, colors))
+    return 0
+
+
+def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool = False) -> None:
+    """Write a sparse model, without skew, as a binary COLMAP model; ``pinhole`` uses PINHOLE throughout."""
+    posed, distance = dict[int, _PosedImage](), np.zeros(len(model.xy))
+    rows = rows_of_views(model.view_index, len(model.views))
+    for i, view in enumerate(model.views):
+        assert view.K is not None
+        assert view.size is not None
+        assert view.distortion is not None
+        kind, params = _camera_params(view.K, view.distortion, 1.0, pinhole=pinhole)
+        posed[i] = _PosedImage(view.name, view.R, view.t, (0, *view.size, kind, params))
+        here = rows[i]
+        X = model.X[model.point_index[here]]
+        seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
+        distance[here] = np.linalg.norm(seen - model.xy[here], axis=1)
+    observed = _Observations(model.view_index, model.point_index, model.xy + PIXEL_CENTRE, distance)
+    Xh = np.column_stack([model.X, np.ones(len(model.X))])
+    _write(Path(folder), posed, observed, np.arange(len(Xh)), (Xh, colors_of(model)))
+
+
+def has_skew(K: F64) -> B8:
+    """Whether calibration matrices (..., 3, 3) have skew beyond rounding."""
+    return np.asarray(np.abs(K[..., 0, 1]) > 1e-9 * K[..., 0, 0])
+
+
+class _PosedImage(NamedTuple):
+    name: str
+    R: F64
+    t: F64
+    camera: tuple[int, int, int, str, tuple[float, ...]]  #: group, width, height, model, parameters
+
+
+class _Observations(NamedTuple):
+    """Observations in COLMAP's pixels, and their reprojection distances."""
+
+    view: I64
+    point: I64
+    xy: F64
+    distance: F64
+
+
+def _write(
+    folder: Path, posed: dict[int, _PosedImage], observed: _Observations, used: I64, points: tuple[F64, U8]
+) -> None:
+    """Write images by number, and the points ``used`` of (Xh, colors)."""
+    view, point, xy, distance = observed
+    kinds = [name for name, _ in _KINDS]
+    # One camera per group and set of intrinsics.
+    cameras: dict[tuple[object, ...], int] = {}
+    camera_parts, images, frames = list[bytes](), list[bytes](), list[bytes]()
+    row, rows = np.zeros(len(view), dtype=np.int64), rows_of_views(view, max(posed, default=-1) + 1)
+    for i, (name, R, t, camera) in posed.items():
+        _, width, height, model, params = camera
+        if camera not in cameras:
+            cameras[camera] = len(cameras) + 1
+            head = (cameras[camera], kinds.index(model), width, height)
+            camera_parts.append(struct.pack(f"<IiQQ{len(params)}d", *head, *params))
+        here = rows[i]
+        row[here] = np.arange(len(here))
+        quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True), 1)
+        observations = np.empty(len(here), dtype=POINT_2D)
+        observations["xy"], observations["point"] = xy[here], point[here] + 1
+        image = struct.pack("<I7dI", i + 1, *quaternion, *t, cameras[camera])
+        encoded = name.encode("utf-8", "surrogateescape") + b"\0"
+        images.append(image + encoded + struct.pack("<Q", len(here)) + observations.tobytes())
+        sensor = (1, 0, cameras[camera], i + 1)  # a sensor of the kind 0, a camera
+        frames.append(struct.pack("<II7dIiIQ", i + 1, cameras[camera], *quaternion, *t, *sensor))
+    order = np.lexsort((view, point))
+    tracks = np.column_stack([view[order] + 1, row[order]]).astype("<u4")
+    Xh, colors = points
+    counts = np.bincount(point, minlength=len(Xh))[used]
+    error = np.bincount(point, weights=distance, minlength=len(Xh))[used] / np.maximum(counts, 1)
+    columns = (used + 1, _points(Xh[used]), colors[used], error, np.split(tracks, np.cumsum(counts)))
+    parts = [
+        struct.pack("<Q3d3BdQ", number, *xyz, *rgb, mean, len(track)) + track.tobytes()
+        for number, xyz, rgb, mean, track in zip(*columns, strict=False)
+    ]
+    rigs = [struct.pack("<IIiI", number, 1, 0, number) for number in cameras.values()]
+    files = {"rigs": rigs, "cameras": camera_parts, "frames": frames, "images": images, "points3D": parts}
+    for file, records in files.items():
+        write_atomically(folder / f"{file}.bin", struct.pack("<Q", len(records)) + b"".join(records))
+
+
+def colors_of(model: SparseModel) -> U8:
+    """Colours (N, 3) of the points; mid-grey if they are not known."""
+    return np.full((len(model.X), 3), 128, np.uint8) if model.colors is None else model.colors
+
+
+def _points(Xh: F64) -> F64:
+    return Xh[:, :3] / Xh[:, 3:]
+
+
+def _pose(K: F64, P: F64) -> tuple[F64, F64]:
+    """R (3, 3) and t (3,) of P = s K [R t] with s > 0."""
+    pose = np.asarray(np.linalg.solve(K, P), dtype=np.float64)
+    pose /= np.cbrt(np.linalg.det(pose[:, :3]))
+    return pose[:, :3], pose[:, 3]
+
+
+def _camera_params(
+    K: F64, distortion: F64, scale: float, *, pinhole: bool = False
+) -> tuple[str, tuple[float, ...]]:
+    """Return the smallest COLMAP camera model for K and (k1, k2, k3), with parameters in original pixels."""
+    fx, fy = float(K[0, 0] * scale), float(K[1, 1] * scale)
+    centre = tuple(float(value) for value in (K[:2, 2] + PIXEL_CENTRE) * scale)
+    k1, k2, k3 = distortion.tolist()
+    if k2 or k3:
+        return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
+    # One focal length for both moves no pixel by more than rounding.
+    if not pinhole and abs(fx - fy) <= 1e-12 * fx:
+        return ("SIMPLE_RADIAL", (fx, *centre, k1)) if k1 else ("SIMPLE_PINHOLE", (fx, *centre))
+    return ("OPENCV", (fx, fy, *centre, k1, 0.0, 0.0, 0.0)) if k1 else ("PINHOLE", (fx, fy, *centre))

@@ -14,8 +14,8 @@ from thesisrecon.io._files import write_json
 from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.pipeline import algorithm1
 from thesisrecon.records import PairChoice, StageReport
+from thesisrecon.runtime._run import run_position
 from thesisrecon.runtime._run_folder import RunDirectory, StageFolder
-from thesisrecon.runtime._run_position import run_position
 
 IMAGES = 10
 
