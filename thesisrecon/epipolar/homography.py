@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, noise_width
 from thesisrecon.errors import StageFailure, counted
@@ -30,11 +31,34 @@ TRIPLES, SUBSET = 100, 200
 OFF_PLANE = 16.0
 
 
-def _linearized(H: F64, points: F64) -> tuple[F64, F64, F64]:
-    """Equations (..., N, 2) of x2 ~ H x1, their derivatives (..., N, 2, 2) by x1 and, negative, by x2."""
-    xh = homogenize(points[:, :2]) @ H.swapaxes(-1, -2)
-    J = H[..., None, :2, :2] - points[:, 2:, None] * H[..., None, 2:, :2]
-    return xh[..., :2] - xh[..., 2:] * points[:, 2:], J, xh[..., 2]
+@kernel
+def _equations(h: F64, match: F64, J: F64) -> tuple[float, float, float]:
+    """Equations c of x2 ~ H x1 and w = (H x1)_3; writes their derivatives ``J`` (2, 2) by x1.
+
+    The derivatives by x2 are -w I.
+    """
+    x1, y1, x2, y2 = match[0], match[1], match[2], match[3]
+    w = h[2, 0] * x1 + h[2, 1] * y1 + h[2, 2]
+    for j in range(2):
+        J[0, j], J[1, j] = h[0, j] - x2 * h[2, j], h[1, j] - y2 * h[2, j]
+    c0 = h[0, 0] * x1 + h[0, 1] * y1 + h[0, 2] - w * x2
+    return c0, h[1, 0] * x1 + h[1, 1] * y1 + h[1, 2] - w * y2, w
+
+
+@kernel
+def _squared_distances(H: F64, points: F64) -> F64:
+    """Squared distances (S, N) of matches from homographies (S, 3, 3)."""
+    J, squared = empty((2, 2)), empty((len(H), len(points)))
+    for s in range(len(H)):
+        for k in range(len(points)):
+            c0, c1, w = _equations(H[s], points[k], J)
+            # Sums of squares (Lagrange's identity): a difference of products could round below zero.
+            above = (c0 * J[1, 0] - c1 * J[0, 0]) ** 2 + (c0 * J[1, 1] - c1 * J[0, 1]) ** 2
+            above += w * w * (c0 * c0 + c1 * c1)
+            entries = J[0, 0] ** 2 + J[0, 1] ** 2 + J[1, 0] ** 2 + J[1, 1] ** 2 + w * w
+            below = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2 + w * w * entries
+            squared[s, k] = above / below if below > 1e-28 * entries * entries else 1e280
+    return squared
 
 
 def squared_plane_distances(H: F64, points: F64) -> F64:
@@ -43,14 +67,8 @@ def squared_plane_distances(H: F64, points: F64) -> F64:
     To first order; c are the two equations and J their derivatives by the four coordinates (Chum, Pajdla and
     Sturm, 2005). A singular H has no exact match nearby.
     """
-    c, J, w = _linearized(H, points)
-    # Sums of squares (Lagrange's identity): a difference of products could round below zero.
-    turned = c[..., :1] * J[..., 1, :] - c[..., 1:] * J[..., 0, :]
-    above = np.sum(turned**2 + (w[..., None] * c) ** 2, axis=-1)
-    entries = np.sum(J**2, axis=(-2, -1)) + w**2
-    below = (J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]) ** 2 + w**2 * entries
-    regular = below > 1e-28 * entries**2
-    return np.where(regular, above / np.where(regular, below, 1.0), 1e280)
+    squared = _squared_distances(np.ascontiguousarray(H).reshape(-1, 3, 3), points)
+    return np.asarray(squared).reshape(*H.shape[:-2], len(points))
 
 
 def induced_homographies(F: F64, e2: F64, points: F64, triples: I64, smallest_area: float) -> F64:
@@ -74,22 +92,33 @@ def _normal_matrix(H: F64, points: F64, gate: float) -> F64:
     Each match has the weight (J J')^-1 and, within the gate, (1 - d^2 / gate^2)^2 (Tukey).
     """
     share = squared_plane_distances(H, points) / gate**2
-    points, share = points[share < 1.0], share[share < 1.0]
-    _, J, w = _linearized(H, points)
-    a = np.sum(J[:, 0] ** 2, axis=1) + w**2
-    slope = np.sum(J[:, 0] * J[:, 1], axis=1) / a
-    # det J J', without the rounding of a difference.
-    determinant = np.linalg.det(J) ** 2 + w**2 * (a + np.sum(J[:, 1] ** 2, axis=1))
-    x1 = homogenize(points[:, :2])
-    zero = np.zeros_like(x1)
-    first = np.hstack([x1, zero, -points[:, 2:3] * x1])
-    second = np.hstack([zero, x1, -points[:, 3:] * x1]) - slope[:, None] * first
-    # The rows of L^-1 [equations], L the Cholesky factor of J J', times the root of the weight.
-    rows = np.vstack(
-        [((1.0 - share) / np.sqrt(a))[:, None] * first,
-         ((1.0 - share) * np.sqrt(a / determinant))[:, None] * second]
-    )  # fmt: skip
-    return np.asarray(rows.T @ rows)
+    return np.asarray(_sum_equations(np.ascontiguousarray(H), points, share))
+
+
+@kernel
+def _sum_equations(H: F64, points: F64, share: F64) -> F64:
+    """The sum of :func:`_normal_matrix`; ``share`` (N,) is d^2 / gate^2."""
+    G, row, J = zeros((9, 9)), zeros((2, 9)), empty((2, 2))
+    for k in range(len(points)):
+        if not share[k] < 1.0:
+            continue
+        w = _equations(H, points[k], J)[2]
+        a, b = J[0, 0] ** 2 + J[0, 1] ** 2 + w * w, J[0, 0] * J[1, 0] + J[0, 1] * J[1, 1]
+        # det J J', without the rounding of a difference.
+        determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2
+        determinant += w * w * (a + J[1, 0] ** 2 + J[1, 1] ** 2)
+        # The rows of L^-1 [equations], L the Cholesky factor of J J', times the root of the weight.
+        s, t = (1.0 - share[k]) / np.sqrt(a), (1.0 - share[k]) * np.sqrt(a / determinant)
+        x2, y2 = points[k, 2], points[k, 3]
+        for j in range(3):
+            x = points[k, j] if j < 2 else 1.0
+            row[0, j], row[0, 6 + j] = s * x, -s * x2 * x
+            row[1, j], row[1, 3 + j], row[1, 6 + j] = -t * b / a * x, t * x, -t * (y2 - b / a * x2) * x
+        for i in range(9):
+            for j in range(i, 9):
+                G[i, j] += row[0, i] * row[0, j] + row[1, i] * row[1, j]
+                G[j, i] = G[i, j]
+    return G
 
 
 def refine_plane(H: F64, points: F64, gate: float, iterations: int) -> F64:
@@ -142,10 +171,24 @@ def fundamentals_of_plane(H: F64, points: F64, weights: F64, pairs: I64, gate: f
     x1, x2 = homogenize(points[:, :2]), homogenize(points[:, 2:])
     parallax = np.cross(x2, x1 @ H.T)
     F = unit_norm(cross_matrix(np.cross(parallax[pairs[:, 0]], parallax[pairs[:, 1]])) @ H)
-    lines2, lines1 = x1 @ F.swapaxes(1, 2), x2 @ F
-    gradient = np.sum(lines2[..., :2] ** 2 + lines1[..., :2] ** 2, axis=2)
-    agree = (np.sum(x2 * lines2, axis=2) ** 2 < gate**2 * gradient).astype(np.float64)
+    agree = np.asarray(_agree(F, np.ascontiguousarray(points.T), gate))
     return F.reshape(-1, 9), agree, agree @ weights.T
+
+
+@kernel(fastmath={"reassoc", "contract"})
+def _agree(F: F64, columns: F64, gate: float) -> F64:
+    """1 where a Sampson distance of the matches (4, N) from F (S, 3, 3) is below the gate, else 0: (S, N)."""
+    agree, wide = empty((len(F), columns.shape[1])), gate * gate
+    for s in range(len(F)):
+        f00, f01, f02, f10, f11, f12 = F[s, 0, 0], F[s, 0, 1], F[s, 0, 2], F[s, 1, 0], F[s, 1, 1], F[s, 1, 2]
+        f20, f21, f22 = F[s, 2, 0], F[s, 2, 1], F[s, 2, 2]
+        for k in range(columns.shape[1]):
+            x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+            a0, a1 = f00 * x1 + f01 * y1 + f02, f10 * x1 + f11 * y1 + f12
+            b0, b1 = f00 * x2 + f10 * y2 + f20, f01 * x2 + f11 * y2 + f21
+            e = a0 * x2 + a1 * y2 + f20 * x1 + f21 * y1 + f22
+            agree[s, k] = 1.0 if e * e < wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) else 0.0
+    return agree
 
 
 _SAMPLE, _PARAMETERS = 4, 8
