@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import unit_norm
@@ -125,27 +126,48 @@ def check_start(F: F64, frame: PairFrame) -> F64:
 TAIL = 4.0
 
 
-def _fit_mixture(
-    residuals: F64, parameters: float, spread: float, rounds: int, widths: F64, fractions: F64
-) -> tuple[F64, F64, float]:
-    """Fit three zero-mean normals by expectation-maximisation, with a prior ``spread`` of wrong residuals.
+@kernel
+def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
+    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
 
-    ``widths`` (3,) and ``fractions`` (3,) of noise, its tail and wrong residuals are returned, and the mean
-    log-likelihood.
+    ``mixture`` (5,), updated: sigma, standard deviation of wrong residuals (prior ``spread``), fractions of
+    noise, its tail and wrong residuals.
     """
-    q, counts = residuals**2, np.array([1.0, 0.5, 1.0])
-    for _ in range(rounds):
-        p = fractions / widths * np.exp(-0.5 * q[:, None] / widths**2)
-        likelihood = p.sum(axis=1) + 1e-300
-        posterior = p / likelihood[:, None]
-        n, squares = posterior.sum(axis=0), posterior.T @ q
-        noise = squares[0] + squares[1] / TAIL**2
-        sigma = np.sqrt(noise / max(n[0] + n[1] - parameters, 1.0)) + 1e-12 * spread
+    core_count, tail_count, wrong_count = 1.0, 0.5, 1.0
+    n, likelihood = len(residuals), 0.0
+    for last in range(rounds - 1, -1, -1):
+        sigma, wide, core, tail, wrong = mixture
+        c0, c1, c2 = core / sigma, tail / (TAIL * sigma), wrong / wide
+        i1, i2 = 0.5 / (TAIL * TAIL * sigma * sigma), 0.5 / (wide * wide)
+        n0, n1, n2, s01, s2 = 0.0, 0.0, 0.0, 0.0, 0.0
+        likelihood = 0.0
+        for k in range(n):
+            q = residuals[k] * residuals[k]
+            # The core's exponential is that of the tail to the power TAIL^2 = 16.
+            e1 = np.exp(-i1 * q)
+            e0 = e1 * e1
+            e0 *= e0
+            e0 *= e0
+            e0 *= e0
+            p0, p1, p2 = c0 * e0, c1 * e1, c2 * np.exp(-i2 * q)
+            p = p0 + p1 + p2 + 1e-300
+            if last == 0:
+                likelihood += np.log(p)
+            p = 1.0 / p
+            n0 += p0 * p
+            n1 += p1 * p
+            n2 += p2 * p
+            s01 += (p0 + p1 / (TAIL * TAIL)) * p * q
+            s2 += p2 * p * q
+        total = n + core_count + tail_count + wrong_count
+        mixture[0] = np.sqrt(s01 / max(n0 + n1 - parameters, 1.0)) + 1e-12 * spread
+        wide = np.sqrt((s2 + wrong_count * spread * spread) / (n2 + wrong_count))
         # Wrong residuals are at least twelve times as wide as the noise.
-        wide = max(np.sqrt((squares[2] + counts[2] * spread**2) / (n[2] + counts[2])), 12.0 * sigma)
-        widths = np.array([sigma, TAIL * sigma, wide])
-        fractions = (n + counts) / (len(q) + counts.sum())
-    return widths, fractions, float(np.mean(np.log(likelihood)))
+        mixture[1] = max(wide, 12.0 * mixture[0])
+        mixture[2] = (n0 + core_count) / total
+        mixture[3] = (n1 + tail_count) / total
+        mixture[4] = (n2 + wrong_count) / total
+    return likelihood / n
 
 
 def _middle(ordered: F64) -> float:
@@ -212,13 +234,12 @@ class NoiseMixture:
         """Fit to ascending residuals by expectation-maximisation; ``spread`` is the prior of wrong ones."""
         # At most 600 of them, evenly spaced in order.
         step = max(len(residuals) // 300, 1)
-        some = residuals[step // 2 :: step]
+        some = np.ascontiguousarray(residuals[step // 2 :: step])
         share = float(np.count_nonzero(some < 3.0 * sigma)) / len(some)
-        widths = np.array([sigma, TAIL * sigma, spread])
-        fractions = np.array([0.9 * share, 0.1 * share, 1.0 - share])
-        widths, fractions, likelihood = _fit_mixture(some, parameters / step, spread, 6, widths, fractions)
-        core, tail, wrong = fractions.tolist()
-        return cls(float(widths[0]), float(widths[2]), core, tail, wrong, likelihood)
+        mixture = np.array([sigma, spread, 0.9 * share, 0.1 * share, 1.0 - share])
+        likelihood = _fit_mixture(some, parameters / step, spread, 6, mixture)
+        sigma, spread, core, tail, wrong = mixture.tolist()
+        return cls(sigma, spread, core, tail, wrong, float(likelihood))
 
     @property
     def limit(self) -> float:

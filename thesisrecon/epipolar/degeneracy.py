@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
@@ -58,9 +59,10 @@ def _contradicted_ratios(H: F64, points: F64, on_plane: B8, chosen: I64, near: f
     opaque surface would change order. Points nearer than ``near`` are the same feature and do not count.
     """
     parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)
-    apart = np.linalg.norm(points[chosen, None, :2] - points[:, :2], axis=2)
+    apart = scipy.spatial.distance.cdist(points[chosen, :2], points[:, :2])
     apart[apart < near] = np.inf
-    nearest = np.argsort(apart, axis=1, kind="stable")[:, :5]
+    count = min(5, len(points))
+    nearest = np.argpartition(apart, count - 1, axis=1)[:, :count]
     distance = np.take_along_axis(apart, nearest, axis=1)
     differ = np.linalg.norm(parallax[nearest] - parallax[chosen, None], axis=2) > distance
     counted = np.maximum(np.isfinite(distance).sum(axis=1), 1)

@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 import scipy
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import (
     PairFrame,
@@ -38,6 +39,7 @@ from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.two_view import (
     epipoles,
@@ -284,25 +286,45 @@ def _refine_translation(f: F64, points: F64, gate: float) -> None:
         return
     e /= np.linalg.norm(e)
     kept = points[np.asarray(sampson_distances(f, points)) < gate]
-    if len(kept) < 5:
-        return
-    x1, x2 = homogenize(kept[:, :2]), homogenize(kept[:, 2:])
-    normals = np.cross(x1, x2)
+    if len(kept) >= 5:
+        _correct_epipole(e, np.ascontiguousarray(kept))
+        f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
+
+
+@kernel
+def _correct_epipole(e: F64, points: F64) -> None:
+    """Minimise the Sampson distances of [e]x of matches (K, 4) over the unit vector ``e``, in place."""
+    normal, gradient, J, n, step = empty((3, 3)), empty(3), empty(3), empty(3), empty(3)
     for _ in range(CORRECTIONS):
-        # x2 . (e x x1) = e . (x1 x x2); its gradients are the first two entries of e x x1 by x2 and of
-        # x2 x e by x1.
-        (a0, a1, _), (b0, b1, _) = np.cross(e, x1).T, np.cross(x2, e).T
-        size = 1.0 / np.sqrt(a0**2 + a1**2 + b0**2 + b1**2 + EXACT**2)
-        r = normals @ e * size
-        by_g = np.stack([b1 - a1, a0 - b0, a1 * x1[:, 0] - a0 * x1[:, 1] + b0 * x2[:, 1] - b1 * x2[:, 0]])
-        J = (normals * size[:, None]).T - r * size**2 * by_g
+        normal[:], gradient[:] = 0.0, 0.0
+        for k in range(len(points)):
+            x1, y1, x2, y2 = points[k]
+            # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two
+            # rows, whose squares are g.
+            n[0], n[1], n[2] = y1 - y2, x2 - x1, x1 * y2 - y1 * x2
+            a0, a1 = e[1] - e[2] * y1, e[2] * x1 - e[0]
+            b0, b1 = y2 * e[2] - e[1], e[0] - x2 * e[2]
+            size = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + EXACT**2)
+            residual = (n[0] * e[0] + n[1] * e[1] + n[2] * e[2]) * size
+            by_g = residual * size * size
+            J[0] = n[0] * size - by_g * (b1 - a1)
+            J[1] = n[1] * size - by_g * (a0 - b0)
+            J[2] = n[2] * size - by_g * (a1 * x1 - a0 * y1 + b0 * y2 - b1 * x2)
+            for i in range(3):
+                gradient[i] += J[i] * residual
+                for j in range(3):
+                    normal[i, j] += J[i] * J[j]
         # The length of e has no effect on the distances: e e' fixes it.
-        normal = J @ J.T
-        step = np.linalg.lstsq(normal + np.trace(normal) * np.outer(e, e), -J @ r, rcond=None)[0]
-        e = (e + step) / np.linalg.norm(e + step)
+        held = normal[0, 0] + normal[1, 1] + normal[2, 2]
+        for i in range(3):
+            for j in range(3):
+                normal[i, j] += held * e[i] * e[j]
+        if not solve_damped(normal, gradient, 0.0, step):
+            break
+        e += step
+        e /= np.sqrt(e @ e)
         if step @ step < 1e-20:
             break
-    f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
 
 
 @dataclass(frozen=True)

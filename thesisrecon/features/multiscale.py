@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 import scipy
 
+from thesisrecon._numba import FAST, empty, kernel
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.features.harris import CornerMeasure, select_spread
 from thesisrecon.imaging.resampling import halve, resample, smooth
@@ -24,14 +25,25 @@ PATCH_VALUES = 32
 """Values of a patch: half of its cosine coefficients, those of low frequency, insensitive to small shifts."""
 
 
+@kernel(fastmath=FAST)
 def sample_patches(image: F32, xy: F64, angle: F32, side: int, spacing: float) -> F32:
     """Square patches (N, side^2) of an image, clamped, rotated by ``angle`` (N,) rad, sampled bilinearly."""
-    c, s = (spacing * f(angle)[:, None, None] for f in (np.cos, np.sin))
-    b, a = np.mgrid[:side, :side] - 0.5 * (side - 1)
-    x, y = xy.T[:, :, None, None]
-    places = [y + s * a + c * b, x + c * a - s * b]
-    found: F32 = scipy.ndimage.map_coordinates(image, places, order=1, mode="nearest")
-    return found.reshape(len(xy), side**2)
+    height, width = image.shape
+    out = empty((len(xy), side * side), np.float32)
+    centre = 0.5 * (side - 1)
+    for n in range(len(xy)):
+        c, s = np.cos(angle[n]) * spacing, np.sin(angle[n]) * spacing
+        for row in range(side):
+            for column in range(side):
+                a, b = column - centre, row - centre
+                u = min(max(xy[n, 0] + c * a - s * b, 0.0), width - 1.001)
+                v = min(max(xy[n, 1] + s * a + c * b, 0.0), height - 1.001)
+                x0, y0 = int(u), int(v)
+                p, q = np.float32(u - x0), np.float32(v - y0)
+                top = image[y0, x0] + p * (image[y0, x0 + 1] - image[y0, x0])
+                low = image[y0 + 1, x0] + p * (image[y0 + 1, x0 + 1] - image[y0 + 1, x0])
+                out[n, row * side + column] = top + q * (low - top)
+    return out
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-import scipy
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
@@ -133,11 +132,6 @@ def affine_determinant(a: F64) -> float:
     """Determinant of a local affine map, 0 if it is implausible (mirrored, or scaled by more than five)."""
     determinant = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
     return determinant if determinant > 0.04 and determinant < 25.0 else 0.0
-
-
-def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
-    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2)."""
-    return np.asarray(scipy.spatial.cKDTree(xy).query(of, np.arange(1, count + 1))[1], dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._prepared import empty_matches, join_matches, nearest_neighbours, select_found
+from thesisrecon.matching._nearest_neighbours import nearest_neighbours
+from thesisrecon.matching._prepared import empty_matches, join_matches, select_found
 from thesisrecon.matching.track_alignment import strongest_distinct
 from thesisrecon.records import Features, Matches, Seeds
 

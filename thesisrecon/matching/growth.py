@@ -12,6 +12,7 @@ from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
+from thesisrecon.matching._nearest_neighbours import nearest_neighbours
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
@@ -21,7 +22,6 @@ from thesisrecon.matching._prepared import (
     dot,
     empty_matches,
     join_matches,
-    nearest_neighbours,
     normalize_window,
     one_to_one,
     prepare_image,
