@@ -247,7 +247,7 @@ def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
     off = there[near] - there[:, None] - offset
     apart = TOLERANCE * np.linalg.norm(offset, axis=2) + 1.0
     weight = np.exp(-0.5 * np.sum(off**2, axis=2) / apart**2)
-    return np.sum(np.where(near == np.arange(len(here))[:, None], 0.0, weight), axis=1)
+    return np.asarray(np.where(near == np.arange(len(here))[:, None], 0.0, weight).sum(axis=1))
 
 
 def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:

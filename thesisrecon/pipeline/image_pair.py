@@ -13,7 +13,7 @@ from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import StageFailure
-from thesisrecon.matching._prepared import Found, select_found
+from thesisrecon.matching._prepared import select_found
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 from thesisrecon.runtime._run import stream
 
@@ -64,7 +64,7 @@ def _distance_to_mask(image: Image) -> Any:
     return scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
 
 
-def _unmasked(found: Found, clear: Any) -> Found:
+def _unmasked(found: Any, clear: Any) -> Any:
     if clear is None:
         return found
     return select_found(found, values_at(clear, found.xy) > MASK_REACH * found.scale)
