@@ -1,4 +1,4 @@
-"""Open3D with our types: distances to meshes, and surfaces of depth maps.
+"""Open3D with our types: motions by ICP, distances to meshes, images of them, and surfaces of depth maps.
 
 Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
 (0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0
@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64
-from thesisrecon.camera import decompose_camera
+from thesisrecon.arrays import F64, U8
+from thesisrecon.camera import Camera, decompose_camera
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from validation.references.libraries import open3d as o3d
 
@@ -39,6 +39,21 @@ def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
     return float(np.median(np.concatenate(widths)))
 
 
+def refine_by_icp(moving: F64, fixed: F64, reach: float) -> F64:
+    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3).
+
+    Pairs are no farther apart than ``reach``.
+    """
+    clouds = [
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(X, dtype=np.float64)))
+        for X in (moving, fixed)
+    ]
+    criteria = o3d.pipelines.registration.ICPConvergenceCriteria(1e-9, 1e-9, 60)
+    method = o3d.pipelines.registration.TransformationEstimationPointToPoint(False)
+    found = o3d.pipelines.registration.registration_icp(*clouds, reach, np.eye(4), method, criteria)
+    return np.array(found.transformation, dtype=np.float64)
+
+
 class Nearest:
     """A surface prepared for distance queries."""
 
@@ -54,12 +69,35 @@ class Nearest:
         return np.asarray(found.numpy(), dtype=np.float64)
 
 
-def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
-    """Reduce a mesh to a number of faces by quadric decimation (Garland and Heckbert 1997)."""
-    full = o3d.geometry.TriangleMesh(
+def _triangles(mesh: TexturedMesh) -> Any:
+    return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
     )
-    fewer = full.simplify_quadric_decimation(faces)
+
+
+def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
+    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
+
+    Raises ``RuntimeError`` if the machine has no graphics that it can use.
+    """
+    width, height = camera.size
+    renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
+    material = o3d.visualization.rendering.MaterialRecord()
+    material.shader = "defaultUnlit"
+    drawn = _triangles(mesh)
+    if mesh.colors is not None:
+        drawn.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
+    renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
+    renderer.scene.view.set_post_processing(False)
+    renderer.scene.add_geometry("model", drawn, material)
+    K, world = camera_of(camera.P, shift=0.5)
+    renderer.setup_camera(K, world, width, height)
+    return np.asarray(renderer.render_to_image()).copy()
+
+
+def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
+    """Reduce a mesh to a number of faces by quadric decimation (Garland and Heckbert 1997)."""
+    fewer = _triangles(mesh).simplify_quadric_decimation(faces)
     return TexturedMesh(np.asarray(fewer.vertices), np.asarray(fewer.triangles).astype(np.int64))
 
 

@@ -68,6 +68,7 @@ def overview(results: Results, earlier: Results | None) -> dict[str, Any]:
         "rows": [],
         "references": [],
         "plots": plots,
+        "pictures": (),
         "notes": [*notes, *changes(results, earlier)],
     }
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import PIL.Image
+
 from thesisrecon import __version__
 from thesisrecon.errors import counted, made
 from thesisrecon.io._files import write_text
 from thesisrecon.report._page import plotly_script, render_page
 from validation.runs.overview import cost_ratio, overview
-from validation.runs.records import Plot, ReportOptions, Stage, key_of, slug
+from validation.runs.records import Judgement, Picture, Plot, ReportOptions, Stage, key_of, slug
 from validation.runs.report import Judged
 from validation.runs.results import Results, Row
 from validation.runs.tables import number
@@ -48,7 +52,7 @@ def write_pages(
     def write_scene(scene: str) -> None:
         rows = [r for r in results.rows if r.key.split("/")[1] == scene]
         sections = [
-            _section(stages[name], rows, names) | {"notes": judgement.notes}
+            _section(stages[name], rows, names) | _figures(options.folder(name, scene), name, judgement)
             for (name, where), (judgement, _) in judged.items()
             if where == scene
         ]
@@ -117,7 +121,17 @@ def _section(stage: Stage, rows: Sequence[Row], names: Mapping[str, str]) -> dic
         "rows": [_row(row, names) for row in rows],
         "references": list(dict.fromkeys(name for row in rows for name in row.reference)),
         "plots": (),
+        "pictures": (),
         "notes": (),
+    }
+
+
+def _figures(folder: Path, stage: str, judgement: Judgement) -> dict[str, Any]:
+    """Return what the judgement in the folder ``folder`` adds to the section of its stage."""
+    return {
+        "plots": [plot_at(f"{slug(stage)}-{n}", plot) for n, plot in enumerate(judgement.plots)],
+        "pictures": [_picture(folder, picture) for picture in judgement.pictures],
+        "notes": judgement.notes,
     }
 
 
@@ -134,3 +148,14 @@ def _row(row: Row, names: Mapping[str, str]) -> dict[str, Any]:
 def plot_at(folder: str, plot: Plot) -> dict[str, Any]:
     """Return a plot as an entry of a section; ``folder`` becomes part of its identifier."""
     return {"id": f"plot-{folder}", **vars(plot), "solid": "scene" in plot.figure.get("layout", {})}
+
+
+def _picture(folder: Path, picture: Picture) -> dict[str, Any]:
+    """Return the image as a data URL at page width."""
+    with PIL.Image.open(folder / picture.file) as opened:
+        rgb = opened.convert("RGB")
+    rgb.thumbnail((1400, 1400))
+    sink = io.BytesIO()
+    rgb.save(sink, "JPEG", quality=88)
+    address = "data:image/jpeg;base64," + base64.b64encode(sink.getvalue()).decode("ascii")
+    return {**vars(picture), "address": address, "width": rgb.width, "height": rgb.height}

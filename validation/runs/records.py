@@ -16,8 +16,8 @@ from validation.runs.tables import Metric
 @dataclass(frozen=True)
 class ReportOptions:
     """``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
-    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references that no gate
-    needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
+    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no
+    gate needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
     ``side_px``: long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose
     references are reused, or empty. ``stages_from``: module of ``STAGES``."""
 
@@ -73,6 +73,15 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Picture:
+    """A figure on the page of a scene: a PNG or JPEG ``file`` in the folder of the judgement."""
+
+    file: str
+    title: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
 class Plot:
     """An interactive plot on a page: ``figure`` for plotly.js (data, layout)."""
 
@@ -83,10 +92,12 @@ class Plot:
 
 @dataclass(frozen=True)
 class Judgement:
-    """Evaluation of a stage on a scene."""
+    """Evaluation of a stage on a scene: numbers first, then plots and figures."""
 
     metrics: Sequence[Metric]
     notes: Sequence[str] = ()
+    plots: Sequence[Plot] = ()
+    pictures: Sequence[Picture] = ()
 
 
 class Stage(Protocol):

@@ -33,7 +33,7 @@ from thesisrecon.io._outputs import clear_folder
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
 from validation.runs.processes import failure_of, last_line, own_cores, run_jobs, run_process
-from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task
+from validation.runs.records import OURS, Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
 from validation.runs.tables import Metric
 
 Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
@@ -163,6 +163,8 @@ def _judgement(outcome: Outcome) -> Judgement:
     return Judgement(
         [Metric(**metric) for metric in record["metrics"]],
         record["notes"],
+        [Plot(**plot) for plot in record["plots"]],
+        [Picture(**picture) for picture in record["pictures"]],
     )
 
 

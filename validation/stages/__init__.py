@@ -7,6 +7,7 @@ from validation.runs.scenes import available_scenes
 from validation.stages.boards import BoardsStage
 from validation.stages.bundle import BundleStage
 from validation.stages.cameras import CamerasStage
+from validation.stages.clouds import CloudsStage
 from validation.stages.depth import DepthStage
 from validation.stages.disparity import DisparityStage
 from validation.stages.features import FeaturesStage
@@ -26,6 +27,7 @@ STAGES: dict[str, Stage] = {
         FeaturesStage(),
         TriangulationStage(),
         CamerasStage(),
+        CloudsStage(),
         BundleStage(),
         DisparityStage(),
         ViewInterpolationStage(),
