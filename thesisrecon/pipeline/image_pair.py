@@ -40,7 +40,7 @@ def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int)
 def detect_features(config: PipelineConfig, image: Image) -> Features:
     """Detect the features of an image; those with a masked pixel within ``MASK_REACH`` are dropped."""
     found, clear = config.features.detect(image), _distance_to_mask(image)
-    corners = _unmasked(found, clear)
+    corners: Features = _unmasked(found, clear)
     return corners if found.seeds is None else replace(corners, seeds=_unmasked(found.seeds, clear))
 
 
