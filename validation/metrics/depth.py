@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64
+from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.records import DepthMap, DisparityMap, Reconstruction, Similarity
 from validation.scenes.real import Scene, load_fixture_depth
@@ -129,6 +129,29 @@ def judge_against_points(found: DepthMap, model: Reconstruction) -> Judged:
 def _judged(error: F64, deviations: F64, total: int) -> Judged:
     total = max(total, 1)
     return Judged(error, deviations, len(error) / total, float(np.sum(error < SAME)) / total)
+
+
+def depth_range(depths: Sequence[F32 | F64]) -> tuple[float, float]:
+    """1 and 99 % quantiles of the inverse depths, for :func:`depth_colours`; (0, 1) where none is known."""
+    known = np.concatenate([1.0 / d[np.isfinite(d)].astype(np.float64) for d in depths])
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.quantile(known, [0.01, 0.99])
+    return float(low), float(max(high, low + 1e-12))
+
+
+def depth_colours(depth: F32 | F64, limits: tuple[float, float]) -> U8:
+    """(H, W, 3): inverse depth between two ``limits``, near red, far blue, unknown black."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return coloured((1.0 / depth.astype(np.float64) - limits[0]) / (limits[1] - limits[0]))
+
+
+def coloured(share: F64) -> U8:
+    """(..., 3): 0 blue to 1 red, beyond as at the end, unknown black."""
+    ends = [[48, 18, 59], [70, 107, 227], [40, 187, 236], [50, 242, 152], [238, 207, 58], [208, 48, 5]]
+    stops, known = np.linspace(0.0, 1.0, len(ends)), np.isfinite(share)
+    rgb = [np.interp(np.clip(share, 0.0, 1.0), stops, channel) for channel in zip(*ends, strict=True)]
+    return np.where(known[..., None], np.stack(rgb, axis=-1), 0.0).astype(np.uint8)
 
 
 def bad_pixels(disparity: F32, pair: StereoPair, limit_px: float) -> float:

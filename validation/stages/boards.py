@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import PIL.Image
 from scipy.ndimage import map_coordinates
 
 from thesisrecon.api.views import render
@@ -19,11 +20,15 @@ from validation.runs.records import (
     OURS,
     Judgement,
     Outcome,
+    Picture,
     ReportOptions,
     Stage,
     Task,
+    plot,
     read_arrays,
     row,
+    scatter,
+    slug,
 )
 from validation.runs.tables import Metric
 from validation.scenes.materials import Material
@@ -178,16 +183,25 @@ class BoardsStage(Stage):
         board = _board(task.method, options)
         pictures = board_images(task.method, board)
         folder = options.folder(task.stage, task.scene, task.method)
+        beside = np.concatenate([picture[::2, ::2] for picture in pictures[:4]], axis=1)
+        PIL.Image.fromarray(beside).save(folder / "boards.png")
         corners = [board_corners(picture, CORNERS) for picture in pictures]
         found = calibrate_from_corners(board.X, corners, SIZE)
         np.savez(folder / "found.npz", corners=np.array(corners), K=found.K, k1=found.k1, std=found.std)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        metrics = list[Metric]()
+        metrics, traces, pictures = list[Metric](), list[dict[str, Any]](), list[Picture]()
         for way, outcome in outcomes.items():
             board, found = _board(way, options), read_arrays(outcome, "found.npz")
             metrics += _metrics(scene, way, board, found)
-        return Judgement(metrics)
+            if found is not None:
+                off = np.round((found["corners"] - board.projections()).reshape(-1, 2), 4)
+                traces.append(scatter(way, *off.T.tolist(), marker={"size": 4, "opacity": 0.6}))
+                pictures.append(Picture(f"{slug(way)}/boards.png", f"By the {way}", "Four of the images."))
+        text = "Each point is a corner: OpenCV's position minus its true projection."
+        equal = {"scaleanchor": "x"}
+        plots = [plot("Corner errors", traces, "x (px)", "y (px)", text, yaxis=equal)] if traces else []
+        return Judgement(metrics, plots=plots, pictures=pictures)
 
 
 def _board(way: str, options: ReportOptions) -> Board:

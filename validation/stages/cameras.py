@@ -24,12 +24,15 @@ from validation.runs.records import (
     OURS,
     Judgement,
     Outcome,
+    Plot,
     ReportOptions,
     Stage,
     Task,
     Values,
     each,
+    plot,
     row,
+    scatter,
 )
 from validation.runs.scenes import has_images, load_images, truth_of
 from validation.runs.tables import Metric
@@ -101,7 +104,7 @@ class CamerasStage(Stage):
         metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
         metrics += _before_adjustment(images, outcomes.get(OURS))
         metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
-        return Judgement(metrics)
+        return Judgement(metrics, plots=[_plot(images, models)])
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
@@ -256,3 +259,20 @@ def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float
             truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if entry is None else true_K[entry]
             held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
     return 100.0 * float(np.mean(held)) if held else None
+
+
+def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
+    """Plot the focal length of every image by each method, and the true one."""
+    images = range(1, len(scene.image_paths) + 1)
+    traces = [scatter(name, images, _focals(model)) for name, model in models.items() if model is not None]
+    if scene.K is not None:
+        true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
+        marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
+        traces.append(scatter("truth", images, true, marker=marker))
+    return plot("Focal lengths", traces, "image", "focal length (px)")
+
+
+def _focals(model: Reconstruction) -> list[float | None]:
+    assert model.K is not None
+    found = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
+    return [float(f) if seen else None for f, seen in zip(found, model.registered, strict=True)]

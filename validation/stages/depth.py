@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 
 from thesisrecon.api.surface import confirmed_depth_maps
+from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
 from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.io._files import write_text
@@ -20,16 +22,19 @@ from validation.metrics.depth import (
     Judged,
     JudgedMaps,
     TrueDepth,
+    coloured,
+    depth_colours,
+    depth_range,
     judge_against_points,
     judge_against_truth,
     together,
     true_depth,
     true_from_maps,
 )
-from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task, each, row
+from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, each, row
 from validation.runs.scenes import load_images
 from validation.runs.tables import Metric
-from validation.scenes.real import Scene
+from validation.scenes.real import Scene, load_fixture_depth
 from validation.stages.cameras import our_model
 
 THESIS = "ours (thesis)"
@@ -40,6 +45,8 @@ SIDE_PX = 448
 """Long side of the depth maps; the library default of 1024 takes too long for a report."""
 FEW, FEW_AROUND = ("fountain-P11",), 2
 """Scenes whose depth maps only their own gates read; images on each side of the middle that these need."""
+WORST = 0.02
+"""Relative error that is red in the figures."""
 
 
 class DepthStage(Stage):
@@ -98,7 +105,8 @@ class DepthStage(Stage):
         seconds = each(known, lambda folder: (folder / "seconds.txt").read_text())
         text = "processor time, compiling included"
         metrics = [*_metrics(scene, judged), row(scene, "time a view", "s", seconds, text)]
-        return Judgement(metrics)
+        pictures = [] if options.gates_only else _pictures(images, found, model, options)
+        return Judgement(metrics, pictures=pictures)
 
 
 def side_of(options: ReportOptions) -> int:
@@ -172,3 +180,45 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
     return [
         row(scene, name, unit, each(judged, read), text, more=more) for name, unit, read, text, more in rows
     ]
+
+
+def _pictures(
+    scene: Scene, found: Mapping[str, Mapping[int, DepthMap]], model: Reconstruction, options: ReportOptions
+) -> list[Picture]:
+    """Draw two views: image, maps, and, if known, truth and errors."""
+    views = sorted(set.intersection(*(set(maps) for maps in found.values()))) if found else []
+    chosen = sorted({views[len(views) // 4], views[len(views) // 2]}) if views else []
+    images, folder = images_of(scene), options.folder(DepthStage.name, scene.name)
+    pictures = []
+    for view in chosen:
+        rgb = pinhole_view(images[view], model, view, max_side=side_of(options)).rgb
+        maps = {name: of_method[view] for name, of_method in found.items()}
+        limits = depth_range([m.depth for m in maps.values()])
+        rows = [[rgb, *(depth_colours(m.depth, limits) for m in maps.values())]]
+        text = f"Image, {', then '.join(maps)}: near red, far blue, unknown black."
+        if scene.name == COURTYARD:
+            scales = {name: true_from_maps(of_method, scene).scale for name, of_method in found.items()}
+            true = _true_map(view, rgb.shape[:2])
+            own = depth_colours(true / next(iter(scales.values())), limits)
+            rows.append([own, *(_errors(m, true, scales[name]) for name, m in maps.items())])
+            text += f" Below the truth, and errors from blue (none) to red ({100.0 * WORST:g} % or more)."
+        file = f"view-{view:02d}.png"
+        PIL.Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows])).save(folder / file)
+        pictures.append(Picture(file, f"Depth of image {view + 1}", text))
+    return pictures
+
+
+def _true_map(view: int, shape: Sequence[int]) -> F32:
+    """Return the true depth at the samples nearest to the pixels of a map of this shape."""
+    true, stride = load_fixture_depth(view)
+    # Sample k is the pixel stride * k of the image.
+    y, x = (
+        np.clip(np.rint((np.arange(n) + 0.5) * m / n - 0.5 / stride), 0, m - 1).astype(np.int64)
+        for n, m in zip(shape, true.shape, strict=True)
+    )
+    return np.asarray(true[np.ix_(y, x)], dtype=np.float32)
+
+
+def _errors(found: DepthMap, true: F32, scale: float) -> U8:
+    with np.errstate(invalid="ignore"):
+        return coloured(np.abs(scale * found.depth.astype(np.float64) / true - 1.0) / WORST)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import PIL.Image
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, U8
+from thesisrecon.records import DisparityMap
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
-from validation.metrics.depth import bad_pixels
+from validation.metrics.depth import bad_pixels, coloured
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
 from validation.runs.records import (
     OURS,
     Judgement,
     Outcome,
+    Picture,
     ReportOptions,
     Stage,
     Task,
@@ -97,7 +100,11 @@ class DisparityStage(Stage):
         metrics.append(row(scene, "error on surfaces", "px", on_surfaces, text))
         text = "processor time, a ratio of two runs on the same machine"
         metrics.append(row(scene, "time over SGBM HH", "s / s", ratio(spent[OURS], spent[HH]), text))
-        return Judgement(metrics)
+        drawn = {name: d for name, d in maps.items() if d is not None}
+        shown = [name for name in (THESIS, OURS, THREE_WAY) if name in drawn]
+        PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.folder(self.name, scene) / "maps.png")
+        text = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
+        return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", text)])
 
 
 def _surface_error(disparity: F32, pair: StereoPair) -> float:
@@ -119,3 +126,19 @@ def _match(method: str, pair: StereoPair, *, widened: bool = True) -> F32:
         return MATCHERS[method].match(pair.left, pair.right, disparity_range=limits).disparity
     one_thread()
     return OpenCVSemiGlobal(method, widened).match(pair.left, pair.right, pair.disparities)
+
+
+def _picture(pair: StereoPair, maps: Mapping[str, F32], names: Sequence[str]) -> U8:
+    """Draw truth and maps in colours; below each map the errors above 1 px (yellow) and 2 px (red)."""
+    top = [pair.left, coloured(pair.truth / np.float64(pair.disparities))]
+    dark = (pair.left // 3 + 50).astype(np.uint8)
+    low = [dark, np.where(pair.judged[..., None], np.uint8(200), dark)]
+    for name in names:
+        top.append(coloured(maps[name] / np.float64(pair.disparities)))
+        shown = dark.copy()
+        filled = DisparityMap(maps[name], np.zeros_like(maps[name]), 0.0).filled()
+        error = np.nan_to_num(np.abs(filled - pair.truth), nan=np.inf)
+        shown[pair.judged & (error > 1.0)] = (255, 255, 0)
+        shown[pair.judged & (error > 2.0)] = (255, 0, 0)
+        low.append(shown)
+    return np.concatenate([np.concatenate(top, axis=1), np.concatenate(low, axis=1)])

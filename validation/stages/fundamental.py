@@ -9,19 +9,22 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.two_view import epipoles
-from validation.metrics.fundamental_precision import rms_epipolar_distance
+from validation.metrics.fundamental_precision import NONE_PX, rms_epipolar_distance
 from validation.references.fundamental import estimate_with
 from validation.references.libraries import NoReference
 from validation.runs.records import (
     OURS,
     Judgement,
     Outcome,
+    Plot,
     ReportOptions,
     Stage,
     Task,
     each,
+    plot,
     read_arrays,
     row,
+    scatter,
 )
 from validation.runs.scenes import has_images, load_images
 from validation.runs.tables import Metric
@@ -87,7 +90,7 @@ class FundamentalStage(Stage):
         answers = {m: read_arrays(o, "answers.npz") for m, o in outcomes.items() if m != MATCHES}
         errors = {m: None if a is None else _errors(a, pairs) for m, a in answers.items()}
         notes = [f"{len(pairs)} pairs, {_seeds(options)} seeds each."]
-        return Judgement(_metrics(scene, pairs, answers, errors), notes=notes)
+        return Judgement(_metrics(scene, pairs, answers, errors), notes, [_plot(errors)])
 
 
 def _seeds(options: ReportOptions) -> int:
@@ -165,3 +168,15 @@ def _direction(F: F64, middle: F64, spread: float) -> F64:
     e = epipoles(F)[0]
     moved = np.array([e[0] - middle[0] * e[2], e[1] - middle[1] * e[2], spread * e[2]])
     return np.asarray(moved / np.linalg.norm(moved))
+
+
+def _plot(errors: Mapping[str, F64 | None]) -> Plot:
+    """Plot the sorted errors of every method."""
+    traces = []
+    for name, found in errors.items():
+        if found is not None:
+            x = np.sort(np.minimum(found.ravel(), NONE_PX))
+            share = 100.0 * np.arange(1, len(x) + 1) / len(x)
+            traces.append(scatter(name, x.tolist(), share.tolist(), "lines"))
+    log, whole, text = {"type": "log"}, {"range": [0, 100]}, "To the left is better."
+    return plot("Errors of all runs", traces, "error (px)", "runs below (%)", text, xaxis=log, yaxis=whole)

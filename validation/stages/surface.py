@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import PIL.Image
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.api.views import render
+from thesisrecon.arrays import F64, I64, U8
+from thesisrecon.camera import Camera
 from thesisrecon.config import preset
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._mesh import face_areas, surface_from_depth
 from thesisrecon.surface.model import SurfaceModel
-from validation.metrics.depth import true_depth, true_from_maps
+from validation.metrics.depth import coloured, true_depth, true_from_maps
 from validation.references.open3d_geometry import Nearest, OpenTsdf, poisson_mesh
 from validation.runs.records import (
     OURS,
     Judgement,
     Outcome,
+    Picture,
     ReportOptions,
     Stage,
     Task,
@@ -26,6 +30,7 @@ from validation.runs.records import (
     ratio,
     read_arrays,
     row,
+    slug,
 )
 from validation.runs.scenes import load_images
 from validation.runs.tables import Metric
@@ -113,6 +118,8 @@ def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> t
 
 
 TSDF, POISSON = "Open3D TSDF", "Open3D Poisson"
+RED_PCT = 1.0
+"""Distance that is red in the figures, in percent of the scene depth."""
 
 
 class SurfaceStage(Stage):
@@ -150,7 +157,16 @@ class SurfaceStage(Stage):
         text = "triangles of the surface"
         metrics = [*_metrics(scene, judged), row(scene, "faces", "", faces, text, ranked=False)]
         notes = [f"The scene is {truth.depth_m:.2f} m deep, the median over all true depth maps."]
-        return Judgement(metrics, notes=notes)
+        folder, pictures = options.folder(self.name, scene), list[Picture]()
+        camera = _camera(scene, options)
+        for name in () if options.gates_only else (OURS, TSDF, POISSON):
+            if (mesh := meshes.get(name)) is None:
+                continue
+            off_pct = 100.0 * truth.surface.distances(mesh.vertices) / truth.depth_m
+            PIL.Image.fromarray(_drawn(mesh, off_pct, camera)).save(folder / f"{slug(name)}.png")
+            text = f"View of a middle image; blue: no error, red: {RED_PCT:g} % of the depth or more."
+            pictures.append(Picture(f"{slug(name)}.png", f"Surface: {name}", text))
+        return Judgement(metrics, notes, pictures=pictures)
 
 
 def _surface(method: str, scene: str, options: ReportOptions) -> TexturedMesh:
@@ -197,3 +213,18 @@ def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[M
             row(scene, f"{what} over Open3D TSDF", "", over, "mean distance, ours over that of Open3D's grid")
         )
     return rows
+
+
+def _camera(scene: str, options: ReportOptions) -> Camera:
+    """Return the middle true camera at page size."""
+    images = load_images(scene, options)
+    K, R, C = images.cameras
+    view = len(C) // 2
+    with PIL.Image.open(images.image_paths[view]) as opened:
+        size = opened.size
+    return Camera(K[view], R[view], -R[view] @ C[view], size).scaled(640.0 / max(size))
+
+
+def _drawn(mesh: TexturedMesh, off_pct: F64, camera: Camera) -> U8:
+    """Render the surface coloured by the vertex errors."""
+    return render(replace(mesh, colors=coloured(off_pct / RED_PCT)), camera, background=(245, 247, 250)).color

@@ -21,12 +21,15 @@ from validation.references.triangulation import colmap_points, opencv_linear, op
 from validation.runs.records import (
     Judgement,
     Outcome,
+    Plot,
     ReportOptions,
     Stage,
     Task,
     each,
+    plot,
     read_arrays,
     row,
+    scatter,
 )
 from validation.runs.tables import Metric
 from validation.scenes.rigs import SCENES, DrawnRig, draw_rig, squared_distances
@@ -40,6 +43,7 @@ ADJUSTED = "ours (cameras too)"
 MOVED = 1e-3
 """Relative perturbation of camera entries before the adjustment, about a pixel."""
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
+NOISES_PX = (0.5, 1.0, 2.0)
 POINTS = 400
 Method = Callable[[F64, F64], F64]
 
@@ -100,7 +104,7 @@ class TriangulationStage(Stage):
         spent = each(found, lambda f: 1e6 * float(np.median(f["seconds"])))
         text = "two views, one processor, median"
         metrics.append(row(scene, "time a point", "us", spent, text, judged=OURS))
-        return Judgement(metrics)
+        return Judgement(metrics, plots=[_plot(problems, found)])
 
 
 def _adjusted(problem: Problem, seed: int) -> tuple[F64, F64]:
@@ -140,7 +144,7 @@ def _solver(method: str, views: int) -> Method | None:
 
 def _problems(options: ReportOptions) -> Iterator[Problem]:
     trials = 1 if options.quick else 4
-    for scene, sigma, projective, trial in product(SCENES, (0.5, 1.0, 2.0), (False, True), range(trials)):
+    for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(trials)):
         rng = np.random.default_rng([options.seed, trial])
         frame: Group = "projective" if projective else "metric"
         drawn = draw_rig(scene, sigma, frame, rng, POINTS)
@@ -207,3 +211,22 @@ def _least_near_truth(problem: Problem) -> F64:
         N = N + damping[:, None, None] * np.einsum("naa->na", N)[:, :, None] * np.eye(3)
         trial = X - np.linalg.solve(N, g[:, :, None])[..., 0]
     return np.asarray(homogenize(X) @ problem.G.T)
+
+
+def _plot(problems: list[Problem], found: Mapping[str, Mapping[str, F64] | None]) -> Plot:
+    """Plot the error in space over noise: two views, metric frame."""
+    traces = []
+    for name, answers in found.items():
+        if answers is None:
+            continue
+        y = []
+        for sigma in NOISES_PX:
+            errors = [
+                p.errors_pct(answers[f"{n}"])
+                for n, p in enumerate(problems)
+                if p.sigma_px == sigma and not p.projective and len(p.P) == 2 and f"{n}" in answers
+            ]
+            y.append(float(np.median(np.concatenate(errors))))
+        traces.append(scatter(name, NOISES_PX, y, "lines+markers"))
+    zero = {"rangemode": "tozero"}
+    return plot("Two views, metric frame", traces, "noise (px)", "median error in space (%)", yaxis=zero)

@@ -22,7 +22,7 @@ from thesisrecon.views.tensor import CalibratedPair, camera_at, default_intrinsi
 from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
-from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task, Values, row
+from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, Values, row
 from validation.runs.tables import Metric
 from validation.scenes.real import read_rgb
 from validation.scenes.stereo import read_disparity, stereo_folder
@@ -152,7 +152,7 @@ class ViewInterpolationStage(Stage):
                 difference = "difference of the means"
                 metrics.append(row(scene, f"{what}PSNR over {name}", "dB", over, difference, more=True))
         metrics += [_of_view(scene, k, cones, made) for k in (*BETWEEN, *BEYOND)]
-        return Judgement(metrics)
+        return Judgement(metrics, pictures=_beside(options.folder(self.name, scene), cones, made))
 
 
 def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> Metric:
@@ -166,6 +166,17 @@ def _of_view(scene: str, k: int, cones: NineViews, made: Mapping[str, Mapping[in
     }
     text = f"without {BORDER_PX} columns at the borders" if beyond else "of this view alone"
     return row(scene, f"PSNR, view {k}", "dB", values, text, more=True, judged=TENSOR if beyond else OURS)
+
+
+def _beside(folder: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]) -> list[Picture]:
+    shown = []
+    for k, picture in made[OURS].items():
+        wanted = cones.images[k]
+        apart = np.clip(128.0 + 4.0 * (picture.astype(np.float32) - wanted), 0.0, 255.0).astype(np.uint8)
+        PIL.Image.fromarray(np.concatenate([wanted, picture, apart], axis=1)).save(_file(folder, k))
+        text = "The image, ours, and four times the difference from middle grey."
+        shown.append(Picture(_file(folder, k).name, f"View {k}", text))
+    return shown
 
 
 def _cones() -> NineViews:

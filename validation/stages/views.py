@@ -16,16 +16,20 @@ from thesisrecon.records import DepthMap, PinholeView, RenderedView, TexturedMes
 from thesisrecon.surface._texture_blending import depth_buffers, prepare_views
 from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, ssim
-from validation.references.open3d_geometry import OpenTsdf
-from validation.runs.records import OURS, Judgement, Outcome, ReportOptions, Stage, Task, each, row
+from validation.metrics.depth import coloured
+from validation.references.open3d_geometry import OpenTsdf, render_open3d
+from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, each, row
 from validation.runs.scenes import load_images
 from validation.runs.tables import Metric
 from validation.stages.depth import COURTYARD, our_maps, read_maps, views_of
 
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
+OWN_PICTURE = "Open3D TSDF, 1 px, its own image"
 VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
 SCENES = (COURTYARD, "Herz-Jesus-P8")
 LEFT_OUT, QUICK_LEFT_OUT = 2, 1
+RED_LEVELS = 64.0
+"""Difference in grey levels that is red in the figures."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,10 @@ class ViewsStage(Stage):
         "their depth map nor their colours go into a model. (Other depth maps were matched with them, for "
         "all alike.) Ours is textured; Open3D's is its grid of truncated signed distances with coloured "
         "vertices, from the same depth maps and images, once with exposures equalised by our gains. All "
-        "are drawn by our renderer at the left-out camera and compared over the pixels that all cover "
-        "whole. The exposure of a left-out image is unknown: each rendering is first multiplied by the best "
-        "factor of each channel."
+        "are drawn by our renderer at the left-out camera, Open3D's finer one "
+        "(but for a quick report) also by its own, and compared over the pixels that all cover whole. The "
+        "exposure of a left-out image is unknown: each rendering is first multiplied by the best factor of "
+        "each channel."
     )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
@@ -78,18 +83,35 @@ class ViewsStage(Stage):
             drawn = render(mesh, camera)
             _save(folder / f"{k:04d}.png", drawn.color)
             _save(folder / f"{k:04d}-covered.png", np.where(drawn.valid, 255, 0).astype(np.uint8))
+            if task.method == FINE and not options.quick:
+                try:
+                    _save(folder / f"{k:04d}-own.png", render_open3d(mesh, camera))
+                except RuntimeError as error:
+                    print(f"Open3D cannot draw here: {error}")
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         views = views_of(load_images(scene, options), options)
         left_out = _left_out(sorted(read_maps(options.folder("depth", scene, OURS))), options)
+        folder, pictures = options.folder(self.name, scene), list[Picture]()
         found: dict[str, list[Likeness]] = {}
         for k in left_out:
             drawn = _drawn(outcomes, k)
-            for name, one in compare(views[k], drawn)[0].items():
+            scores, compared = compare(views[k], drawn)
+            for name, one in scores.items():
                 found.setdefault(name, []).append(one)
+            shown = {n: drawn[n].color for n in (OURS, FINE, OWN_PICTURE) if n in drawn}
+            file = f"left-out-{k:02d}.png"
+            _save(folder / file, _beside(views[k].rgb, shown, compared))
+            text = (
+                f"The image, then {'; '.join(shown)}; below the differences, blue (none) to red "
+                f"({RED_LEVELS:g} grey levels or more), black where not compared."
+            )
+            pictures.append(Picture(file, f"Image {k + 1}, left out", text))
+        names = [*outcomes, *([OWN_PICTURE] if OWN_PICTURE in found else [])]
         numbers = ", ".join(str(k + 1) for k in left_out)
         notes = [f"Left out: image{'s' * (len(left_out) > 1)} {numbers}."]
-        return Judgement(_metrics(scene, {n: _mean(found.get(n)) for n in outcomes}), notes)
+        metrics = _metrics(scene, {n: _mean(found.get(n)) for n in names})
+        return Judgement(metrics, notes, pictures=pictures)
 
 
 def _left_out(views: Sequence[int], options: ReportOptions) -> list[int]:
@@ -146,7 +168,9 @@ def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView
             continue
         covered = _read(folder / f"{view:04d}-covered.png") > 0
         depth = np.full(covered.shape, np.nan, dtype=np.float32)
-        drawn[name] = RenderedView(_read(folder / f"{view:04d}.png"), depth, covered)
+        for method, end in ((name, ""), (OWN_PICTURE, "-own")):
+            if (file := folder / f"{view:04d}{end}.png").is_file():
+                drawn[method] = RenderedView(_read(file), depth, covered)
     return drawn
 
 
@@ -176,6 +200,17 @@ def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
         text = f"{metric.name} of ours minus the best of Open3D's"
         rows.append(row(scene, f"{metric.name} over Open3D", metric.unit, over, text, more=True))
     return rows
+
+
+def _beside(rgb: U8, shown: Mapping[str, U8], compared: B8) -> U8:
+    """Draw the image and renderings in a row, exposure-compensated differences below."""
+    above, below = [rgb], [np.zeros_like(rgb)]
+    for color in shown.values():
+        equal = match_exposure(rgb, color, compared)
+        off = np.abs(equal.astype(np.float64) - rgb).mean(axis=2) / RED_LEVELS
+        above.append(equal)
+        below.append(coloured(np.where(compared, off, np.nan)))
+    return np.concatenate([np.concatenate(above, axis=1), np.concatenate(below, axis=1)])
 
 
 def _save(path: Path, picture: U8) -> None:
