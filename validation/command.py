@@ -160,7 +160,8 @@ def _print_gates(results: Results) -> None:
 def run_all(out: Path) -> int:
     """Make every table of the documentation, each in its own folder: all studies with the options of
     the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
-    code is the largest."""
+    code is the largest.
+    """
     runs: dict[str, Callable[[], int]] = {}
     for name in MODULES:
         for number, options in enumerate(OF_PAGES.get(name, [[]])):

@@ -31,10 +31,12 @@ Verdict = Literal["better", "worse", "negligible", "no difference shown", "no sa
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a variant with another under one condition, by one measure. ``interval`` holds
-    differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported` returns quotients).
-    ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from it, "negligible"
-    where the whole interval is, and "no sample" where there is no interval."""
+    """Comparison of a variant with another under one condition, by one measure.
+
+    ``interval`` holds differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported`
+    returns quotients). ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from
+    it, "negligible" where the whole interval is, and "no sample" where there is no interval.
+    """
 
     measure: Measure
     variant: str
@@ -49,7 +51,8 @@ class Comparison:
 @dataclass(frozen=True)
 class Cell:
     """Summary of a variant under a condition: mean and median of a measure over the rows that have it, number
-    of rows and failures, median cost (s), mean rank (1 is best) and whether it is Pareto-optimal."""
+    of rows and failures, median cost (s), mean rank (1 is best) and whether it is Pareto-optimal.
+    """
 
     measure: Measure
     variant: str
@@ -259,7 +262,8 @@ def failures_of(rows: Iterable[Row]) -> list[Failure]:
 
 def _measure_text(analysis: Analysis, measure: Measure) -> str:
     """A row for each variant. Under one condition: its mean, its difference from the baseline and, in a
-    ladder, from the step before. Under several: the means, bold if significantly better, italic if worse."""
+    ladder, from the step before. Under several: the means, bold if significantly better, italic if worse.
+    """
     plan = analysis.plan
     cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
     found = {(c.variant, c.condition): c for c in analysis.comparisons if c.measure == measure}

@@ -24,8 +24,10 @@ LOST = "the worker process of this row was killed or ran out of memory"
 
 @dataclass(frozen=True)
 class Row:
-    """A finished row: its place in the study and its outcome. ``cost_s`` is the processor time (s) of the row
-    including shared steps."""
+    """A finished row: its place in the study and its outcome.
+
+    ``cost_s`` is the processor time (s) of the row including shared steps.
+    """
 
     key: str
     variant: str

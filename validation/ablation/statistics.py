@@ -33,10 +33,12 @@ RESAMPLES = 4999
 @dataclass(frozen=True)
 class Interval:
     """The mean of paired differences, its 95 % interval and two-sided p, and the effect size: the mean over
-    the standard deviation of a sampled value, with Hedges' correction for few. ``count`` values of ``sample``
-    ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts the differences. All but the
-    mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES`` scenes, or draws that change
-    nothing."""
+    the standard deviation of a sampled value, with Hedges' correction for few.
+
+    ``count`` values of ``sample`` ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts
+    the differences. All but the mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES``
+    scenes, or draws that change nothing.
+    """
 
     mean: float
     low: float

@@ -21,9 +21,11 @@ Axis = Sequence[Any] | Mapping[str, Changes]
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that rows report. ``better`` is "less" or "more". With ``ratio`` values are compared by
-    quotients, for errors of different magnitude above zero; a quotient within ``negligible`` of 1 is called
-    negligible."""
+    """A number that rows report.
+
+    ``better`` is "less" or "more". With ``ratio`` values are compared by quotients, for errors of different
+    magnitude above zero; a quotient within ``negligible`` of 1 is called negligible.
+    """
 
     name: str
     unit: str = ""

@@ -26,9 +26,12 @@ ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
 
 @dataclass(frozen=True)
 class Outcome:
-    """``metrics`` are its numbers; ``failure`` is the error message or empty. ``seconds`` is its wall time,
+    """Result of a row.
+
+    ``metrics`` are its numbers; ``failure`` is the error message or empty. ``seconds`` is its wall time,
     ``cpu_s`` its processor time; ``steps`` are the keys of reused shared steps. ``lost``: the process ended
-    before the row."""
+    before the row.
+    """
 
     metrics: Mapping[str, float] = field(default_factory=dict)
     failure: str = ""

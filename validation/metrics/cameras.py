@@ -24,10 +24,12 @@ class TrueCameras:
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the registered cameras; None if they are too few to be aligned. ``focal_error_pct``: median
-    over views of |f / f_true - 1|, f the geometric mean of fx and fy. ``principal_point_error_px``: median
-    distance. ``centre_error``: mean distance after the least-squares similarity, in the truth's unit.
-    ``rotation_error_deg``: median angle after the common rotation is off."""
+    """Errors of the registered cameras; None if they are too few to be aligned.
+
+    ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
+    ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares
+    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is off.
+    """
 
     focal_error_pct: float
     principal_point_error_px: float

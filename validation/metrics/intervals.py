@@ -85,7 +85,8 @@ def join_scores(scores: Sequence[IntervalScores]) -> IntervalScores:
 
 def holding_std(scores: Sequence[IntervalScores], columns: Sequence[int]) -> float:
     """Standard deviation of the share of intervals that hold the truth, of several scenes: the cameras of one
-    scene err together, so that it is scenes that count (Cochran 1977, the ratio estimate of clusters)."""
+    scene err together, so that it is scenes that count (Cochran 1977, the ratio estimate of clusters).
+    """
     held = [np.abs(s.z[:, list(columns)]) for s in scores]
     held = [z[np.isfinite(z)] <= LEVEL for z in held]
     total, share = sum(map(len, held)), float(np.mean(np.concatenate(held)))

@@ -26,8 +26,10 @@ class NoReference(ImportError):
 
 
 class Library:
-    """The library ``module``, imported when something of it is first used. Every use raises
-    :class:`NoReference` if it cannot be had."""
+    """The library ``module``, imported when something of it is first used.
+
+    Every use raises :class:`NoReference` if it cannot be had.
+    """
 
     def __init__(self, module: str) -> None:
         self._module = module

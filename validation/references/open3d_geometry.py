@@ -104,7 +104,9 @@ def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
 @dataclass(frozen=True)
 class OpenTsdf:
     """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
-    ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it."""
+
+    ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it.
+    """
 
     voxel_px: float = 1.5
 

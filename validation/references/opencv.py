@@ -69,8 +69,10 @@ MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MOD
 @dataclass(frozen=True)
 class OpenCVSemiGlobal:
     """``cv2.StereoSGBM`` on colour, block 3, P1 = 216, P2 = 864, with its checks; ``mode`` one of ``MODES``.
-    It has no disparities for the left columns that a disparity of the range would take out of the image. With
-    ``widened`` the images are repeated to the left so that it has them."""
+
+    It has no disparities for the left columns that a disparity of the range would take out of the image.
+    With ``widened`` the images are repeated to the left so that it has them.
+    """
 
     mode: str
     widened: bool = True

@@ -15,11 +15,15 @@ from validation.runs.tables import Metric
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
-    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no
-    gate needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
+    """Options of a report.
+
+    ``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
+    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no gate
+    needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
     ``side_px``: long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose
-    references are reused, or empty. ``stages_from``: module of ``STAGES``."""
+    references are reused, or empty.
+    ``stages_from``: module of ``STAGES``.
+    """
 
     out: Path
     scenes: tuple[str, ...]
@@ -101,10 +105,13 @@ class Judgement:
 
 
 class Stage(Protocol):
-    """A stage of the library and its references. ``definition`` states the comparison in one sentence.
-    ``takes`` returns whether the stage can work on a scene; ``methods`` the methods there; ``needs`` the
-    (stage, method) results that a method, or the judgement (empty ``method``), reads. ``run`` computes a task
-    and saves its result; ``judge`` reads all results and recomputes every number."""
+    """A stage of the library and its references.
+
+    ``definition`` states the comparison in one sentence. ``takes`` returns whether the stage can work on a
+    scene; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the
+    judgement (empty ``method``), reads. ``run`` computes a task and saves its result; ``judge`` reads all
+    results and recomputes every number.
+    """
 
     name: str
     title: str

@@ -22,10 +22,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Metric:
-    """One row of a table: a number on a scene, by ours and the references, with its target. ``values`` maps
-    methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper one with
-    ``at_most``; without it the row is only reported. ``definition`` states the number in one line. Neither
-    side of a number that is not ``ranked`` is better, such as a count of faces."""
+    """One row of a table: a number on a scene, by ours and the references, with its target.
+
+    ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
+    one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
+    Neither side of a number that is not ``ranked`` is better, such as a count of faces.
+    """
 
     scene: str
     name: str

@@ -24,10 +24,13 @@ from validation.scenes.pose import Pose
 @dataclass(frozen=True)
 class Surface:
     """A chart in the world: ``origin`` (3,), unit ``u_axis`` and ``v_axis``, ``size`` (u, v) metres, its
-    ``material``. A plane's normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs
-    around it once over the whole width of the map. ``disc`` > 0 keeps of a plane only what lies within that
-    radius of its middle. ``flat`` takes the relief for shading only (faces of boxes, so that their edges
-    close). ``offset`` is where on the map (0, 0) lies."""
+    ``material``.
+
+    A plane's normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs around it once
+    over the whole width of the map. ``disc`` > 0 keeps of a plane only what lies within that radius of its
+    middle. ``flat`` takes the relief for shading only (faces of boxes, so that their edges close). ``offset``
+    is where on the map (0, 0) lies.
+    """
 
     origin: F64
     u_axis: F64

@@ -34,8 +34,11 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 @dataclass(frozen=True)
 class Scene:
-    """A set of images, sorted by name, and its truth where there is one. ``K``, ``R`` (world-to-camera) (V,
-    3, 3) and ``C`` (V, 3) camera centres in metres, all None without truth."""
+    """A set of images, sorted by name, and its truth where there is one.
+
+    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without
+    truth.
+    """
 
     name: str
     image_paths: tuple[Path, ...]

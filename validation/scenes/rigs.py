@@ -25,7 +25,8 @@ class Rig:
     """``K, R`` (V, 3, 3), R world-to-camera, ``C`` (V, 3), ``X`` (N, 3), ``seen`` (V, N) whether a view may
     see a point (the border of the image is checked besides), ``size`` of every image; ``flat`` (V,) views
     whose points lie on one plane, which leaves a projective camera open; ``plane`` (N,) number of the plane
-    that a point lies on, where points lie on planes."""
+    that a point lies on, where points lie on planes.
+    """
 
     K: F64
     R: F64
@@ -126,8 +127,10 @@ SEEN = 0.75
 
 
 def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Rig:
-    """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40
-    degrees."""
+    """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40 degrees.
+
+    The principal point is off the image's middle by a normal deviate of half a percent of the long side.
+    """
     X = rng.uniform([-2.0, -1.5, -1.6], [2.0, 1.5, 1.6], (points, 3))
     angles = rng.uniform([-0.7, -0.35], [0.7, 0.35], (views, 2))
     azimuth, height = angles.T
@@ -192,9 +195,12 @@ def squared_distances(P: F64, X: F64, xy: F64) -> F64:
 
 @dataclass(frozen=True)
 class DrawnRig:
-    """``G`` (4, 4): transform of space; ``P`` (V, 3, 4): cameras in the transformed frame; ``xy`` (V, N, 2):
+    """One draw.
+
+    ``G`` (4, 4): transform of space; ``P`` (V, 3, 4): cameras in the transformed frame; ``xy`` (V, N, 2):
     noisy pixels; ``X`` (N, 3): true points before the transform; ``centre`` (3,): centre of the first
-    camera."""
+    camera.
+    """
 
     G: F64
     P: F64

@@ -23,7 +23,8 @@ PER_PIXEL = 2
 @dataclass(frozen=True)
 class Sensor:
     """An ordinary camera. ``blur_px`` Gaussian point spread (before the pixel's own square), ``vignetting``
-    loss of light at the corner, ``full_well`` electrons at white, ``read_noise`` electrons."""
+    loss of light at the corner, ``full_well`` electrons at white, ``read_noise`` electrons.
+    """
 
     blur_px: float = 0.42
     vignetting: float = 0.16

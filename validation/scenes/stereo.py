@@ -20,7 +20,8 @@ STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
 class StereoPair:
     """``left, right`` (H, W, 3), ``truth`` (H, W) disparity of the left image, NaN where there is none,
     ``judged`` (H, W) pixels that have truth and are seen by both cameras; the range is
-    0 .. ``disparities`` - 1."""
+    0 .. ``disparities`` - 1.
+    """
 
     name: str
     left: U8

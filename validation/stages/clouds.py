@@ -113,8 +113,10 @@ def _pairs_of_clouds(
 def _common_frame(
     scene: Scene, ours: Reconstruction, theirs: Reconstruction
 ) -> tuple[F64, F64, float] | None:
-    """Return both clouds (N, 3), (M, 3) in the true frame, or theirs without truth, and the median
-    distance of the points from the cameras."""
+    """Return both clouds (N, 3), (M, 3) in a common frame, and the median distance of points from cameras.
+
+    The frame is the true one, or theirs without truth.
+    """
     both = ours.registered & theirs.registered
     if both.sum() < 3:
         return None

@@ -108,8 +108,11 @@ def asked_for(points: F64, scene: Scene) -> I64:
 
 
 def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> tuple[F64, F64]:
-    """Accuracy and completeness of a surface in the true frame, as distances in percent of the scene's
-    depth."""
+    """Accuracy and completeness of a surface in the true frame, as distances in percent of the scene's depth.
+
+    Accuracy: from points spread evenly over the surface, where at least two images could show them, to
+    the true one. Completeness: from true points that two images show to the surface.
+    """
     points = points_on(mesh, samples)
     points = points[asked_for(points, truth.scene) >= 2]
     unit = 100.0 / truth.depth_m

@@ -43,10 +43,13 @@ COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one method on one scene. ``reconstruction``: none after a failure; ``wall_s``, ``seconds``:
-    the time that counts, and its parts; ``cpu_s``: processor time of the whole process; ``failure``: message
-    of the failure; ``reasons``: unregistered image -> reason that the method gives; ``claimed_rms_px``:
-    reprojection error that the method states."""
+    """Result of one method on one scene.
+
+    ``reconstruction``: none after a failure; ``wall_s``, ``seconds``: the time that counts, and its parts;
+    ``cpu_s``: processor time of the whole process; ``failure``: message of the failure; ``reasons``:
+    unregistered image -> reason that the method gives; ``claimed_rms_px``: reprojection error that the
+    method states.
+    """
 
     reconstruction: Reconstruction | None
     wall_s: float

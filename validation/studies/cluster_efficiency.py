@@ -55,8 +55,10 @@ class Task:
 
 @dataclass
 class Matching:
-    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair. ``corners``:
-    their number in each view, which bounds the batches."""
+    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair.
+
+    ``corners``: their number in each view, which bounds the batches.
+    """
 
     views: dict[int, Task] = field(default_factory=dict)
     pairs: dict[tuple[int, int], Task] = field(default_factory=dict)

@@ -48,8 +48,11 @@ PLANAR_OR_TURNTABLE = (Motion.TURNTABLE, Motion.PLANAR)
 
 @dataclass(frozen=True)
 class Trial:
-    """``named``: reported critical motion, empty for none; ``identifiable``: whether the focal length is
-    reported as identifiable; ``focal_error``: |log f / f_true| of the median view, NaN without an answer."""
+    """One scene.
+
+    ``named``: reported critical motion, empty for none; ``identifiable``: whether the focal length is
+    reported as identifiable; ``focal_error``: |log f / f_true| of the median view, NaN without an answer.
+    """
 
     named: str
     identifiable: bool

@@ -49,8 +49,11 @@ THRESHOLD_PX, MATCHED_SIGMAS = 1.0, 3.0
 
 @dataclass(frozen=True)
 class Method:
-    """A named estimator of F. ``name``: name in the tables; ``estimate``: the estimator; ``robust``: whether
-    it accepts wrong matches; ``thresholded``: whether it uses the inlier threshold."""
+    """A named estimator of F.
+
+    ``name``: name in the tables; ``estimate``: the estimator; ``robust``: whether it accepts wrong matches;
+    ``thresholded``: whether it uses the inlier threshold.
+    """
 
     name: str
     estimate: Estimate
@@ -150,9 +153,12 @@ class Setting:
 
 @dataclass(frozen=True)
 class Result:
-    """``matched_threshold``: whether the inlier threshold is :data:`MATCHED_SIGMAS` times the noise;
+    """One method in one setting.
+
+    ``matched_threshold``: whether the inlier threshold is :data:`MATCHED_SIGMAS` times the noise;
     ``rms_ratio``, ``median_ratio``: distance of the exact points over the bound, over all trials with an F;
-    ``time_ms``: median processor time; ``failures``, ``trials``: trials without an F, and all trials."""
+    ``time_ms``: median processor time; ``failures``, ``trials``: trials without an F, and all trials.
+    """
 
     method: str
     setting: Setting

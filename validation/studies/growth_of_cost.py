@@ -74,10 +74,13 @@ class Meter:
 
 @dataclass(frozen=True)
 class Cost:
-    """``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
+    """One number of images.
+
+    ``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
     matches, cameras and points; ``focal_error_rel``, ``centre_error_rel``: of the true focal length and of
     the extent of the true centres; ``failure``: message of a run without cameras; ``colmap``: the same of
-    COLMAP."""
+    COLMAP.
+    """
 
     images: int
     cpu_s: Mapping[str, float]

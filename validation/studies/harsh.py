@@ -35,7 +35,8 @@ from validation.studies.subsets import Matched, solve
 class HarshSet:
     """True cameras ``K, R`` (V, 3, 3), ``C`` (V, 3), points ``X`` (N, 3); ``lens`` (k1, k2); observation
     errors (``sigma_px``, share of ``wrong`` matches, share of points ``moving`` with an object); and the
-    camera assumption ``cameras``."""
+    camera assumption ``cameras``.
+    """
 
     K: F64
     R: F64
@@ -233,9 +234,12 @@ OFF = 0.03
 
 @dataclass(frozen=True)
 class Trial:
-    """``outcome``: "refused", "not trusted" or "trusted"; ``worst``, ``median``: relative focal errors of the
+    """One set and its outcome.
+
+    ``outcome``: "refused", "not trusted" or "trusted"; ``worst``, ``median``: relative focal errors of the
     registered cameras; ``silent``: cameras that err by more than 3 % and by more than their 95 % intervals;
-    ``failed_checks``: failed checks, or the refusal."""
+    ``failed_checks``: failed checks, or the refusal.
+    """
 
     number: int
     outcome: str

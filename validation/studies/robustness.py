@@ -165,9 +165,12 @@ def kill_table(rows: Sequence[Kill]) -> str:
 
 @dataclass(frozen=True)
 class Stop:
-    """``seconds``: from the signal to the end; ``code``, ``message``: exit code and error stream; ``left``:
+    """An interrupted run.
+
+    ``seconds``: from the signal to the end; ``code``, ``message``: exit code and error stream; ``left``:
     processes left behind; ``kept``: finished stage files; ``different``: outputs that differ after the
-    resume."""
+    resume.
+    """
 
     when: str
     seconds: float
@@ -285,8 +288,11 @@ def stop_table(rows: Sequence[Stop], asked: signal.Signals) -> str:
 
 @dataclass(frozen=True)
 class Refusal:
-    """``when``: where the disk was full or read-only; ``code``, ``message``: exit code and error stream;
-    ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume."""
+    """A run that could not write.
+
+    ``when``: where the disk was full or read-only; ``code``, ``message``: exit code and error stream;
+    ``strange``: files that a whole run does not have; ``different``: outputs that differ after the resume.
+    """
 
     when: str
     code: int

@@ -37,8 +37,11 @@ SHIFTED_REASONS = ("pure translation", "not determine the focal length", "at lea
 
 @dataclass(frozen=True)
 class Matched:
-    """An image set after its front end. ``sizes`` (V, 2): image sizes; ``focal_px`` (V,): true focal lengths
-    at working size; ``reasons``: accepted reasons of a refusal; empty if any reason will do."""
+    """An image set after its front end.
+
+    ``sizes`` (V, 2): image sizes; ``focal_px`` (V,): true focal lengths at working size; ``reasons``:
+    accepted reasons of a refusal; empty if any reason will do.
+    """
 
     name: str
     tracks: Tracks
@@ -55,9 +58,12 @@ an answer) for an accepted reason or another one; within 3 % and not trusted; wr
 
 @dataclass(frozen=True)
 class Trial:
-    """``median_pct``, ``worst_pct``: focal errors over the registered cameras, NaN without an answer;
+    """One subset and its outcome.
+
+    ``median_pct``, ``worst_pct``: focal errors over the registered cameras, NaN without an answer;
     ``failed_checks``: empty if the answer is trusted; ``interval_pct``: half of the median 95 % interval of
-    the focal lengths."""
+    the focal lengths.
+    """
 
     number: int
     views: tuple[int, ...]

@@ -1,11 +1,13 @@
 """The pages of a report as a browser shows them."""
 
+import numpy as np
+import PIL.Image
 import pytest
 
 from tests.report.synthetic import Witness
 from tests.validation.runs.toy_stages import STAGES, WAYS
 from validation.runs.page import write_pages
-from validation.runs.records import Judgement, Outcome, ReportOptions
+from validation.runs.records import Judgement, Outcome, Picture, Plot, ReportOptions
 from validation.runs.results import Gate, collect
 from validation.runs.tables import Metric
 
@@ -16,7 +18,7 @@ EVIL = "<img src=x onerror=alert(1)>"
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
-    """A report of two numbers, one of which breaks its gate, and a note."""
+    """A report of two numbers, one of which breaks its gate, with a flat and a solid plot and a picture."""
     out = tmp_path_factory.mktemp("pages")
     options = ReportOptions(out, ("yard",), ("toy",))
     values = dict.fromkeys(WAYS, 1.5)
@@ -24,7 +26,19 @@ def pages(tmp_path_factory):
         Metric("yard", "wheels, lost", "px", values, "ours", definition=EVIL),
         Metric("yard", EVIL, "%", {"ours": 3.0}, "ours"),
     ]
-    judgement = Judgement(metrics, [EVIL])
+    xyz = np.random.default_rng(0).normal(size=(3, 60)).round(3).tolist()
+    solid = {
+        "data": [{"type": "scatter3d", "mode": "markers", **dict(zip("xyz", xyz, strict=True))}],
+        "layout": {"scene": {}},
+    }
+    flat = {
+        "data": [{"type": "scatter", "y": [1, 3, 2], "line": {"color": "#d01010", "width": 6}}],
+        "layout": {},
+    }
+    options.folder("toy", "yard").mkdir(parents=True)
+    PIL.Image.new("RGB", (40, 30), (10, 10, 200)).save(options.folder("toy", "yard") / "blue.png")
+    pictures = [Picture("blue.png", EVIL, EVIL)]
+    judgement = Judgement(metrics, [EVIL], [Plot("Flat", flat), Plot("Solid", solid)], pictures)
     failed = Outcome(out, EVIL)
     judged = {("toy", "yard"): (judgement, {"ours": Outcome(out), "crashing": failed})}
     gates = {"toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, EVIL)}
@@ -34,7 +48,7 @@ def pages(tmp_path_factory):
 
 @pytest.fixture(scope="module", params=[1300, 420], ids=["desktop", "narrow"])
 def scene(request, browser, pages):
-    opened = Witness(browser, pages / "scene-yard.html", request.param, drawn=())
+    opened = Witness(browser, pages / "scene-yard.html", request.param, drawn=("plot-toy-0", "plot-toy-1"))
     yield opened
     opened.context.close()
 
@@ -55,6 +69,16 @@ def test_input_text_is_shown_unchanged(scene):
     assert scene.page.locator("img[src='x']").count() == 0
     assert EVIL in scene.page.locator("tbody").first.inner_text()
     assert EVIL in scene.page.locator("#failures").inner_text()
+
+
+def test_the_page_fits_the_screen(scene):
+    assert scene.page.evaluate("document.documentElement.scrollWidth") <= scene.page.viewport_size["width"]
+
+
+def test_the_plots_and_pictures_are_drawn(scene):
+    red, blue = (scene.pixels(place).astype(int) for place in ("#plot-toy-0", ".scene-pictures img"))
+    assert ((red[..., 0] > 180) & (red[..., 1] < 90) & (red[..., 2] < 90)).sum() > 200
+    assert np.median(blue[..., 2]) > 180 > np.median(blue[..., 0])
 
 
 def test_the_whole_leads_to_the_scene(browser, pages):

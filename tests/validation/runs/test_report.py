@@ -126,6 +126,7 @@ def test_the_pages_escape_their_input(ran):
     assert "crashed with signal 11" in text
     page = scene.read_text(encoding="utf-8")
     assert "A &lt;/script&gt; note." in page
+    assert "data:image/jpeg;base64," in page
     # Without plotly's own script.
     markup = "".join(html.split("<script>")[0] for html in (text, page))
     assert not re.search(r'(?:src|href)="(?!data:|#|scene-|index)', markup)

@@ -6,8 +6,10 @@ import shutil
 import signal
 import time
 
+import PIL.Image
+
 from thesisrecon.errors import StageFailure
-from validation.runs.records import Judgement
+from validation.runs.records import Judgement, Picture, Plot
 from validation.runs.tables import Metric
 
 VALUES = {"ours": 0.5, "good": 2.0, "after": 4.0}
@@ -54,7 +56,9 @@ class ToyStage:
             Metric(scene, "wheels, lost", "px", values, "ours", definition='"less" is <better>'),
             Metric(scene, "time", "s", {"ours": time.time()}, "ours"),
         ]
-        return Judgement(metrics, ["A </script> note."])
+        PIL.Image.new("RGB", (40, 30), (200, 10, 10)).save(options.folder(self.name, scene) / "red.png")
+        plots = [Plot("Wheels", {"data": [{"type": "scatter", "y": [1, 2]}], "layout": {}})]
+        return Judgement(metrics, ["A </script> note."], plots, [Picture("red.png", "Red")])
 
 
 STAGES = {"toy": ToyStage()}

@@ -92,8 +92,10 @@ class Cell:
 @dataclass(frozen=True)
 class CalibrationOverNoise(Task):
     """``views`` cameras of the cube or of a cloud with Gaussian noise of ``noise_px``, handed to the
-    self-calibration as the minimum of the projective bundle adjustment in a random frame. ``mode`` is
-    "constant" (one focal length) or "zooming". With ``bundle`` the metric stage follows."""
+    self-calibration as the minimum of the projective bundle adjustment in a random frame.
+
+    ``mode`` is "constant" (one focal length) or "zooming". With ``bundle`` the metric stage follows.
+    """
 
     noise_px: float = 1.0
     views: int = 9

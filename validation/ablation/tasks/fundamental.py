@@ -27,9 +27,11 @@ OF_CONFIG = "epipolar of the configuration"
 @dataclass(frozen=True)
 class FundamentalOfCube(Task):
     """``pairs`` pairs of the 27 cameras, drawn by the seed, with Gaussian noise of ``noise_px`` and a share
-    ``outliers`` of matches thrown anywhere. ``method`` is one of the catalogue of methods of F; "epipolar of
-    the configuration" is the variant of that stage, whose threshold is its own. ``iterations`` and the like
-    are then paths of that stage."""
+    ``outliers`` of matches thrown anywhere.
+
+    ``method`` is one of the catalogue of methods of F; "epipolar of the configuration" is the variant of that
+    stage, whose threshold is its own. ``iterations`` and the like are then paths of that stage.
+    """
 
     method: str = OF_CONFIG
     noise_px: float = 1.0

@@ -29,8 +29,10 @@ _SCENES = (*SCENES_WITH_CAMERAS, "courtyard")
 class ImagePairs(Task):
     """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side at most 1536: corners,
     matches, F and verification of the configuration, judged by correspondences of the true cameras. A row
-    whose F is wrong (error of 1 px and more) fails. The pairs of a scene are subsets of it. A yard (yard-1/0)
-    has its images in the order of their cameras."""
+    whose F is wrong (error of 1 px and more) fails.
+
+    The pairs of a scene are subsets of it. A yard (yard-1/0) has its images in the order of their cameras.
+    """
 
     gap: int = 2
 

@@ -45,11 +45,13 @@ AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Reconstruction(Task):
-    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread. A scene is one with a name, or
-    a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth if there is one; without truth the
-    errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n windows of two thirds of the images,
-    in the order of their names, spread over the scene. "yard-N" is a rendered yard with true cameras, another
-    one for each number."""
+    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
+
+    A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
+    if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
+    windows of two thirds of the images, in the order of their names, spread over the scene. "yard-N" is
+    a rendered yard with true cameras, another one for each number.
+    """
 
     until: str = "metric"
 

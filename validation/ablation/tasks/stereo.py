@@ -20,8 +20,10 @@ from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 @dataclass(frozen=True)
 class RectifiedPairs(Task):
-    """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see. "yard-N" is a
-    rendered pair, another one for each number. A subset is a window of two thirds of the rows."""
+    """``dense.pairs.matcher`` on a pair with dense truth, judged where both cameras see.
+
+    "yard-N" is a rendered pair, another one for each number. A subset is a window of two thirds of the rows.
+    """
 
     measures: ClassVar[Sequence[Measure]] = (
         Measure("bad1_pct", "%", "less", True, "pixels off by more than 1 px, holes filled along the row"),

@@ -35,8 +35,10 @@ METHODS: dict[str, Callable[[F64, F64], F64]] = {
 @dataclass(frozen=True)
 class TriangulationOverNoise(Task):
     """``points`` points of a rig drawn by the seed, seen with Gaussian noise of ``noise_px``, triangulated by
-    ``method`` in a ``frame`` of space that is "metric", "affine" or "projective". Every method meets the same
-    rig, noise and frame."""
+    ``method`` in a ``frame`` of space that is "metric", "affine" or "projective".
+
+    Every method meets the same rig, noise and frame.
+    """
 
     method: str = POLYNOMIAL
     noise_px: float = 1.0
