@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import estimate_similarity
-from thesisrecon.records import Reconstruction, Similarity
+from thesisrecon.records import Reconstruction
 from validation.references.open3d_geometry import refine_by_icp
 from validation.runs.records import (
     OURS,
@@ -35,9 +36,6 @@ from validation.stages.cameras import COLMAP, COLMAP_PP, read_model
 ICP = "Open3D, ICP"
 NEAR_PCT = 0.5
 """A point has a partner if the other cloud has a point within this share of its depth (%)."""
-PLOTTED = 6000
-SAME_PX = 1.0
-"""Points of two models are the same if observed within this distance (px)."""
 
 
 class CloudsStage(Stage):
@@ -63,85 +61,94 @@ class CloudsStage(Stage):
     def run(self, task: Task, options: ReportOptions) -> None:
         folder = options.folder(task.stage, task.scene, task.method)
         images = load_images(task.scene, options)
-        for name, (mine, other, unit) in _pairs_of_clouds(images, _models(images, options)).items():
-            transform = refine_by_icp(mine, other, NEAR_PCT / 100.0 * unit)
-            np.savez(folder / f"{slug(name)}.npz", transform=transform)
+        for name, clouds in _all_clouds(images, _models(images, options)).items():
+            np.savez(folder / f"{slug(name)}.npz", transform=clouds.refined_by_icp())
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
         models = _models(images, options)
-        ours = models[OURS]
-        if ours is None or (models[COLMAP] is None and models[COLMAP_PP] is None):
-            names = ", ".join(name for name, model in models.items() if model is None)
-            return Judgement((), notes=[f"There is no model of {names} to compare."])
-        metrics, plots = list[Metric](), list[Plot]()
-        clouds = _pairs_of_clouds(images, models)
-        for name, (mine, other, unit) in clouds.items():
-            theirs = models[name]
-            assert theirs is not None
-            metrics += _same_points(scene, name, ours, theirs, (mine, other, unit))
-            metrics += _metrics(scene, name, mine, other, unit)
-            metrics += _icp_metrics(scene, name, mine, other, unit, outcomes.get(ICP))
-            plots.append(_plot(name, mine, other, unit))
-        few = [name for name in (COLMAP, COLMAP_PP) if models[name] is not None and name not in clouds]
+        if OURS not in models or len(models) == 1:
+            names = ", ".join(name for name in (OURS, COLMAP, COLMAP_PP) if name not in models)
+            return Judgement((), [f"There is no model of {names} to compare."])
+        found = _all_clouds(images, models)
+        metrics = list[Metric]()
+        for name, clouds in found.items():
+            metrics += _same_points(scene, name, models[OURS], models[name], clouds)
+            metrics += _metrics(scene, name, clouds)
+            metrics += _icp_metrics(scene, name, clouds, outcomes.get(ICP))
+        few = [name for name in models if name not in (OURS, *found)]
         notes = [f"{name}: too few common cameras to align the clouds." for name in few]
-        return Judgement(metrics, plots, notes=notes)
+        return Judgement(metrics, notes, [_plot(name, clouds) for name, clouds in found.items()])
 
 
-def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction | None]:
-    """Return the models of the stage cameras, None if missing."""
+class Clouds(NamedTuple):
+    """Points of ours (N, 3) and of a reference (M, 3) in one frame, and their distance from the cameras.
+
+    The frame is the true one, or theirs without truth; ``unit`` is the median distance.
+    """
+
+    mine: F64
+    other: F64
+    unit: float
+
+    def refined_by_icp(self) -> F64:
+        """Return the motion (4, 4) of ours by Open3D's ICP."""
+        return refine_by_icp(self.mine, self.other, NEAR_PCT / 100.0 * self.unit)
+
+    def distances_pct(self) -> F64:
+        """Return the distance of each point of ours to the nearest of theirs."""
+        return np.asarray(100.0 * cKDTree(self.other).query(self.mine)[0] / self.unit)
+
+
+def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction]:
+    """Return the models of the stage cameras that there are."""
     models = {}
     for name in (OURS, COLMAP, COLMAP_PP):
         folder = options.folder("cameras", scene.name, name)
-        models[name] = read_model(scene, name, Outcome(folder)) if folder.is_dir() else None
+        model = read_model(scene, name, Outcome(folder)) if folder.is_dir() else None
+        if model is not None:
+            models[name] = model
     return models
 
 
-def _pairs_of_clouds(
-    scene: Scene, models: Mapping[str, Reconstruction | None]
-) -> dict[str, tuple[F64, F64, float]]:
-    """Return :func:`_common_frame` of ours and each reference cloud."""
-    ours, found = models[OURS], {}
-    for name in (COLMAP, COLMAP_PP):
-        theirs = models[name]
-        clouds = None if ours is None or theirs is None else _common_frame(scene, ours, theirs)
-        if clouds is not None:
-            found[name] = clouds
-    return found
+def _all_clouds(scene: Scene, models: Mapping[str, Reconstruction]) -> dict[str, Clouds]:
+    """Return the clouds of ours and of each reference whose cameras could be aligned."""
+    pairs = {
+        n: common_frame(scene, models[OURS], m) for n, m in models.items() if OURS in models and n != OURS
+    }
+    return {name: clouds for name, clouds in pairs.items() if clouds is not None}
 
 
-def _common_frame(
-    scene: Scene, ours: Reconstruction, theirs: Reconstruction
-) -> tuple[F64, F64, float] | None:
-    """Return both clouds (N, 3), (M, 3) in a common frame, and the median distance of points from cameras.
-
-    The frame is the true one, or theirs without truth.
-    """
+def common_frame(scene: Scene, ours: Reconstruction, theirs: Reconstruction) -> Clouds | None:
+    """Align both models by the centres of their common cameras; None if these are too few."""
     both = ours.registered & theirs.registered
     if both.sum() < 3:
         return None
-    centres = {name: _centres(model, both) for name, model in (("ours", ours), ("theirs", theirs))}
-    target = centres["theirs"] if scene.C is None else scene.C[both]
+    centres = [dehomogenize(camera_centre(model.P[both])) for model in (ours, theirs)]
+    target = centres[1] if scene.C is None else scene.C[both]
     try:
-        moves = {name: estimate_similarity(c, target) for name, c in centres.items()}
+        moves = [estimate_similarity(C, target) for C in centres]
     except ValueError:
         return None
-    mine, other = (_moved(m, moves[n]) for n, m in (("ours", ours), ("theirs", theirs)))
+    mine, other = (
+        np.asarray(move.apply(dehomogenize(model.X[model.valid])))
+        for model, move in zip((ours, theirs), moves, strict=True)
+    )
     distance = np.linalg.norm(other[:, None] - target[None], axis=2)
-    return mine, other, float(np.median(distance))
+    return Clouds(mine, other, float(np.median(distance)))
 
 
 def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
     """Return pairs (M, 2) of indices of valid points that are the same scene point.
 
-    They were seen within ``SAME_PX`` of each other in more images than any other pair of either.
+    They were seen within a pixel of each other in more images than any other pair of either.
     """
     votes: Counter[tuple[int, int]] = Counter()
     for view in np.flatnonzero(ours.registered & theirs.registered):
-        (xy1, point1), (xy2, point2) = (_is_supported(model, int(view)) for model in (ours, theirs))
+        (xy1, point1), (xy2, point2) = (_supported(model, int(view)) for model in (ours, theirs))
         if not len(xy1) or not len(xy2):
             continue
-        distance, nearest = cKDTree(xy2).query(xy1, distance_upper_bound=SAME_PX)
+        distance, nearest = cKDTree(xy2).query(xy1, distance_upper_bound=1.0)
         near = np.isfinite(distance)
         votes.update(zip(point1[near].tolist(), point2[nearest[near]].tolist(), strict=True))
     taken1, taken2, pairs = set[int](), set[int](), []
@@ -153,7 +160,7 @@ def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _is_supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
+def _supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
     """Return inlier observations of a view: pixels and indices among the valid points."""
     number = np.cumsum(model.valid) - 1
     tracks = model.tracks
@@ -162,13 +169,12 @@ def _is_supported(model: Reconstruction, view: int) -> tuple[F64, I64]:
 
 
 def _same_points(
-    scene: str, name: str, ours: Reconstruction, theirs: Reconstruction, clouds: tuple[F64, F64, float]
+    scene: str, name: str, ours: Reconstruction, theirs: Reconstruction, clouds: Clouds
 ) -> list[Metric]:
-    mine, other, unit = clouds
     pairs = same_points(ours, theirs)
     if not len(pairs):
         return []
-    apart = 100.0 * np.linalg.norm(mine[pairs[:, 0]] - other[pairs[:, 1]], axis=1) / unit
+    apart = 100.0 * np.linalg.norm(clouds.mine[pairs[:, 0]] - clouds.other[pairs[:, 1]], axis=1) / clouds.unit
     text = "distance of ours to theirs, for points observed by both within a pixel"
     most = f"90 % quantile of the {text}"
     return [
@@ -178,18 +184,9 @@ def _same_points(
     ]
 
 
-def _centres(model: Reconstruction, views: np.ndarray[Any, Any]) -> F64:
-    C = camera_centre(model.P[views])
-    return np.asarray(C[:, :3] / C[:, 3:], dtype=np.float64)
-
-
-def _moved(model: Reconstruction, move: Similarity) -> F64:
-    X = model.X[model.valid]
-    return np.asarray(move.apply(X[:, :3] / X[:, 3:]), dtype=np.float64)
-
-
-def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[Metric]:
-    forth, back = (100.0 * cKDTree(b).query(a)[0] / unit for a, b in ((mine, other), (other, mine)))
+def _metrics(scene: str, name: str, clouds: Clouds) -> list[Metric]:
+    forth = clouds.distances_pct()
+    back = Clouds(clouds.other, clouds.mine, clouds.unit).distances_pct()
     share = 100.0 * float(np.mean(forth <= NEAR_PCT))
     text = "median distance of a point of ours to the nearest"
     back_text = "median distance of one of their points to the nearest"
@@ -201,23 +198,21 @@ def _metrics(scene: str, name: str, mine: F64, other: F64, unit: float) -> list[
     ]
 
 
-def _icp_metrics(
-    scene: str, name: str, mine: F64, other: F64, unit: float, outcome: Outcome | None
-) -> list[Metric]:
+def _icp_metrics(scene: str, name: str, clouds: Clouds, outcome: Outcome | None) -> list[Metric]:
     """Return the motion and the inlier share of Open3D's ICP."""
     found = read_arrays(outcome, f"{slug(name)}.npz")
     if found is None:
         return []
     R, t = found["transform"][:3, :3], found["transform"][:3, 3]
     turn = float(np.degrees(np.linalg.norm(Rotation.from_matrix(R).as_rotvec())))
-    middle = np.median(mine, axis=0)
-    shift = float(np.linalg.norm(R @ middle + t - middle))
-    share = 100.0 * float(np.mean(cKDTree(other).query(mine @ R.T + t)[0] <= NEAR_PCT / 100.0 * unit))
+    middle = np.median(clouds.mine, axis=0)
+    shift = 100.0 * float(np.linalg.norm(R @ middle + t - middle)) / clouds.unit
+    share = 100.0 * float(np.mean(clouds._replace(mine=clouds.mine @ R.T + t).distances_pct() <= NEAR_PCT))
     turned = "rotation by which ICP still turns our cloud after the similarity"
     near = "share of our points with a partner after ICP"
     return [
         row(scene, f"ICP to {name}: turn", "deg", turn, turned),
-        _distance(scene, f"ICP to {name}: shift", 100.0 * shift / unit, "shift of the cloud centre"),
+        _distance(scene, f"ICP to {name}: shift", shift, "shift of the cloud centre"),
         row(scene, f"ICP to {name}: inliers", "%", share, near, more=True),
     ]
 
@@ -226,17 +221,16 @@ def _distance(scene: str, name: str, value: float, text: str) -> Metric:
     return row(scene, name, "% of distance", float(value), text)
 
 
-def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
+def _plot(name: str, clouds: Clouds) -> Plot:
     """Plot both clouds: ours coloured by the distance to theirs, theirs grey."""
-    distance = 100.0 * cKDTree(other).query(mine)[0] / unit
-    low, high = np.quantile(mine, [0.02, 0.98], axis=0)
+    low, high = np.quantile(clouds.mine, [0.02, 0.98], axis=0)
     margin = 0.3 * (high - low).max()
-    shades = np.minimum(distance[_thinned(mine)], 2.0).round(3).tolist()
+    shades = _thinned(clouds.distances_pct()).round(3).tolist()
     scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "showscale": True}
     bar = {"colorbar": {"title": {"text": "% of distance"}}}
     traces = [
-        _trace("ours", mine, {"size": 2, "color": shades, **scale, **bar}),
-        _trace(name, other, {"size": 1.5, "color": "#9aa5ad"}),
+        _trace("ours", clouds.mine, {"size": 2, "color": shades, **scale, **bar}),
+        _trace(name, clouds.other, {"size": 1.5, "color": "#9aa5ad"}),
     ]
     axes = {
         f"{axis}axis": {"range": [float(low[k] - margin), float(high[k] + margin)], "visible": False}
@@ -248,11 +242,10 @@ def _plot(name: str, mine: F64, other: F64, unit: float) -> Plot:
 
 
 def _trace(name: str, X: F64, marker: dict[str, Any]) -> dict[str, Any]:
-    shown = np.round(X[_thinned(X)], 4)
-    xyz = {axis: shown[:, k].tolist() for k, axis in enumerate("xyz")}
+    xyz = dict(zip("xyz", np.round(_thinned(X), 4).T.tolist(), strict=True))
     return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
 
 
-def _thinned(X: F64) -> np.ndarray[Any, Any]:
-    """Every n-th point."""
-    return np.arange(0, len(X), max(1, len(X) // PLOTTED))
+def _thinned(X: F64) -> F64:
+    """Every n-th point, 6000 to 12,000 of many."""
+    return X[:: max(1, len(X) // 6000)]

@@ -8,7 +8,7 @@ import pytest
 from tests.validation.test_metrics import N, _reconstruction, _truth
 from validation.runs.records import Outcome
 from validation.scenes.real import Scene
-from validation.stages.clouds import _common_frame, _icp_metrics, _same_points, same_points
+from validation.stages.clouds import Clouds, _icp_metrics, _same_points, common_frame, same_points
 
 
 def test_points_seen_at_one_position_are_merged_in_any_order():
@@ -26,11 +26,10 @@ def test_a_shift_of_the_points_is_reported_in_per_cent_of_their_distance():
     truth = _truth()
     ours = _reconstruction(truth)
     scene = Scene("made up", (), truth.K, truth.R, truth.C)
-    frame = _common_frame(scene, ours, ours)
+    frame = common_frame(scene, ours, ours)
     assert frame is not None
-    mine, other, unit = frame
-    shift = np.array([0.01 * unit, 0.0, 0.0])
-    rows = _same_points("made up", "COLMAP", ours, ours, (mine + shift, other, unit))
+    shifted = frame._replace(mine=frame.mine + np.array([0.01 * frame.unit, 0.0, 0.0]))
+    rows = _same_points("made up", "COLMAP", ours, ours, shifted)
     np.testing.assert_allclose([row.values["ours"] for row in rows[1:]], 1.0)
     assert rows[0].values["ours"] == N
 
@@ -44,10 +43,11 @@ def test_the_motion_of_icp_depends_on_its_matrix_alone(tmp_path):
     other = mine @ transform[:3, :3].T + transform[:3, 3]
     other[:50] += 0.5
     np.savez(tmp_path / "COLMAP.npz", transform=transform)
-    turn, shift, share = _icp_metrics("made up", "COLMAP", mine, other, 10.0, Outcome(tmp_path))
+    clouds = Clouds(mine, other, 10.0)
+    turn, shift, share = _icp_metrics("made up", "COLMAP", clouds, Outcome(tmp_path))
     assert turn.values["ours"] == pytest.approx(2.0)
     middle = np.median(mine, axis=0)
     moved = transform[:3, :3] @ middle + transform[:3, 3] - middle
     assert shift.values["ours"] == pytest.approx(100.0 * np.linalg.norm(moved) / 10.0)
     assert share.values["ours"] == pytest.approx(75.0, abs=1.0)
-    assert _icp_metrics("made up", "COLMAP", mine, other, 10.0, Outcome(tmp_path, "Open3D is missing")) == []
+    assert _icp_metrics("made up", "COLMAP", clouds, Outcome(tmp_path, "Open3D is missing")) == []
