@@ -335,7 +335,7 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         if path.suffix.lower() in RAW_SUFFIXES:
             raise UnusableImage(RAW_FILE) from None
         heic = path.suffix.lower() in (".heic", ".heif") and "HEIF" not in _formats()
-        raise UnusableImage(Notice("heic" if heic else "unknown-format")) from None
+        raise UnusableImage(Notice("heic") if heic else Notice("unknown-format")) from None
     except MemoryError:
         raise UnusableImage(Notice("too-large-for-memory")) from None
     except Exception as error:

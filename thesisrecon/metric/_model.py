@@ -24,6 +24,7 @@ MIN_ANGLE = float(np.radians(0.05))
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
 the views; of more than ``MANY_VIEWS`` each view gets the numbers below. A view has ``CELLS`` along a side."""
+LONG_PER_VIEW, PRECISE_PER_VIEW = 1000, 500
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,10 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
     if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
-    return restrict_points(model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), 1000))
+    points = _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
+    return restrict_points(model, points)
+        model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
+    )
 
 
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
@@ -98,7 +102,7 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     # It weighs as much as six residuals.
     noise = (total + 6 * variance) / np.maximum(2 * count - 3 + 6, 1)
     order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
-    points = _select_spread_points(model, order, 500)
+    points = _select_spread_points(model, order, PRECISE_PER_VIEW)
     return restrict_points(model, points), points
 
 
