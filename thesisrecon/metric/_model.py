@@ -79,8 +79,6 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
     points = _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
     return restrict_points(model, points)
-        model, _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
-    )
 
 
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
