@@ -141,16 +141,18 @@ def draw(n, wrong, tail, seed):
 
 
 def test_one_round_is_the_textbook_step():
-    r, widths = draw(60, 0.3, 0.2, 0), np.array([0.7, 0.7 * TAIL, 80.0])
-    fractions = np.array([0.5, 0.2, 0.3])
-    p = fractions * 2.0 * norm.pdf(r[:, None], scale=widths)
+    r = draw(60, 0.3, 0.2, 0)
+    mixture = np.array([0.7, 80.0, 0.5, 0.2, 0.3])
+    widths = np.array([0.7, 0.7 * TAIL, 80.0])
+    p = mixture[2:] * 2.0 * norm.pdf(r[:, None], scale=widths)
     posterior = p / p.sum(axis=1, keepdims=True)
-    squares, counts = posterior.T @ r**2, posterior.sum(axis=0)
-    found, shares, likelihood = _fit_mixture(r, 7.0, 50.0, 1, widths, fractions)
+    squares = posterior.T @ r**2
+    counts = posterior.sum(axis=0)
+    likelihood = _fit_mixture(r, 7.0, 50.0, 1, mixture)
     sigma = np.sqrt((squares[0] + squares[1] / TAIL**2) / (counts[0] + counts[1] - 7.0))
-    wide = np.sqrt((squares[2] + 50.0**2) / (counts[2] + 1.0))
-    np.testing.assert_allclose(found, [sigma, TAIL * sigma, wide], rtol=1e-9)
-    np.testing.assert_allclose(shares, (counts + np.array([1.0, 0.5, 1.0])) / 62.5, rtol=1e-9)
+    assert mixture[0] == pytest.approx(sigma, rel=1e-9)
+    assert mixture[1] == pytest.approx(np.sqrt((squares[2] + 50.0**2) / (counts[2] + 1.0)), rel=1e-9)
+    np.testing.assert_allclose(mixture[2:], (counts + np.array([1.0, 0.5, 1.0])) / 62.5, rtol=1e-9)
     # The factor 2 / sqrt(2 pi) of half-normal densities is left out.
     assert likelihood == pytest.approx(np.mean(np.log(p.sum(axis=1))) - np.log(2.0 * norm.pdf(0.0)), rel=1e-9)
 
