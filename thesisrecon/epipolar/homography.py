@@ -171,12 +171,12 @@ def fundamentals_of_plane(H: F64, points: F64, weights: F64, pairs: I64, gate: f
     x1, x2 = homogenize(points[:, :2]), homogenize(points[:, 2:])
     parallax = np.cross(x2, x1 @ H.T)
     F = unit_norm(cross_matrix(np.cross(parallax[pairs[:, 0]], parallax[pairs[:, 1]])) @ H)
-    agree = np.asarray(_agree(F, np.ascontiguousarray(points.T), gate))
+    agree = np.asarray(_plane_inliers(F, np.ascontiguousarray(points.T), gate))
     return F.reshape(-1, 9), agree, agree @ weights.T
 
 
 @kernel(fastmath={"reassoc", "contract"})
-def _agree(F: F64, columns: F64, gate: float) -> F64:
+def _plane_inliers(F: F64, columns: F64, gate: float) -> F64:
     """1 where a Sampson distance of the matches (4, N) from F (S, 3, 3) is below the gate, else 0: (S, N)."""
     agree, wide = empty((len(F), columns.shape[1])), gate * gate
     for s in range(len(F)):
