@@ -279,7 +279,7 @@ def synthesize_view(
 
     Notes
     -----
-    For many views of one pair call :func:`match_images` and :func:`prepare_trilinear_views` once.
+    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
 
     Examples
     --------
