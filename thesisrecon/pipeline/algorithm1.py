@@ -178,8 +178,10 @@ def last_result(stages: Iterator[RunResult], result: RunResult) -> tuple[RunResu
 
 def pairs_of_group(job: Job, pairs: Sequence[TwoView]) -> Sequence[TwoView]:
     """The pairs of the largest group of images if there are several groups."""
-    groups = groups_of(job, pairs)
-    return tuple(p for p in pairs if {p.i, p.j} <= set(groups[0])) if groups else pairs
+    if not (groups := groups_of(job, pairs)):
+        return pairs
+    largest = set(groups[0])
+    return tuple(pair for pair in pairs if {pair.i, pair.j} <= largest)
 
 
 def groups_of(job: Job, pairs: Sequence[TwoView]) -> list[list[int]]:

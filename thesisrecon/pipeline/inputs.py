@@ -90,16 +90,15 @@ class Given:
 
         return report_matches(job, run.map_cached("matches", keys, _verify, batches))
 
-    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
+    def track(
+        self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
+    ) -> Tracks:
         """The given tracks, or those of the matches."""
-        return FromImages().track(job, views, pairs) if self.tracks is None else self.take_tracks(job)
-
-    def take_tracks(self, job: Job, views: Sequence[int] | None = None) -> Tracks:
-        """The given tracks, or those of some views."""
         tracks, run = self.tracks, job.run
-        assert tracks is not None
-        if views is not None:
-            tracks = tracks_of_part(tracks, np.array(views))
+        if tracks is None:
+            return FromImages().track(job, views, pairs)
+        if among is not None:
+            tracks = tracks_of_part(tracks, np.array(among))
         key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
         return report_tracks(run, run.cached("tracks", "tracks", key, lambda: tracks))
 

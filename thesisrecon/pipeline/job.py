@@ -43,8 +43,10 @@ class FrontEnd(Protocol):
         """Matches and epipolar geometry of the pairs (4.2.2, chapter 5)."""
         ...
 
-    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
-        """Tracks through the accepted pairs."""
+    def track(
+        self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
+    ) -> Tracks:
+        """Tracks through the accepted pairs; ``among``: images of this front end that the job consists of."""
         ...
 
 

@@ -137,12 +137,8 @@ def cameras_from_parts(
         return None, []
     parts = overlapping_parts(graph, own)
     variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
-    code, upstream, prior, sizes = (
-        code_digest(reconstruct_part),
-        run.logs["tracks"].keys,
-        job.prior,
-        job.sizes,
-    )
+    code, upstream = code_digest(reconstruct_part), run.logs["tracks"].keys
+    prior, sizes = job.prior, job.sizes
     inputs = [sizes, prior.mean, prior.std, prior.shared, prior.kind]
     keys = {
         f"part-{n}": run.key("metric", variants, code, upstream, *inputs, views, run.seed)

@@ -94,7 +94,9 @@ class FromImages:
         rejected = {n: pair.reason for n, pair in enumerate(final) if pair is not found[n]}
         return report_matches(job, final, kinds, rejected)
 
-    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
+    def track(
+        self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
+    ) -> Tracks:
         """Build tracks from the accepted pairs."""
         run, accepted = job.run, [(pair.i, pair.j) for pair in pairs if pair.accepted]
         key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, accepted, run.seed)
@@ -105,7 +107,7 @@ class FromImages:
         return report_tracks(run, tracks)
 
 
-class FromRun(FromImages):
+class FromRun:
     """The front end of some images of another run, from which it takes features and pairs."""
 
     divides = False
@@ -128,7 +130,7 @@ class FromRun(FromImages):
         """The views as the other run takes them."""
         return self.whole.front.prepare(job, features)
 
-    def select(self, job: Job, features: Sequence[Features]) -> None:  # type: ignore[override]
+    def select(self, job: Job, features: Sequence[Features]) -> None:
         """No choice: the pairs are those of the other run."""
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
@@ -145,13 +147,11 @@ class FromRun(FromImages):
                 found.append(run.cached("matches", item, key, partial(replace, pair)))
         return report_matches(job, found)
 
-    def track(self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView]) -> Tracks:
-        """Build tracks, or take given ones of these images."""
-        front = self.whole.front
-        if getattr(front, "tracks", None) is None:
-            return super().track(job, views, pairs)
-        found: Tracks = front.take_tracks(job, self.views)  # type: ignore[attr-defined]
-        return found
+    def track(
+        self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
+    ) -> Tracks:
+        """The tracks that the other run gives these images."""
+        return self.whole.front.track(job, views, pairs, self.views)
 
 
 class PreparedViews(Sequence[Any]):
