@@ -36,25 +36,16 @@ def test_a_camera_is_found_by_name_and_by_number_and_has_standard_deviations(run
     assert np.array_equal(camera.P, result.cameras[-2].P)
     assert abs(camera.K[0, 0] - scene.cameras[3].K[0, 0]) < 4 * camera.std["focal_px"]
     assert 0 < camera.std["focal_px"] < 50
-
-
-def test_a_result_is_shown_in_a_line(run):
-    """Notebooks show the value of a cell."""
-    assert repr(run[1]).startswith("RunResult(out='")
-    assert repr(run[1]).endswith("images=5, registered=5, points=200, failure='')")
-    assert repr(run[1].cameras).startswith("Cameras(['image-0', ")
-
-
-def test_unknown_images_are_named(run):
-    result = run[1]
-    with pytest.raises(KeyError, match="there is no image 'other'"):
-        result.cameras["other"]
-    with pytest.raises(KeyError, match="there is no image 9; 5 were read"):
-        result.cameras[9]
+    for key, words in (("other", "there is no image 'other'"), (9, "there is no image 9; 5 were read")):
+        refuses(KeyError, words, result.cameras.__getitem__, key)
     refuses(KeyError, "there is no image 7", result.observations, 7)
+    # Notebooks show the value of a cell.
+    assert repr(result).startswith("RunResult(out='")
+    assert repr(result).endswith("images=5, registered=5, points=200, failure='')")
+    assert repr(result.cameras).startswith("Cameras(['image-0', ")
 
 
-def test_a_finished_folder_is_read_back(run):
+def test_a_finished_folder_is_read_back_and_saved_as_the_run_wrote_it(run, tmp_path):
     result = run[1]
     loaded = thesisrecon.load(result.out)
     assert loaded.summary == result.summary
@@ -63,21 +54,7 @@ def test_a_finished_folder_is_read_back(run):
     assert np.array_equal(loaded.cameras[1].K, result.cameras[1].K)
     assert same_pairs(loaded, result)
     assert loaded.tracks.n_points == result.tracks.n_points
-
-
-def test_pairs_that_were_given_the_other_way_round_are_read_back(run, tmp_path):
-    scene = run[0]
-    matches = {(j, i): rows[:, ::-1] for (i, j), rows in scene.matches.items()}
-    result = thesisrecon.reconstruct_from_matches(
-        scene.keypoints, matches, scene.sizes, tmp_path, until="matches"
-    )
-    assert [(p.i, p.j) for p in result.pairs][:3] == [(0, 1), (0, 2), (1, 2)]
-    assert same_pairs(thesisrecon.load(tmp_path), result)
-
-
-def test_a_loaded_result_is_saved_as_the_run_wrote_it(run, tmp_path):
-    result = run[1]
-    thesisrecon.save(thesisrecon.load(result.out), tmp_path / "copy")
+    thesisrecon.save(loaded, tmp_path / "copy")
     for name in ("cameras.json", "points.ply", "summary.json", "sparse/0/images.bin"):
         assert (tmp_path / "copy" / name).read_bytes() == (result.out / name).read_bytes()
 
@@ -111,15 +88,14 @@ def test_results_of_one_folder_stay_apart_and_outlive_it(run, tmp_path):
         shutil.rmtree(out, ignore_errors=True)
 
 
-def test_a_folder_without_a_finished_run_is_refused(tmp_path):
+def test_pairs_given_the_other_way_round_are_read_back_and_cameras_are_refused_with_the_reason(run, tmp_path):
+    scene, out = run[0], tmp_path / "early"
     refuses(UsageError, "no run has finished in this folder", thesisrecon.load, tmp_path)
-
-
-def test_cameras_of_an_earlier_stage_are_refused_with_the_reason(run, tmp_path):
-    scene = run[0]
-    result = thesisrecon.reconstruct_from_matches(
-        scene.keypoints, scene.matches, scene.sizes, tmp_path / "early", until="matches"
-    )
+    matches = {(j, i): rows[:, ::-1] for (i, j), rows in scene.matches.items()}
+    given = scene.keypoints, matches, scene.sizes
+    result = thesisrecon.reconstruct_from_matches(*given, out, until="matches")
+    assert [(p.i, p.j) for p in result.pairs][:3] == [(0, 1), (0, 2), (1, 2)]
+    assert same_pairs(thesisrecon.load(out), result)
     with pytest.raises(AttributeError, match="the run ended before the metric stage"):
         result.cameras  # noqa: B018
 

@@ -62,11 +62,17 @@ def test_matches_of_files_and_arrays_are_pixels_of_these_and_those_of_records_of
         assert np.median(distance) < 0.3 * two
 
 
-def test_photographs_that_cannot_be_read_or_matched_are_failures(tmp_path):
+def test_impossible_images_reconstructions_and_seeds_are_refused(tmp_path):
     (tmp_path / "a.jpg").write_text("no picture")
     noise = [np.random.default_rng(k).integers(0, 256, (200, 200, 3), dtype=np.uint8) for k in range(2)]
     refuses(StageFailure, r"a\.jpg is not an image", thesisrecon.match_pair, tmp_path / "a.jpg", noise[0])
     refuses(StageFailure, "do not match", thesisrecon.match_pair, *noise)
+    metric = replace(small_reconstruction(), stratum="metric")
+    for stage in (thesisrecon.self_calibrate, thesisrecon.upgrade_affine):
+        refuses(ValueError, "takes a projective reconstruction; got metric", stage, metric)
+    for seed in (np.random.default_rng(0), -1, 0.5, True):
+        refuses(ValueError, "the seed must be a whole number of at least 0; got", stream, seed, "matches")
+    assert stream(np.int64(3), "matches").integers(1000) == stream(3, "matches").integers(1000)
 
 
 def test_self_calibration_groups_views_by_size_and_takes_a_prior():
@@ -85,18 +91,6 @@ def test_self_calibration_groups_views_by_size_and_takes_a_prior():
     assert not heard[0].focal_known.any()
     assert heard[1].focal_known.all()
     assert heard[1].mean[:, 0].tolist() == [50.0, 50.0]
-
-
-def test_only_a_projective_reconstruction_is_calibrated():
-    metric = replace(small_reconstruction(), stratum="metric")
-    for stage in (thesisrecon.self_calibrate, thesisrecon.upgrade_affine):
-        refuses(ValueError, "takes a projective reconstruction; got metric", stage, metric)
-
-
-def test_a_seed_is_a_whole_number():
-    for seed in (np.random.default_rng(0), -1, 0.5, True):
-        refuses(ValueError, "the seed must be a whole number of at least 0; got", stream, seed, "matches")
-    assert stream(np.int64(3), "matches").integers(1000) == stream(3, "matches").integers(1000)
 
 
 def test_points_take_the_mean_colour_of_where_they_are_seen():

@@ -26,10 +26,8 @@ from thesisrecon import (
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.io._images import read_pixels
 from thesisrecon.results import SparseModel, SparseView
-from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from validation.scenes.real import load_fixture_depth
@@ -130,39 +128,20 @@ def test_infinite_depths_of_a_renderer_are_unknown(fusion):
         np.testing.assert_array_equal(getattr(found[1], name), getattr(found[0], name))
 
 
-def test_observations_are_in_the_pixels_of_the_reduced_images(monkeypatch, walled):
-    """A depth estimator of your own may use them."""
-    seen = []
+@pytest.fixture
+def given(monkeypatch):
+    """The views that a texture is made of."""
+    found = []
 
-    def prepare(*given, **_):
-        seen.append(given[2])
-        raise StageFailure("seen")
+    def color(self, surface, views, *, threads=1):  # noqa: ARG001
+        found.extend(views)
 
-    monkeypatch.setattr(MultiViewStereo, "prepare", prepare)
-    cameras = _cameras()
-    X = np.column_stack([*np.random.default_rng(0).uniform(-0.8, 0.8, (2, 60)), np.full(60, 6.0)])
-    xy = np.stack([camera.project(X) for camera in cameras])
-    xy[~((xy >= 0.0) & (xy <= np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
-    arrays = (np.stack([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
-    given = reconstruction_from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
-    refuses(StageFailure, "seen", depth_maps, [image.rgb for image in walled.images], given, max_size=120)
-    (reduced,) = seen
-    tracks = reduced.tracks
-    assert len(tracks.xy) > 100
-    for i, P in enumerate(reduced.P):
-        here = tracks.view_index == i
-        off = project(P, reduced.X[tracks.point_index[here]]) - tracks.xy[here]
-        np.testing.assert_allclose(off, 0.0, atol=1e-9)
+    monkeypatch.setattr(SurfaceModel, "color", color)
+    return found
 
 
 @pytest.mark.parametrize(("max_size", "side"), [(None, 1600), (1700, 1700), (400, 400)])
-def test_a_texture_is_made_of_images_of_the_requested_size(monkeypatch, max_size, side):
-    given = []
-
-    def color(self, surface, views, *, threads=1):  # noqa: ARG001
-        given.extend(views)
-
-    monkeypatch.setattr(SurfaceModel, "color", color)
+def test_a_texture_is_made_of_images_of_the_requested_size(given, max_size, side):
     image = np.random.default_rng(0).integers(0, 256, (300, 1800, 3), dtype=np.uint8)
     K = np.array([[900.0, 0, 899.5], [0, 900, 149.5], [0, 0, 1]])
     camera = Camera(K, np.eye(3), np.zeros(3), (1800, 300), np.array([-0.01, 0, 0]))
@@ -171,14 +150,8 @@ def test_a_texture_is_made_of_images_of_the_requested_size(monkeypatch, max_size
     assert given[0].rgb.shape[1] == side
 
 
-def test_images_with_cameras_of_a_colmap_model_are_used_as_stored(tmp_path, monkeypatch):
+def test_images_with_cameras_of_a_colmap_model_are_used_as_stored(tmp_path, given):
     """A half turn by EXIF keeps the size of an image: only the camera tells which pixels are meant."""
-    given = []
-
-    def color(self, surface, views, *, threads=1):  # noqa: ARG001
-        given.extend(views)
-
-    monkeypatch.setattr(SurfaceModel, "color", color)
     pixels = np.random.default_rng(0).integers(0, 256, (90, 120, 3), dtype=np.uint8)
     exif = PIL.Image.Exif()
     exif[0x0112] = 3

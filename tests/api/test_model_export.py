@@ -1,9 +1,7 @@
 """Exports are read back by the programs themselves or by a reader of the format, and project known points."""
 
 import json
-import shutil
 import struct
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +9,10 @@ import PIL.Image
 import pytest
 from scipy.spatial.transform import Rotation
 
-import thesisrecon.api.export as export_module
 from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.cli.main import run_command
-from thesisrecon.io._exports import write_image
-from thesisrecon.io._images import read_image
-from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import SparseModel, SparseView
 
 SIZE = (160, 120)
@@ -201,23 +195,24 @@ def read_opencv(folder):
 
 
 @pytest.mark.parametrize(
-    ("to", "read"),
+    ("to", "read", "skew"),
     [
-        pytest.param("colmap-undistorted", read_colmap, marks=pytest.mark.references),
-        ("nerfstudio", read_nerfstudio),
-        ("openmvs", read_openmvs),
-        ("bundler", read_bundler),
+        pytest.param("colmap-undistorted", read_colmap, 0.0, marks=pytest.mark.references),
+        pytest.param("colmap-undistorted", read_colmap, 3.0, marks=pytest.mark.references),
+        ("nerfstudio", read_nerfstudio, 0.0),
+        ("openmvs", read_openmvs, 0.0),
+        ("bundler", read_bundler, 0.0),
     ],
 )
-def test_undistorted_exports_project_known_points(tmp_path, images, to, read):
-    model = make_model(BARREL, PINCUSHION)
+def test_undistorted_exports_project_known_points(tmp_path, images, to, read, skew):
+    model = make_model(BARREL, PINCUSHION, skew=skew)
     export(model, tmp_path / "out", to=to, images=images)
     found = read(tmp_path / "out")
     for view in model.views:
         name = WRITTEN[view.name].replace(" ", "_") if to == "bundler" else WRITTEN[view.name]
         project, (width, height) = found[name]
         xy = project(model.X)
-        pinhole = Camera(view.K, view.R, view.t, view.size)
+        pinhole = Camera(view.K * [[1, skew == 0, 1], [1, 1, 1], [1, 1, 1]], view.R, view.t, view.size)
         if to == "bundler":
             # One focal length and another principal point.
             centred = (pinhole.project(model.X) - view.K[:2, 2]) * view.K[0, 0] / np.diag(view.K)[:2]
@@ -247,7 +242,7 @@ MASKED = np.s_[30:70, 40:90]
 
 @pytest.mark.parametrize("to", ["colmap-undistorted", "nerfstudio", "openmvs"])
 def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path, images, to):
-    """One image of four has a mask; programs want one for every image."""
+    """One image of four has a mask, or transparent pixels; programs want a mask for every image."""
     mask_names = {name: f"masks/{name}.png" for name in WRITTEN.values()}
     if to == "openmvs":
         mask_names = {name: f"masks/{name.split('/')[-1].rpartition('.')[0]}.mask.png" for name in mask_names}
@@ -255,8 +250,8 @@ def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path,
     mask[MASKED] = 0
     (tmp_path / "given").mkdir()
     PIL.Image.fromarray(mask).save(tmp_path / "given" / "c.png.png")
-    model = make_model(BARREL, PINCUSHION)
-    export(model, tmp_path / "out", to=to, images=images, masks=tmp_path / "given")
+    model, given = make_model(BARREL, PINCUSHION), {"to": to, "images": images, "masks": tmp_path / "given"}
+    export(model, tmp_path / "out", **given)
     for name, file in mask_names.items():
         written = pixels_of(tmp_path / "out" / file)
         rgb = pixels_of(tmp_path / "out" / "images" / name)
@@ -279,15 +274,15 @@ def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path,
     if to == "openmvs":
         alike = replace(model, views=[replace(model.views[0], name="c.jpg"), *model.views[1:]])
         same = r"two images of the model would have the mask masks/c\.mask\.png"
-        refuses(
-            UsageError,
-            same,
-            export,
-            alike,
-            tmp_path / "alike",
-            to=to,
-            images=images,
-            masks=tmp_path / "given",
+        refuses(UsageError, same, export, alike, tmp_path / "alike", **given)
+    rgb = pixels_of(images / "sub" / "c.png").astype(np.uint8)
+    for alpha, there in ((np.full_like(mask, 255), False), (mask, True)):
+        PIL.Image.fromarray(np.dstack([rgb, alpha])).save(images / "sub" / "c.png")
+        export(model, tmp_path / f"alpha {there}", to=to, images=images)
+        assert (tmp_path / f"alpha {there}" / "masks").exists() == there
+    for file in mask_names.values():
+        np.testing.assert_array_equal(
+            pixels_of(tmp_path / "alpha True" / file), pixels_of(tmp_path / "out" / file)
         )
 
 
@@ -401,10 +396,8 @@ def test_images_of_a_colmap_model_are_used_as_stored(tmp_path, images, orientati
         found = pixels_of(tmp_path / "rotated-out" / path.relative_to(tmp_path / "plain-out"))
         np.testing.assert_array_equal(found, pixels_of(path))
     if orientation == 6:
-        turned = {"to": "nerfstudio", "images": tmp_path / "rotated"}
-        refuses(
-            UsageError, r"has \(120, 160\) pixels after EXIF", export, model, tmp_path / "other", **turned
-        )
+        turned, words = {"to": "nerfstudio", "images": tmp_path / "rotated"}, "pixels after EXIF"
+        refuses(UsageError, rf"has \(120, 160\) {words}", export, model, tmp_path / "other", **turned)
 
 
 @pytest.mark.references
@@ -419,19 +412,6 @@ def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
         expected = result.cameras[name].project(result.points)
         np.testing.assert_allclose(project(result.points), expected, atol=1e-6, rtol=0)
     refuses(UsageError, "give it with --images", export, result, tmp_path / "out", to="nerfstudio")
-
-
-@pytest.mark.references
-def test_skew_is_resampled_away_or_refused(tmp_path, images):
-    model = make_model(PINCUSHION, PINCUSHION, skew=3.0)
-    export(model, tmp_path / "out", to="colmap-undistorted", images=images)
-    project, _ = read_colmap(tmp_path / "out")["é.png"]
-    pixels = pixels_of(tmp_path / "out" / "images" / "é.png")
-    xy, expected = project(model.X), camera(model.views[3]).project(model.X)
-    inside = ((xy > 1) & (xy < np.array(pixels.shape[1::-1]) - 2)).all(axis=1)
-    x, y = np.rint(xy[inside]).astype(int).T
-    assert np.abs(pixels[y, x, :2] / SLOPE - expected[inside]).max() < 1.2
-    refuses(UsageError, "opencv has no camera model with skew", export, model, tmp_path / "o", to="opencv")
 
 
 def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
@@ -453,10 +433,13 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
         (small, "bundler", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
         (wild, "openmvs", images, "the camera is not plausible"),
         (replace(model, views=[]), "opencv", None, "no camera"),
+        (make_model(PINCUSHION, BARREL, skew=3.0), "opencv", None, "opencv has no camera model with skew"),
     ]
     for bad, to, source, words in cases:
         refuses(UsageError, words, export, bad, tmp_path / "out", to=to, images=source)
     refuses(UsageError, "holds a run", export, model, tmp_path / "run", to="opencv")
+    far = export(replace(model, X=model.X + 5e6), tmp_path / "far", to="nerfstudio", images=images)
+    assert "rounded to 0.5" in far.notes[0]
 
 
 def test_an_export_does_not_replace_its_input(tmp_path, images):
@@ -483,29 +466,6 @@ def test_an_export_does_not_replace_its_input(tmp_path, images):
     export(tmp_path / "sparse" / "0", tmp_path, to="nerfstudio", images=images)
 
 
-@pytest.mark.parametrize(("total", "together"), [(1e6, 1), (1e9, 4)])
-def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monkeypatch, total, together):
-    """An image of 160 x 120 px takes 0.6 MB."""
-    working, most, gate = [], [], threading.Barrier(together)
-
-    def read(*arguments, **options):
-        working.append(1)
-        most.append(len(working))
-        gate.wait(60)
-        return read_image(*arguments, **options)
-
-    def write(*arguments):
-        write_image(*arguments)
-        working.pop()
-
-    monkeypatch.setattr(export_module, "_budget", MemoryBudget(int(total)))
-    monkeypatch.setattr(export_module, "read_image", read)
-    monkeypatch.setattr(export_module, "write_image", write)
-    export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
-    assert len(most) == 4
-    assert max(most) == together
-
-
 def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):
     """r (1 - 9 r^2) grows up to r = 0.19; beyond it two points of the scene would fall on one pixel."""
     model = make_model(np.array([-9.0, 0.0, 0.0]), PINCUSHION)
@@ -516,35 +476,3 @@ def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):
     centre = project(X)[0]
     reach = np.hypot(*np.maximum(centre, [width - 1, height - 1] - centre)) / 140.0
     assert 0.17 < reach < 1 / np.sqrt(27)
-
-
-def test_coordinates_far_from_the_origin_are_reported(tmp_path, images):
-    model = make_model(BARREL, PINCUSHION)
-    report = export(replace(model, X=model.X + 5e6), tmp_path, to="nerfstudio", images=images)
-    assert "rounded to 0.5" in report.notes[0]
-
-
-@pytest.mark.parametrize("to", ["colmap-undistorted", "openmvs", "bundler"])
-def test_transparent_pixels_of_images_are_masks_in_exports(tmp_path, images, to):
-    model = make_model(BARREL, PINCUSHION)
-    folder = tmp_path / "images"
-    shutil.copytree(images, folder)
-    (name,) = (name for name in model.names if name.endswith("c.png"))
-    rgb = np.asarray(PIL.Image.open(folder / name).convert("RGB"))
-    alpha = np.full(rgb.shape[:2], 255, np.uint8)
-    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
-    assert export(model, tmp_path / "opaque", to=to, images=folder).file.exists()
-    assert not (tmp_path / "opaque" / "masks").exists()
-    alpha[MASKED] = 0
-    PIL.Image.fromarray(np.dstack([rgb, alpha])).save(folder / name)
-    report = export(model, tmp_path / "out", to=to, images=folder)
-    if to == "bundler":
-        assert report.notes == ("no masks are written: Bundler has none",)
-        assert not (tmp_path / "out" / "masks").exists()
-        return
-    (tmp_path / "masks").mkdir()
-    PIL.Image.fromarray(alpha).save(tmp_path / "masks" / "c.png.png")
-    export(model, tmp_path / "given", to=to, images=images, masks=tmp_path / "masks")
-    for file in sorted((tmp_path / "given" / "masks").rglob("*.png")):
-        same = tmp_path / "out" / file.relative_to(tmp_path / "given")
-        np.testing.assert_array_equal(pixels_of(same), pixels_of(file))

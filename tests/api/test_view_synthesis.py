@@ -51,15 +51,12 @@ def test_calibrated_photographs_show_a_third_one(found):
 def test_at_their_own_places_the_photographs_are_seen_again(found):
     guessed = prepare_trilinear_views(found, config=SMALL)
     np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
+    reported = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
+    assert prepare_trilinear_views(found, config=reported).pair.K1[0, 0] == 450.0
     first, second = (guessed.render(camera_at(guessed.pair, s, sizes=guessed.sizes)) for s in (0.0, 1.0))
     assert np.mean(second != found.images[1].rgb) < 1e-3
     # Rounding leaves a corner to its neighbours.
     assert np.mean(first != found.images[0].rgb) < 1e-3
-
-
-def test_a_given_focal_length_is_used(found):
-    reported = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
-    assert prepare_trilinear_views(found, config=reported).pair.K1[0, 0] == 450.0
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
@@ -84,14 +81,14 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
     np.testing.assert_array_equal(picture, views.render(camera, threads=2))
 
 
-def test_cameras_in_one_place_show_no_parallax():
+def test_cameras_in_one_place_and_one_image_twice_are_refused(found):
     """As of one camera with another principal point."""
     picture = _photograph(6)
-    halves, words = (
-        (picture[:, :-32].copy(), picture[:, 32:].copy()),
-        "show no parallax: the camera only rotated",
-    )
+    halves, words = [picture[:, :-32].copy(), picture[:, 32:].copy()], "no parallax: the camera only rotated"
     refuses(StageFailure, words, match_images, *halves, config=SMALL)
+    first, second = found.images
+    for images, words in (((first, second, first), "2 images; got 3"), ((first, first), "the same image")):
+        refuses(UsageError, words, trilinear_sequence, images, 5, config=SMALL, seed=0)
 
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
@@ -112,9 +109,3 @@ def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
     page = (tmp_path / "film" / "strip.html").read_text(encoding="utf-8")
     assert "0.50 baselines before 0006.jpg" in page
     assert "0.50 baselines beyond 0007.jpg" in page
-
-
-def test_films_are_of_two_different_photographs(found):
-    first, second = found.images
-    for images, words in (((first, second, first), "2 images; got 3"), ((first, first), "the same image")):
-        refuses(UsageError, words, trilinear_sequence, images, 5, config=SMALL, seed=0)

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
+import trimesh
 
+from tests.synthetic import texture
 from thesisrecon.cli.main import run_command
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
@@ -96,21 +98,51 @@ def seen_through(H):
     return picture(0).transform(SIZE, perspective, coefficients, bicubic, fillcolor=(128, 128, 128))
 
 
-def test_a_flat_poster_has_no_parallax(folder, reconstruct):
+def round_a_poster():
     """Four cameras walk round a plane, the poster z = 1: x ~ K R (X - C)."""
     for k, angle in enumerate((-0.4, -0.15, 0.15, 0.4)):
         R = rotation(0.1 * (-1) ** k, angle)
         C = np.array([-np.sin(angle), 0.1 * (-1) ** k, 1 - np.cos(angle)])
-        image_from_poster = K @ R @ np.column_stack([[1, 0, 0], [0, 1, 0], np.array([0, 0, 1]) - C])
-        seen_through(K_PICTURE @ np.linalg.inv(image_from_poster)).save(folder / f"{k}.png")
+        yield K @ R @ np.column_stack([[1, 0, 0], [0, 1, 0], np.array([0, 0, 1]) - C])
+
+
+def on_a_tripod():
+    return [K @ rotation(x, y) for x, y in [(-0.05, -0.18), (0.04, -0.06), (0.0, 0.07), (-0.03, 0.19)]]
+
+
+@pytest.mark.parametrize("cameras", [round_a_poster, on_a_tripod])
+def test_a_flat_poster_and_a_camera_that_only_turns_have_no_parallax(cameras, folder, reconstruct):
+    for k, image_from_plane in enumerate(cameras()):
+        seen_through(K_PICTURE @ np.linalg.inv(image_from_plane)).save(folder / f"{k}.png")
     sentence, summary = reconstruct(3)
     assert "no parallax" in sentence
     assert summary["pairs"]["accepted"] >= 3
 
 
-def test_a_camera_that_only_turns_has_no_parallax(folder, reconstruct):
-    for k, (x, y) in enumerate([(-0.05, -0.18), (0.04, -0.06), (0.0, 0.07), (-0.03, 0.19)]):
-        seen_through(K_PICTURE @ rotation(x, y).T @ np.linalg.inv(K)).save(folder / f"{k}.png")
-    sentence, summary = reconstruct(3)
-    assert "no parallax" in sentence
-    assert summary["pairs"]["accepted"] >= 3
+@pytest.fixture
+def odd_images(folder):
+    """One small, two partly burnt out and black, and one of elsewhere."""
+    for k in range(5):
+        rgb = np.array(picture(k).reduce(6) if k == 3 else picture(k))
+        if k in (1, 2):
+            rgb[: rgb.shape[0] // 3] = 255
+            rgb[-60:, :200] = 0
+        PIL.Image.fromarray(rgb).save(folder / f"{k}.png")
+    other = np.repeat(texture(300, 400, 9).astype(np.uint8)[..., None], 3, axis=2)
+    PIL.Image.fromarray(other).save(folder / "elsewhere.png")
+    return folder
+
+
+def test_the_others_become_a_model(odd_images, tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["reconstruct", str(odd_images), "-o", str(out), "--max-size", "200", "--threads", "2"]
+    assert run_command(command) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "5 of 6 images registered" in printed.out
+    assert "not registered: elsewhere.png" in printed.out
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert [entry["name"] for entry in summary["refused"]] == ["elsewhere.png"]
+    mesh = next(iter(trimesh.load(out / "model.glb").geometry.values()))
+    assert len(mesh.faces) > 10_000
+    assert np.isfinite(mesh.vertices).all()

@@ -61,12 +61,8 @@ def test_impossible_options_are_rejected(arguments, make, words, tmp_path, run_c
 
 
 CONFIGS = [
-    ("features = 3", "takes a table"), ("features = [1, 2]", "takes a table"),
-    ("[[features]]\nlevels = 1", "takes a table"), ("[features]\nkind = 3", "unknown kind of features 3"),
+    ("[[features]]\nlevels = 1", "takes a table"),
     ("[features]\nkind = ['a']", "unknown kind of features ['a']"),
-    ("[features]\nlevels = 'many'", "takes a whole number; got 'many'"),
-    ("[features]\nlevels = 1.5", "takes a whole number; got 1.5"),
-    ("[features]\nlevels = true", "takes a whole number; got True"),
     ("[features]\nlevels = 1979-05-27T07:32:00Z", "takes a whole number; got datetime"),
     (f"[features]\nlevels = 0x{'f' * 9000}", "takes a whole number; got int too large"),
     (f"[features]\nlevels = {'9' * 9000}", "is not TOML"),
@@ -78,7 +74,7 @@ CONFIGS = [
     ("[intrinsics]\ncameras = ['shared']", "unknown value of intrinsics.cameras"),
     ("[dense]\npairs = 3", "pairs"),
     ("[dense.pairs]\nmatcher = {kind = []}", "unknown kind of dense.pairs.matcher []"),
-    ("preset = 3", "unknown preset 3"), ("preset = ['default']", "unknown preset ['default']"),
+    ("preset = ['default']", "unknown preset ['default']"),
     (f"a = {'[' * 50_000}", "too deep"), (b"\xff\xfe\0a", "is not a UTF-8 text"), ("\0", "is not TOML"),
     ("x" * 100_000 + " = 1", "unknown stage"),
 ]  # fmt: skip
@@ -95,8 +91,8 @@ def test_settings_of_wrong_types(text, words, tmp_path, run_cli):
 
 
 PAIRS = [
-    ("line 1 of", b"\0\0\0"), ("not a UTF-8 text", b"\xff\xfe\0"), ("line 1 of", "a.png " * 100_000),
-    ("line 2 of", 'a.png b.png\n"a.png\n'), ("names 'c\\x1b[31m.png'", "a.png c\x1b[31m.png"),
+    ("line 1 of", "a.png " * 100_000), ("line 2 of", 'a.png b.png\n"a.png\n'),
+    ("names 'c\\x1b[31m.png'", "a.png c\x1b[31m.png"),
     ("names '<b>.png'", "a.png <b>.png"), ("leaves no pair", "# nothing\n"),
     ("pairs 'a.png' with itself", "a.png a.png\n"),
 ]  # fmt: skip
@@ -109,12 +105,3 @@ def test_invalid_lists_of_pairs_are_rejected(words, text, tmp_path, run_cli):
     writes(text)(tmp_path / "pairs.txt")
     arguments = ["reconstruct", str(folder), "-o", str(tmp_path / "out"), "--until", "matches"]
     assert words in run_cli([*arguments, "--pairs", str(tmp_path / "pairs.txt")], 2)
-
-
-@pytest.mark.parametrize(
-    ("out", "words"),
-    [("/dev/null", "cannot be written"), (files.TOO_LONG, "File name too long"), (" ", "has no name")],
-    ids=["device", "too long", "nothing"],
-)
-def test_the_demo_is_as_careful(out, words, run_cli):
-    assert words in run_cli(["demo", "-o", out], 2)

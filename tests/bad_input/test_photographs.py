@@ -36,7 +36,7 @@ NO_PHOTOGRAPHS = [
     ("cut.webp", writes(files.encoded("WEBP")[:200]), "cannot be decoded"),
     ("doubtful.png", writes(files.png(12_000, 12_000)), "cannot be decoded: "),
     ("broken.png", writes(files.encoded("PNG").replace(b"IDAT", b"IDOT", 1)), "is not an image"),
-    ("bomb.png", writes(files.bomb()), "claims more than 178 megapixels"),
+    ("bomb.png", writes(files.png(30_000, 30_000)), "claims more than 178 megapixels"),
     ("claim.png", writes(files.png(2**31 - 1, 2**31 - 1)), "claims more than 178 megapixels"),
     ("note.png", writes(files.text_bomb()), "cannot be decoded: Decompressed "),
     ("one.png", writes(files.encoded("PNG", picture(size=(1, 1)))), "has only 1 x 1 pixels"),
@@ -142,16 +142,6 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_
     said = run_cli(["reconstruct", str(only), "-o", str(tmp_path / "other"), *FEATURES], 2)
     assert "no images in" in said
     assert "subfolders are not searched" in said
-
-
-def test_thousands_of_tiny_files_are_one_sentence(tmp_path, run_cli):
-    (tmp_path / "in").mkdir()
-    tiny = files.encoded("PNG", picture(size=(8, 8)))
-    for k in range(2000):
-        (tmp_path / "in" / f"{k:04d}.png").write_bytes(tiny)
-    said = run_cli(["reconstruct", str(tmp_path / "in"), "-o", str(tmp_path / "out"), *FEATURES], 3)
-    assert "has only 8 x 8 pixels" in said
-    assert "and 1997 more" in said
 
 
 def test_a_file_that_vanishes_while_others_are_read(tmp_path, run_cli, monkeypatch):

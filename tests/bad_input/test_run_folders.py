@@ -74,16 +74,15 @@ def manifest(report):
 
 
 GOOD_REPORT = {"stage": "features", "seconds": 1.0, "counts": {}, "metrics": {}, "warnings": []}
+
+
 MANIFESTS = [
-    ("deep", writes(files.deep_json())), ("list", writes("[]")), ("no report", manifest(None)),
-    ("words", manifest("soup")), ("seconds in words", manifest({**GOOD_REPORT, "seconds": "soup"})),
-    ("counts in words", manifest({**GOOD_REPORT, "counts": "soup"})),
-    ("counts of tables", manifest({**GOOD_REPORT, "counts": {"images": {}}})),
-    ("a number as warning", manifest({**GOOD_REPORT, "warnings": [3]})),
+    writes(files.deep_json()), writes("[]"), manifest(None),
+    manifest({**GOOD_REPORT, "counts": {"images": {}}}),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("make", [make for _, make in MANIFESTS], ids=[name for name, _ in MANIFESTS])
+@pytest.mark.parametrize("make", MANIFESTS, ids=["deep", "list", "no report", "counts of tables"])
 def test_an_invalid_manifest_is_rewritten(make, tmp_path, run_cli):
     command, out = finished_run(tmp_path, run_cli)
     make(out / "01-features" / "manifest.json")
@@ -95,14 +94,17 @@ def test_an_invalid_manifest_is_rewritten(make, tmp_path, run_cli):
 
 RUN_FILES = [
     ("another version", writes('{"version": 2, "seed": 0}'), "version was 2 and is now 1"),
-    ("a list", writes("[1, 2]"), "holds another run"),
     ("wrong types", writes('{"version": 1, "seed": {}, "settings": []}'), "seed was {} and is now 0"),
     ("wrong photographs", writes('{"version": 1, "photographs": [3]}'), "holds another run"),
-]
+    *((name, make, "holds another run (its run.json ") for name, make in (
+        ("pipe", pipe), ("device", links("/dev/zero")), ("deep", writes(files.deep_json())),
+        ("10 TiB", sparse(10**13)),
+    )),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("make", "words"), [r[1:] for r in RUN_FILES], ids=[r[0] for r in RUN_FILES])
-def test_the_folder_of_another_version(make, words, tmp_path, run_cli):
+def test_a_run_file_that_is_invalid_or_of_another_version(make, words, tmp_path, run_cli):
     folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
     out.mkdir()
     make(out / "run.json")
@@ -110,16 +112,6 @@ def test_the_folder_of_another_version(make, words, tmp_path, run_cli):
     said = run_cli(command, 2)
     assert words in said
     assert "choose another folder, or use --overwrite" in said
-    run_cli([*command, "--overwrite"], 0)
-
-
-@pytest.mark.parametrize("make", [pipe, links("/dev/zero"), writes(files.deep_json()), sparse(10**13)])
-def test_an_invalid_run_file_counts_as_another_run(make, tmp_path, run_cli):
-    folder, out = files.folder_of(tmp_path, "in"), tmp_path / "out"
-    out.mkdir()
-    make(out / "run.json")
-    command = ["reconstruct", str(folder), "-o", str(out), *FEATURES]
-    assert "holds another run (its run.json " in run_cli(command, 2)
     assert [path.name for path in out.iterdir()] == ["run.json"]
     run_cli([*command, "--overwrite"], 0)
     assert json.loads((out / "run.json").read_text(encoding="utf-8"))["seed"] == 0
@@ -150,20 +142,13 @@ def summary_of_run(**changes):
 
 SUMMARIES = [
     ("absent", lambda _: None, "holds no summary.json"),
-    ("pipe", pipe, "holds no summary.json"),
     ("device", links("/dev/zero"), "holds no summary.json"),
     ("10 TiB", sparse(10**13), "holds no summary.json"),
-    ("deep", writes(files.deep_json()), "holds no summary.json"),
-    ("list", writes("[]"), "holds no summary.json"),
     ("bytes", writes(b"\xff\xfe"), "holds no summary.json"),
     ("digits", writes("9" * 9000), "holds no summary.json"),
     ("another program's", writes('{"a": 1}'), "is not a summary written by thesisrecon"),
-    ("words for numbers", writes(summary_of_run(reprojection_rms_px="x")), "is not a summary"),
-    ("a number for a list", writes(summary_of_run(cameras=3)), "is not a summary"),
     ("beyond numbers", writes(summary_of_run(reprojection_rms_px=10**400)), "is not a summary"),
     ("a camera of nothing", writes(summary_of_run(cameras=[{"focal_px": None}])), "is not a summary"),
-    ("refused in words", writes(summary_of_run(refused=["a.png"])), "is not a summary"),
-    ("no seconds", writes(summary_of_run(seconds=[])), "is not a summary"),
 ]
 
 
@@ -189,7 +174,7 @@ def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     """With an address space of 6 GiB, and another alphabet on the terminal."""
     folder = tmp_path / "in"
     folder.mkdir()
-    (folder / "böm\u5199.png").write_bytes(files.bomb())
+    (folder / "böm\u5199.png").write_bytes(files.png(30_000, 30_000))
     pipe(folder / "pipe\x1b[31m.jpg")
     packed = files.encoded("TIFF", compression="tiff_lzw")
     (folder / "packed.tif").write_bytes(packed[:200] + b"\xff" * 200 + packed[400:])

@@ -124,26 +124,20 @@ def patched():
         yield
 
 
-NAMES = (
-    *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json", "holiday.jpg", "a/b.txt",
-    "tiles/tile-0000.glb", "tiles/mine.glb", "00-frames/00-000000.png", "00-frames/mine.png",
-    "00-frames/frames.json", "01-features/mine.npz", "01-features/notes.txt", "06-metric/x.npz",
-    "group-2/summary.json", "group-2/cameras.json", "group-x/summary.json", "frames.json", "strip.html",
-    "frame-0001.png", "frame-0002.png", "frame-0009.png", "frame-x.png", "orbit.webp", "interpolation.webp",
-    "transforms.json", "images/00.png", "images/01.png", "images/mine.jpg", "camera_0.yml", "poses.yml",
-    "bundle.out", "list.txt", ".lock", ".hidden", "sparse/0/images.txt", "sparse/1/images.bin",
-    "model.GLB", "Summary.json",
+KNOWN = (
+    *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json", "tiles/tile-0000.glb",
+    "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
+    "frames.json", "strip.html", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
+    "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "bundle.out",
+    "list.txt",
 )  # fmt: skip
-KNOWN = {f"out/{name}" for name in NAMES} - {
-    f"out/{name}"
-    for name in (
-        "holiday.jpg", "a/b.txt", "tiles/mine.glb", "00-frames/mine.png", "01-features/mine.npz",
-        "01-features/notes.txt", "06-metric/x.npz", "group-x/summary.json", "frame-x.png", "frame-0009.png",
-        "images/mine.jpg", ".lock", ".hidden", "sparse/0/images.txt", "sparse/1/images.bin", "model.GLB",
-        "Summary.json",
-    )
-}  # fmt: skip
-"""Files that --overwrite may replace; the others survive it, too."""
+"""Files that --overwrite may replace; the following survive it, too."""
+UNKNOWN = (
+    "holiday.jpg", "a/b.txt", "tiles/mine.glb", "00-frames/mine.png", "01-features/mine.npz",
+    "01-features/notes.txt", "06-metric/x.npz", "group-x/summary.json", "frame-x.png", "frame-0009.png",
+    "images/mine.jpg", ".lock", ".hidden", "sparse/0/images.txt", "sparse/1/images.bin", "model.GLB",
+    "Summary.json",
+)  # fmt: skip
 FOLDERS = ("sparse", "sparse/0", "tiles", "00-frames", "images", "group-2", "views", "06-metric")
 STATES = (
     "same", "other", "early", "killed", "video", "cut video", "nerfstudio", "colmap", "render", "interpolate",
@@ -176,7 +170,7 @@ def make_state(rng, stock, place):
         if rng.random() < 0.35:
             kind = [*RUN_FILES][rng.integers(len(RUN_FILES))]
             RUN_FILES[kind](out / "run.json")
-        for name in rng.choice(NAMES, rng.integers(0, 4), replace=False).tolist():
+        for name in rng.choice(KNOWN + UNKNOWN, rng.integers(0, 4), replace=False).tolist():
             add_file(rng, out / name, outside, own)
         for name in rng.choice(FOLDERS, int(rng.random() < 0.25)).tolist():
             if not os.path.lexists(out / name) and (out / name).parent.is_dir():
@@ -240,7 +234,8 @@ def try_one(seed, stock, place, *, overwrite):
         code, said = 2, str(refusal)
     words = f"{seed}: {name}, {code} {said}"
     if overwrite:
-        own = {path: what for path, what in own.items() if path.relative_to(place).as_posix() not in KNOWN}
+        names = {path: path.relative_to(place).as_posix().removeprefix("out/") for path in own}
+        own = {path: what for path, what in own.items() if names[path] not in KNOWN}
     faults = [f"{words}: lost {path}" for path in lost(own)]
     if code == 2 and "resume from" not in said:
         after = tree(place)

@@ -1,4 +1,4 @@
-"""``thesisrecon render`` and ``interpolate`` with invalid models, cameras and images."""
+"""``thesisrecon render`` and ``interpolate``, and validation, with invalid models, cameras and images."""
 
 import json
 
@@ -7,6 +7,7 @@ import pytest
 
 from tests.bad_input import files
 from tests.bad_input.files import links, picture, pipe, sparse, writes
+from tests.io.test_colmap import NAMES, export, scene
 
 pytestmark = pytest.mark.usefixtures("bounded")
 
@@ -107,17 +108,55 @@ BETWEEN = [
     ("too long", [files.TOO_LONG, "a.png"], 2, "File name too long"),
     ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "'--frames'"),
     ("background", ["a.png", "--background", "#" * 9000], 2, "--background"),
+    ("small", ["a.png", "b.png", "--max-size", "9"], 2, "--max-size takes at least 64 px"),
+    ("one", ["a.png"], 2, "2 or 3 images; got 1"),
+    ("folder", ["sub", "a.png"], 2, "is a folder"),
+    ("copy", ["a.png", "copy.png"], 2, "a.png and copy.png are the same image"),
+    ("sizes", ["a.png", "less.png"], 2, "the same size; a.png is 96 x 80 and less.png is 80 x 64 px"),
+    ("text", ["a.png", "text.jpg"], 3, "text.jpg is not an image"),
+    ("unlike", ["a.png", "b.png"], 3, "do not match"),
 ]
 
 
 @pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
-def test_interpolation_rejects_files_that_are_not_images(words, code, said, tmp_path, run_cli, monkeypatch):
+def test_interpolation_rejects_what_gives_no_view(words, code, said, tmp_path, run_cli, monkeypatch):
     folder = files.folder_of(tmp_path, "in")
     (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
     (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))
     pipe(folder / "pipe.png")
     (folder / "round.png").symlink_to("round.png")
     (folder / "linked.png").symlink_to("a.png")
+    (folder / "sub").mkdir()
+    (folder / "copy.png").write_bytes((folder / "a.png").read_bytes())
+    (folder / "less.png").write_bytes(files.encoded("PNG", picture(2, (80, 64))))
+    (folder / "text.jpg").write_text("no picture", encoding="utf-8")
     monkeypatch.chdir(folder)
     assert said in run_cli(["interpolate", *words, "--threads", "1"], code)
     assert not (folder / "views").exists()
+
+
+TRUTHS = ["[]", "{}", '{"cameras": 3}', '{"cameras": {"a.png": {}}}', files.deep_json(), "\0"]
+TRUTHS += [json.dumps({"cameras": {"a.png": {"K": [[1]], "R": np.eye(3).tolist(), "C": [0, 0, 0]}}})]
+
+
+@pytest.mark.parametrize("text", TRUTHS, ids=[str(k) for k in range(len(TRUTHS))])
+def test_a_truth_of_wrong_types_is_refused(text, tmp_path, validated):
+    files.folder_of(tmp_path, "images")
+    (tmp_path / "cameras.json").write_text(text, encoding="utf-8")
+    said = validated(["report", "-o", str(tmp_path / "out"), "--images", str(tmp_path)])
+    assert "cameras.json does not hold cameras; it must " in said
+
+
+def test_a_truth_that_is_cut_or_of_other_images_is_refused(tmp_path, validated):
+    folder = tmp_path / "in"
+    export(folder / "sparse" / "0", scene())
+    for name in NAMES:
+        (folder / f"x {name}").write_bytes(files.encoded("PNG"))
+    command = ["report", "-o", str(tmp_path / "out"), "--images", str(folder)]
+    assert "must have a camera with K for every image; it lacks ['x a b.jpg'" in validated(command)
+    path = folder / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes()[:500])
+    said = validated(command)
+    assert "images.bin is not a valid COLMAP file; it " in said
+    assert "export the model again" in said
+    assert not (tmp_path / "out").exists()

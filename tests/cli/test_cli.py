@@ -1,8 +1,9 @@
 """The command line on the project's own photographs: one whole run, killed once, and what it prints."""
 
-import json
+import ast
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -11,10 +12,13 @@ import time
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+import thesisrecon
+from tests.conftest import refuses
 from tests.pipeline.fake_stages import kept_bytes, read
-from thesisrecon.cli import common, runs
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli import common
+from thesisrecon.cli.main import app, run_command
 from thesisrecon.io import _images
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +64,7 @@ def killed_and_resumed(photographs):
     return out, kept
 
 
-def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed):
+def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed, capsys):
     out, kept = killed_and_resumed
     assert kept >= 2
     summary = read(out / "summary.json")
@@ -70,6 +74,10 @@ def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed)
     focal = truth["cameras"][0]["K"][0][0]
     assert summary["cameras"][0]["focal_px"]["value"] == pytest.approx(focal, rel=0.02)
     assert summary["points"] > 300
+    assert run_command(["inspect", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{VIEWS} of {VIEWS} images registered" in printed
+    assert "camera 0: focal length" in printed
 
 
 def test_a_kill_and_the_number_of_threads_change_no_byte(killed_and_resumed, photographs, tmp_path):
@@ -87,13 +95,6 @@ def test_the_preset_of_the_thesis_runs_to_the_end(photographs, tmp_path, capsys)
     summary = read(out / "summary.json")
     assert summary["registered"] >= 4
     assert summary["registered"] + len(summary["refused"]) == VIEWS
-
-
-def test_inspect_prints_the_results(killed_and_resumed, capsys):
-    assert run_command(["inspect", str(killed_and_resumed[0])]) == 0
-    printed = capsys.readouterr().out
-    assert f"{VIEWS} of {VIEWS} images registered" in printed
-    assert "camera 0: focal length" in printed
 
 
 def test_a_run_is_exported_with_the_images_that_it_was_made_from(killed_and_resumed, photographs, tmp_path):
@@ -125,64 +126,51 @@ def test_an_early_end_prints_the_results_of_its_stage(photographs, tmp_path, cap
         assert re.match(words, capsys.readouterr().out)
 
 
-def test_a_finished_run_is_not_touched_by_another_config(killed_and_resumed, photographs, refused):
+def test_a_finished_run_is_not_touched_by_another_config_and_its_own_runs_again(
+    killed_and_resumed, photographs, refused, capsys
+):
     out, _ = killed_and_resumed
     before = (out / "summary.json").read_bytes()
-    arguments = ["reconstruct", str(photographs), "-o", str(out), "--max-size", "700"]
-    assert "images.max_size_px was 320 and is now 700" in refused(arguments)
+    arguments = ["reconstruct", str(photographs), "-o", str(out)]
+    assert "images.max_size_px was 320 and is now 700" in refused([*arguments, "--max-size", "700"])
     assert (out / "summary.json").read_bytes() == before
-
-
-def test_the_written_config_runs_again(killed_and_resumed, photographs, capsys):
-    out, _ = killed_and_resumed
-    arguments = ["reconstruct", str(photographs), "-o", str(out), "--config", str(out / "config.toml")]
-    assert run_command([*arguments, "--threads", "2", "--until", "metric"]) == 0
+    own = ["--config", str(out / "config.toml"), "--threads", "2", "--until", "metric"]
+    assert run_command([*arguments, *own]) == 0
     assert "registered" in capsys.readouterr().out
     assert set(read(out / "summary.json")["resumed"]) >= {"features", "matches", "tracks", "metric"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["reconstruct"], "Missing"),
-        (["reconstruct", "nowhere", "-o", "out"], "there is no folder nowhere"),
-        (["reconstruct", ".", "-o", "out", "--preset", "best"], "--preset"),
-        (["reconstruct", ".", "-o", "out", "--cameras", "two"], "--cameras"),
-        (["reconstruct", ".", "-o", "out", "--no-such-option"], "--no-such-option"),
-        (["reconstruct", ".", "-o", "out", "--seed", "many"], "--seed"),
-        (["reconstruct", ".", "-o", "out", "--set", "features.kin=x"], "did you mean features.kind"),
-        (["reconstruct", ".", "-o", "out", "--config", "nowhere.toml"], "nowhere.toml cannot be read"),
-        (["reconstruct", ".", "-o", "out", "--until", "surface"], "unknown stage"),
-        (["reconstruct", ".", "-o", "out", "--executor", "dask://x"], "given as dask://HOST:PORT"),
-        (["reconstruct", ".", "-o", "out", "--max-size", "5"], "at least 64"),
-        (["reconstruct", ".", "-o", "out", "--pairs", "window:0"], "must be at least 1; got 0"),
-        (["reconstruct", ".", "-o", "out", "--pairs", "window"], "takes a whole number"),
-        (["reconstruct", ".", "-o", "out", "--pairs", "window:--5"], "takes a whole number"),
-        (["reconstruct", ".", "-o", "out", "--pairs", "most"], "all, overlap, window:N, or a file"),
-        (["reconstruct", ".", "-o", "out", "--set", "pairs.kind=some"], "unknown kind of pairs"),
-        (["inspect", "nowhere"], "no summary"),
-        (["reconstruct", ".", "-o", ""], "the folder has no name"),
-        (["reconstruct", "", "-o", "out"], "the folder has no name"),
-        (["reconstruct", "--from", "", "-o", "out"], "the folder has no name"),
-        (["reconstruct", "--from", "a.db", "--images", "", "-o", "out"], "the folder has no name"),
-        (["export", ".", "--to", "colmap", "--images", "", "-o", "out"], "the folder has no name"),
-        (["demo", "-o", " "], "the folder has no name"),
-        (["rebuild"], "rebuild"),
-    ],
-)
-def test_a_wrong_command_gets_one_sentence_and_exit_2(arguments, words, tmp_path, monkeypatch, refused):
+NAMELESS = "the folder has no name"
+# Commands with words of the one sentence; "''" is an empty word.
+WRONG = [
+    ("reconstruct", "Missing"), ("rebuild", "rebuild"), ("inspect nowhere", "no summary"),
+    ("reconstruct nowhere -o out", "there is no folder nowhere"),
+    ("reconstruct . -o out --preset best", "--preset"), ("reconstruct . -o out --cameras two", "--cameras"),
+    ("reconstruct . -o out --no-such-option", "--no-such-option"),
+    ("reconstruct . -o out --set features.kin=x", "did you mean features.kind"),
+    ("reconstruct . -o out --config nowhere.toml", "nowhere.toml cannot be read"),
+    ("reconstruct . -o out --until surface", "unknown stage"),
+    ("reconstruct . -o out --executor dask://x", "given as dask://HOST:PORT"),
+    ("reconstruct . -o out --max-size 5", "at least 64"),
+    ("reconstruct . -o out --pairs window:0", "must be at least 1; got 0"),
+    ("reconstruct . -o out --pairs window", "takes a whole number"),
+    ("reconstruct . -o out --pairs window:--5", "takes a whole number"),
+    ("reconstruct . -o out --pairs most", "all, overlap, window:N, or a file"),
+    ("reconstruct . -o out --set pairs.kind=some", "unknown kind of pairs"),
+    ("reconstruct . -o ''", NAMELESS), ("reconstruct '' -o out", NAMELESS), ("demo -o ' '", NAMELESS),
+    ("reconstruct --from '' -o out", NAMELESS), ("reconstruct --from a.db --images '' -o out", NAMELESS),
+    ("export . --to colmap --images '' -o out", NAMELESS),
+    ("reconstruct -o out", "give the folder of the images, or --from"),
+    ("reconstruct a --from b -o out", "with --from the images are given by --images"),
+    ("reconstruct a --images b -o out", "give the folder of the images, or --from"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("line", "words"), WRONG)
+def test_a_wrong_command_gets_one_sentence_and_exit_2(line, words, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
-    assert words in refused(arguments)
+    assert words in refused(shlex.split(line))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_states_how_to_resume(photographs, tmp_path, monkeypatch, refused):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("thesisrecon.api.reconstruct.reconstruct", interrupt)
-    said = refused(["reconstruct", photographs, "-o", tmp_path / "out"], 130)
-    assert "repeat the command to resume" in said
 
 
 def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkeypatch, refused):
@@ -194,18 +182,15 @@ def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkey
     arguments = ["reconstruct", str(photographs), "-o", str(tmp_path / "out")]
     assert re.search(r"IndexError in test_cli\.py line \d+: index 3 is out", refused(arguments, 1))
     monkeypatch.setenv(common.DEBUG_VARIABLE, "1")
-    with pytest.raises(IndexError):
-        run_command(arguments)
+    refuses(IndexError, None, run_command, arguments)
 
 
 def test_help_and_version(capsys):
-    assert run_command(["--version"]) == 0
-    assert run_command([]) == 0
-    assert run_command(["reconstruct", "--help"]) == 0
+    for arguments in (["--version"], [], ["reconstruct", "--help"]):
+        assert run_command(arguments) == 0
     printed = capsys.readouterr().out
-    options = ["--preset", "--cameras", "--config", "--set", "--seed", "--threads", "--max-size", "--until"]
-    for option in [*options, "--executor", "--overwrite"]:
-        assert option in printed
+    for option in ("preset", "cameras", "config", "set", "seed", "threads", "max-size", "until", "executor"):
+        assert f"--{option}" in printed
 
 
 def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, refused):
@@ -213,42 +198,37 @@ def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_pa
     assert str(tmp_path / "thesisrecon" / "courtyard") in refused(["demo", "-o", tmp_path / "out"])
 
 
-def test_the_demo_replaces_another_run_only_on_request(monkeypatch, tmp_path, refused):
-    """The run may be a demo of another version, with other settings."""
-    monkeypatch.setattr(runs, "_DEMO_SETTINGS", {"images.max_size_px": 128})
-    monkeypatch.setattr(_images, "demo_images", lambda: sorted((COURTYARD / "images").iterdir())[:1])
-    (tmp_path / "run.json").write_text(json.dumps({"settings": {}, "images": {}}))
-    assert "holds another run" in refused(["demo", "-o", tmp_path])
-    assert read(tmp_path / "run.json") == {"settings": {}, "images": {}}
-    # One image is too few for a model, which is found after the folder was taken over.
-    assert "1 usable image; at least two" in refused(["demo", "-o", tmp_path, "--overwrite"], 3)
-    assert len(read(tmp_path / "run.json")["images"]) == 1
-
-
 def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys, refused):
     names = sorted(path.name for path in photographs.iterdir())
-    knowledge, out = tmp_path / "pairs.txt", tmp_path / "out"
-    knowledge.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
-    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
-    assert run_command([*given, "--pairs", str(knowledge)]) == 0
+    pairs, out = tmp_path / "pairs.txt", tmp_path / "out"
+    given = ["reconstruct", photographs, "-o", out, *SMALL, "--until", "matches", "--pairs", pairs]
+    wrong = (f"{names[0]} nope.jpg", "'nope.jpg', which is not among"), ("", "leaves no pair")
+    pairs.write_text(wrong[0][0], encoding="utf-8")
+    assert wrong[0][1] in refused(given)
+    # A corrected list needs no --overwrite.
+    pairs.write_text(f"{names[1]} {names[0]}\n{names[1]} {names[2]}\n", encoding="utf-8")
+    assert run_command([str(word) for word in given]) == 0
     assert "of 2 image pairs accepted (10 are possible)" in capsys.readouterr().out
-    pairs = read(out / "summary.json")["pairs"]
-    assert (pairs["matched"], pairs["possible"], pairs["selection"]) == (2, 10, "the listed pairs")
-    assert "2 of 10 pairs were matched: the listed pairs." in (out / "report.html").read_text(
-        encoding="utf-8"
-    )
-    for line, words in ((f"{names[0]} nope.jpg", "'nope.jpg', which is not among"), ("", "leaves no pair")):
-        knowledge.write_text(line, encoding="utf-8")
-        assert words in refused([*given, "--pairs", knowledge, "--overwrite"])
+    found = read(out / "summary.json")["pairs"]
+    assert (found["matched"], found["possible"], found["selection"]) == (2, 10, "the listed pairs")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "2 of 10 pairs were matched: the listed pairs." in page
+    for line, words in wrong:
+        pairs.write_text(line, encoding="utf-8")
+        assert words in refused([*given, "--overwrite"])
     # The run that was there is whole.
     assert read(out / "run.json")["settings"]["pairs"]["listed"][0] == [names[1], names[0]]
     assert (out / "report.html").is_file()
 
 
-def test_a_corrected_list_of_pairs_needs_no_overwrite(photographs, tmp_path):
-    names = sorted(path.name for path in photographs.iterdir())
-    knowledge, out = tmp_path / "pairs.txt", tmp_path / "out"
-    given = ["reconstruct", str(photographs), "-o", str(out), *SMALL, "--until", "matches"]
-    for line, code in ((f"{names[0]} nope.jpg", 2), (f"{names[0]} {names[1]}", 0)):
-        knowledge.write_text(line, encoding="utf-8")
-        assert run_command([*given, "--pairs", str(knowledge)]) == code
+def test_messages_name_only_options_that_exist():
+    commands = get_command(app).commands.values()
+    options = {option for command in commands for given in command.params for option in given.opts}
+    package, texts = Path(thesisrecon.__file__).parent, []
+    for path in package.rglob("*.py"):
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        texts += [n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    texts.append((package / "messages.toml").read_text(encoding="utf-8"))
+    named = {option for text in texts if " " in text for option in re.findall(r"--[a-z][a-z-]+", text)}
+    assert len(named) > 10
+    assert named <= options | {"--help", "--version"}

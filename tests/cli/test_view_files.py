@@ -13,7 +13,6 @@ from tests.surface.sphere import SHAPE, photograph, ring_of
 from thesisrecon.api.export import write_mesh
 from thesisrecon.camera import Camera
 from thesisrecon.cli.main import run_command
-from thesisrecon.cli.view_files import render_run
 from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
 from thesisrecon.records import TexturedMesh
@@ -69,12 +68,8 @@ def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
     assert said.out == f"5 frames of 160 x 120 px and interpolate.webp written to {folder}\n"
     assert said.err == ""
     frames = [f"frame-000{k}.png" for k in range(1, 6)]
-    assert sorted(path.name for path in folder.iterdir()) == [
-        ".lock",
-        *frames,
-        "frames.json",
-        "interpolate.webp",
-    ]
+    names = [".lock", *frames, "frames.json", "interpolate.webp"]
+    assert sorted(path.name for path in folder.iterdir()) == names
     assert difference_from_photograph(folder / "frame-0001.png", 0) < 6
     assert difference_from_photograph(folder / "frame-0005.png", COUNT - 1) < 6
     with PIL.Image.open(folder / "interpolate.webp") as film:
@@ -180,11 +175,3 @@ def test_a_folder_of_photographs_is_not_written_over(run, refused):
     assert "move the file that is in the place of a folder" in refused(
         ["render", run, "-o", photographs / "frame-0001.png"]
     )
-
-
-def test_progress_is_reported_to_the_end(run):
-    heard = []
-    film = run / "film"
-    render_run(run, film, frames=3, size=(40, 30), threads=2, progress=lambda *step: heard.append(step))
-    assert heard == [("views", k, 4) for k in range(1, 5)]
-    assert len(list(film.glob("frame-*.png"))) == len(list(film.glob("orbit.*"))) + 2 == 3

@@ -1,7 +1,7 @@
 """Settings, presets and priors of intrinsics."""
 
 import tomllib
-from dataclasses import is_dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -13,8 +13,6 @@ from thesisrecon.api.reconstruct import _exif_warnings
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig, preset
 from thesisrecon.config.intrinsics import IntrinsicsOptions, camera_numbers, prior_from_options
 from thesisrecon.config.text import (
-    _parse,
-    _toml_lines,
     as_config,
     build_config,
     config_from_tables,
@@ -41,27 +39,30 @@ def test_a_preset_survives_toml(name):
     config = preset(name)
     assert config_from_toml(toml_from_config(config), preset("default")) == config
     assert tomllib.loads(toml_from_config(config)) == tables_from_config(config)
-
-
-def test_the_steps_of_the_front_end_are_switched_by_settings():
-    values = {
-        "features.spread": False, "features.levels": 3, "features.measure.formula": "harris",
-        "features.measure.colour": True, "matching.growth": False, "matching.coarse_first": False,
-        "matching.rematch": False, "matching.align": False, "matching.support": "never",
-        "matching.orientation": "upright",
-    }  # fmt: skip
-    config = apply_settings(*(f"{place}={str(value).lower()}" for place, value in values.items()))
-    assert {place: attrgetter(place)(config) for place in values} == values
-    assert config_from_toml(toml_from_config(config)) == config
+    awkward = replace(config, pairs=ListedPairs((('quote " backslash \\ newline \n tab \t ünï', "b.png"),)))
+    assert config_from_toml(toml_from_config(awkward)) == awkward
 
 
 @pytest.mark.parametrize(("stage", "kind"), [(s, k) for s, kinds in KINDS.items() for k in kinds])
 def test_every_kind_can_be_chosen_by_its_word(stage, kind):
-    config = apply_settings(f"{stage}.kind={kind}")
-    variant = getattr(config, stage)
+    variant = getattr(apply_settings(f"{stage}.kind={kind}"), stage)
     assert type(variant) is KINDS[stage][kind]
-    assert is_dataclass(variant)
     assert type(variant).__dataclass_params__.frozen
+
+
+def test_settings_of_each_type_are_those_of_the_text_and_survive_toml():
+    values = {
+        "features.spread": False, "features.levels": 3, "features.measure.formula": "harris",
+        "features.measure.integration_sigma_px": 2.0, "matching.ratio": 0.75, "matching.growth": False,
+        "matching.support": "never", "intrinsics.principal_point_px": (1.0, 2.5),
+        "selfcalibration.search": None,
+    }  # fmt: skip
+    texts = {None: "none", (1.0, 2.5): "[1, 2.5]", 2.0: "2e0"}
+    config = apply_settings(*(f"{place}={texts.get(v, str(v).lower())}" for place, v in values.items()))
+    found = {place: attrgetter(place)(config) for place in values}
+    assert found == values
+    assert [type(v) for v in found.values()] == [type(v) for v in values.values()]
+    assert config_from_toml(toml_from_config(config)) == config
 
 
 def test_options_build_the_same_configuration_as_settings(tmp_path):
@@ -113,25 +114,6 @@ def test_options_that_contradict_or_are_unknown_get_a_sentence(given, words):
     refuses(UsageError, words, build_config, **given)
 
 
-def test_the_file_names_its_preset_unless_the_command_did():
-    text = 'preset = "thesis"\n[images]\nmax_size_px = 900\n'
-    assert config_from_toml(text) == replace(
-        preset("thesis"), images=replace(preset("thesis").images, max_size_px=900)
-    )
-    assert config_from_toml(text, preset("default"), fixed_preset=True).features == preset("default").features
-
-
-def test_a_setting_keeps_the_others_of_its_stage():
-    config = apply_settings(
-        "features.max_corners=7", "features.kind=harris-corners", "features.threshold_rel=0.5"
-    )
-    assert (config.features.max_corners, config.features.threshold_rel) == (7, 0.5)
-    config = apply_settings("features.measure.integration_sigma_px=2", "selfcalibration.search=none")
-    assert config.features.measure.integration_sigma_px == 2.0
-    assert config.selfcalibration.search is None
-    assert config_from_toml(toml_from_config(config)) == config
-
-
 def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table():
     kind = "selfcalibration.kind=stratified"
     modulus = apply_settings(kind, "selfcalibration.plane=modulus-constraint")
@@ -172,6 +154,9 @@ def test_a_wrong_setting_gets_a_sentence(setting, words):
 
 
 def test_settings_of_file_and_command_are_merged_before_they_are_checked():
+    thesis, text = preset("thesis"), 'preset = "thesis"\n[images]\nmax_size_px = 900\n'
+    assert config_from_toml(text) == replace(thesis, images=replace(thesis.images, max_size_px=900))
+    assert config_from_toml(text, preset("default"), fixed_preset=True).features == preset("default").features
     config = apply_settings("intrinsics.focal_px=700", "intrinsics.focal_std_rel=0.05")
     assert (config.intrinsics.focal_px, config.intrinsics.focal_std_rel) == (700.0, 0.05)
     over = [tables_from_settings(["intrinsics.focal_std_rel=0.2"])]
@@ -181,22 +166,6 @@ def test_settings_of_file_and_command_are_merged_before_they_are_checked():
         over = [tables_from_settings([f"features.kind={kind}"])]
         config = config_from_toml("[features]\nlevels = 4\n", changes=over)
         assert getattr(config.features, "levels", None) == levels
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("true", True), ("3", 3), ("-2.5e3", -2500.0), ("[1, 2.5]", [1, 2.5]), ("word", "word"), ("'3'", "3")],
-)
-def test_words_of_the_command_line(text, value):
-    parsed = _parse(text)
-    assert parsed == value
-    assert type(parsed) is type(value)
-
-
-def test_toml_keeps_awkward_text():
-    text = 'quote " backslash \\ newline \n tab \t ünï'
-    tables = {"a": {"text": text, "list": [1, 2.5, True], "b": {"c": 1e-300}}}
-    assert tomllib.loads("\n".join(_toml_lines(tables, ()))) == tables
 
 
 SIZES = [(4000, 3000), (4000, 3000), (3000, 4000)]
@@ -256,21 +225,7 @@ def test_exif_is_used_on_request():
     assert known.focal_known.all()
 
 
-def test_a_known_focal_without_exif_is_constant_and_reported():
-    options = IntrinsicsOptions(focal="known", exif=True)
-    silent = np.full(3, np.nan)
-    got = stages_view(options)
-    assert got.group.tolist() == [0, 0, 1]
-    assert np.isinf(got.std[:, 0]).all()
-    assert camera_numbers(SIZES, options, silent).tolist() == [0, 0, 1]
-    (sentence,) = _exif_warnings(options, silent)
-    assert "found in 3 images" in sentence
-    assert "constant" in sentence
-    each = IntrinsicsOptions(focal="known", exif=True, cameras="per-image")
-    assert stages_view(each).group.tolist() == [0, 1, 2]
-
-
-def test_images_without_exif_share_one_focal():
+def test_images_without_exif_share_one_focal_and_are_reported():
     options = IntrinsicsOptions(focal="known", exif=True)
     sizes = [(4000, 3000)] * 5
     exif = np.array([3000.0, np.nan, 3000.0, np.nan, 3500.0])
@@ -282,6 +237,14 @@ def test_images_without_exif_share_one_focal():
     assert camera_numbers(sizes, options, exif).tolist() == [0, 1, 0, 1, 2]
     assert "2 of the 5 images" in _exif_warnings(options, exif)[0]
     assert "constant" in _exif_warnings(options, exif)[0]
+    none = stages_view(options)
+    assert none.group.tolist() == camera_numbers(SIZES, options, np.full(3, np.nan)).tolist() == [0, 0, 1]
+    assert np.isinf(none.std[:, 0]).all()
+    assert "found in 3 images" in _exif_warnings(options, np.full(3, np.nan))[0]
+    each = IntrinsicsOptions(focal="known", exif=True, cameras="per-image")
+    assert stages_view(each).group.tolist() == [0, 1, 2]
+    assert not _exif_warnings(options, np.full(2, 800.0))
+    assert not _exif_warnings(IntrinsicsOptions(), np.full(2, np.nan))
 
 
 def test_a_principal_point_far_outside_of_the_picture_is_refused():

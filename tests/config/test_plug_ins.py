@@ -1,10 +1,9 @@
-"""Functions and objects from outside as stages: calls, refusals, text form, stored results."""
+"""Functions and objects from outside as stages: calls, refusals, stored results, examples of the page."""
 
 # ruff: noqa: ARG001, ARG002, ARG005 (functions and methods take what their stage passes)
 
 import functools
 import importlib
-import linecache
 import logging
 import re
 import sys
@@ -173,22 +172,17 @@ def give(returned, stage):
     return chosen
 
 
-class Extracted:
-    """A matcher that is no dataclass: features once an image, then pairs of them."""
+class Own:
+    """A matcher that is no dataclass and returns what it is given."""
 
-    def __init__(self, ratio):
-        self.ratio = ratio
+    def __init__(self, returned):
+        self.returned = returned
 
     def prepare(self, image, features):
-        xy = strong(image.rgb)
-        return xy, windows(image.rgb, xy)
+        return FunctionMatcher(mutual).prepare(image, features)
 
     def match(self, view1, view2, **_):
-        similarity = view1[1] @ view2[1].T
-        best = similarity.argmax(axis=1)
-        good = similarity.argmax(axis=0)[best] == np.arange(len(best))
-        good &= similarity.max(axis=1) > self.ratio
-        return view1[0][good], view2[0][best[good]]
+        return self.returned
 
 
 class Incomplete:
@@ -200,7 +194,7 @@ class Incomplete:
     [
         ("matching", Incomplete(), "prepare and match, or a function of image1, image2; .*no match"),
         ("features", Incomplete(), r"method detect of features=Incomplete .*\(image\); it takes \(\)"),
-        ("matching", Extracted, r"got the class Extracted: write Extracted\(\)"),
+        ("matching", Own, r"got the class Own: write Own\(\)"),
         ("matching", lambda image: image, r"2 arguments \(image1, image2\); it takes \(image\)"),
         ("features", mutual, "1 arguments"),
         ("tracks", mutual, "only features, pairs, matching, epipolar take a plain function, got mutual"),
@@ -212,37 +206,15 @@ def test_a_method_is_checked_when_the_configuration_is_built(stage, value, words
     refuses(UsageError, words, PipelineConfig, **{stage: value})
 
 
-def test_an_object_that_is_no_dataclass_works(tmp_path):
-    def run(ratio, out):
-        config = PipelineConfig(images=SMALL, features=strong, matching=Extracted(ratio), verification=FEW)
-        result = reconstruct(images(2), tmp_path / out, config=config, until="matches", overwrite=True)
-        return result, result.pairs[0].candidates
-
-    result, loose = run(0.6, "a")
-    assert result.settings["matching"] == {"kind": "Extracted"}
-    assert run(0.6, "a")[0].summary["resumed"] == ["features", "pairs", "matches"]
-    assert run(0.9, "a")[1] == run(0.9, "b")[1] < loose
-
-
-class Wrong(Extracted):
-    def match(self, view1, view2, **_):
-        return self.ratio
-
-
 def test_an_object_is_checked_like_a_function(tmp_path):
-    config = PipelineConfig(images=SMALL, matching=Wrong((np.ones((3, 2)), np.ones((2, 2)))))
-    words = "method match of Wrong returned 3 xy1 and 2 xy2"
+    config = PipelineConfig(images=SMALL, matching=Own((np.ones((3, 2)), np.ones((2, 2)))))
+    words = "method match of Own returned 3 xy1 and 2 xy2"
     refuses(UsageError, words, match_pair, *images(2), config=config)
     views = [FunctionMatcher(mutual).prepare(image, None) for image in photographs(2)]
     matches = FunctionMatcher(mutual).match(*views, pair=(0, 1), estimate_fundamental=None, rng=None)
     matches.index1[:1] = 7**7
-    config = PipelineConfig(images=SMALL, features=strong, matching=Corrupt(matches))
+    config = PipelineConfig(images=SMALL, features=strong, matching=Own(matches))
     refuses(UsageError, "indices that are not corners", match_pair, *images(2), config=config)
-
-
-class Corrupt(Wrong):
-    def prepare(self, image, features):
-        return FunctionMatcher(mutual).prepare(image, features)
 
 
 def test_features_without_seeds_get_a_sentence_where_seeds_are_needed(tmp_path):
@@ -337,46 +309,30 @@ def test_a_function_of_a_prompt_cannot_be_replayed(tmp_path):
     refuses(UsageError, "cannot be sent to another process", reconstruct, images(2), out, **given)
 
 
-def defined(text, name="f", file="<stdin>"):
-    """What a prompt or a notebook cell defines."""
+def defined(text):
+    """The function f that a prompt or a notebook cell defines."""
     scope = {"__name__": "__main__", "mutual": mutual}
-    exec(compile(text, file, "exec"), scope)
-    return scope[name]
+    exec(text, scope)
+    return scope["f"]
 
 
-def in_a_notebook_cell(ratio, _tmp_path):
-    text = f"RATIO = {ratio}\ndef f(a, b):\n    return mutual(a, b, RATIO)"
-    file = f"<ipython-input-{ratio}>"
-    linecache.cache[file] = (len(text), None, text.splitlines(True), file)
-    return defined(text, file=file)
+def test_strength_of_match_takes_the_features_of_a_function():
+    config = PipelineConfig(images=SMALL, features=strong, matching=StrengthOfMatch(), verification=FEW)
+    assert match_pair(*images(2), config=config).inliers >= 20
 
 
-def with_an_edited_helper(ratio, tmp_path):
-    (tmp_path / "edited_helper.py").write_text(f"def limit(): return {ratio}  # {ratio}", encoding="utf-8")
-    sys.modules.pop("edited_helper", None)
-    importlib.invalidate_caches()
-    return defined("import edited_helper\ndef f(a, b):\n    return mutual(a, b, edited_helper.limit())")
-
-
-def closure(ratio, _tmp_path):
-    def f(a, b):
-        return mutual(a, b, ratio)
-
-    return f
-
-
-def a_class_at_a_prompt(ratio, _tmp_path):
-    text = re.sub(r"from (tests|beside).*\n", "", FILE).replace("0.9", str(ratio))
-    return defined(text + "\nf = Mutual()")
-
-
-@pytest.mark.parametrize("make", [in_a_notebook_cell, with_an_edited_helper, closure, a_class_at_a_prompt])
-def test_an_edited_variant_takes_no_stored_results(make, tmp_path, monkeypatch):
+def test_an_edited_variant_takes_no_stored_results(tmp_path, monkeypatch):
+    """Here a helper of its code is edited; other edits are tested with the digest."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # two edits within a second
 
     def matched(ratio, out="out"):
-        config = PipelineConfig(images=SMALL, features=HarrisCorners(), matching=make(ratio, tmp_path))
+        helper = f"def limit(): return {ratio}  # {ratio}"
+        (tmp_path / "edited_helper.py").write_text(helper, encoding="utf-8")
+        sys.modules.pop("edited_helper", None)
+        importlib.invalidate_caches()
+        own = "import edited_helper\ndef f(a, b):\n    return mutual(a, b, edited_helper.limit())"
+        config = PipelineConfig(images=SMALL, features=HarrisCorners(), matching=defined(own))
         result = reconstruct(images(2), tmp_path / out, config=config, until="matches", overwrite=True)
         return result.pairs[0].candidates, result.summary["resumed"]
 
@@ -388,6 +344,63 @@ def test_an_edited_variant_takes_no_stored_results(make, tmp_path, monkeypatch):
     assert "matches" in matched(0.5)[1]
 
 
-def test_strength_of_match_takes_the_features_of_a_function():
-    config = PipelineConfig(images=SMALL, features=strong, matching=StrengthOfMatch(), verification=FEW)
-    assert match_pair(*images(2), config=config).inliers >= 20
+PAGE = Path(__file__).parents[2] / "docs" / "recipes" / "plug-ins.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+GIVEN = {"until": "matches", "max_size": 400}
+
+
+@pytest.mark.references
+@pytest.mark.parametrize(
+    ("number", "said", "max_size"), [(0, "config=config, max_size=1000", 600), (1, "**given)", 400)]
+)
+def test_opencv_sift_matches_and_its_keypoints_are_features(number, said, max_size, tmp_path):
+    definition, call = BLOCKS[number].split("result = ")
+    scope = {"__name__": "__main__"}
+    exec(definition, scope)
+    assert call.startswith(f'thesisrecon.reconstruct("images", "out", {said}')
+    given = scope.get("given", {"config": scope.get("config")}) | GIVEN | {"max_size": max_size}
+    result = reconstruct(images(3), tmp_path / "out", **given)
+    assert sum(pair.accepted for pair in result.pairs) >= 2
+    assert max(pair.inliers for pair in result.pairs) > (100 if number == 0 else 0)
+
+
+class Extractor:
+    """A stub of an extractor: an image (1, 3, H, W) in, keypoints (1, N, 2) and descriptors (1, N, D) out."""
+
+    def __init__(self, max_num_keypoints):
+        self.count = max_num_keypoints
+
+    def extract(self, tensor):
+        assert tensor.dtype == np.float32
+        assert tensor.shape[:2] == (1, 3)
+        rgb = np.moveaxis(tensor[0], 0, 2) * 255
+        xy = strong(rgb, min(self.count, 300))
+        return {"keypoints": xy[None], "descriptors": windows(rgb, xy)[None]}
+
+
+class Matcher:
+    """A stub of a matcher: matches (1, M, 2) and scores (1, M) of two images."""
+
+    def __call__(self, data):
+        similarity = data["image0"]["descriptors"][0] @ data["image1"]["descriptors"][0].T
+        best = similarity.argmax(axis=1)
+        one = np.flatnonzero(similarity.argmax(axis=0)[best] == np.arange(len(best)))
+        return {"matches": [np.column_stack([one, best[one]])], "scores": [similarity.max(axis=1)[one]]}
+
+
+def test_a_lightglue_style_matcher_fits_with_a_class(tmp_path):
+    scope = {"__name__": "__main__", "extractor": Extractor, "matcher": Matcher}
+    exec(BLOCKS[2], scope)
+    few, images_ = PairVerification(min_inliers=20), ImageOptions(max_size_px=400)
+    found = []
+    for score in (0.9, 0.7):
+        matching = scope["LightGlueMatching"](min_score=score)
+        config = PipelineConfig(images=images_, features=strong, matching=matching, verification=few)
+        result = reconstruct(images(3), tmp_path / "out", config=config, until="matches", overwrite=True)
+        found.append(sum(pair.candidates for pair in result.pairs))
+    assert found[1] > found[0] > 0
+    assert result.pairs[0].accepted
+    table = {"kind": "LightGlueMatching", "max_keypoints": 2048, "min_score": 0.7}
+    assert result.settings["matching"] == table
+    tracks = AlignedTracks().build([None] * 3, result.pairs, map_all=one_by_one, rng=np.random.default_rng(0))
+    assert tracks.n_points >= result.pairs[0].inliers

@@ -1,7 +1,6 @@
 """Reading and writing text, lists of pairs and cameras; files are written atomically."""
 
 import errno
-import json
 import os
 import pickle
 from pathlib import Path
@@ -10,8 +9,6 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from tests.io.test_colmap import export, scene
-from thesisrecon.api.models import read_cameras
 from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
 from thesisrecon.io import _files as files
 from validation.studies.robustness import disk_ends
@@ -31,12 +28,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     assert entries(tmp_path) == before
     assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {REMEDIES[number]}"
     assert isinstance(refused.value, UsageError)
-
-
-def test_each_file_of_a_model_is_whole_or_absent(tmp_path):
-    with disk_ends(3, errno.ENOSPC), pytest.raises(OutputError, match=r"frames\.bin cannot be written"):
-        export(tmp_path / "0", scene())
-    assert sorted(entries(tmp_path / "0")) == ["cameras.bin", "rigs.bin"]
 
 
 def test_a_file_stands_where_a_folder_belongs(tmp_path):
@@ -59,41 +50,12 @@ def test_the_sentence_survives_the_way_from_a_worker():
 
 
 def test_json_has_no_nan(tmp_path):
-    files.write_json(
-        tmp_path / "a.json",
-        {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])},
-    )
+    values = {"a": float("nan"), "b": [np.float64(1.5), np.int64(2)], "c": np.array([np.inf, 1])}
+    files.write_json(tmp_path / "a.json", values)
     assert files.read_json(tmp_path / "a.json") == {"a": None, "b": [1.5, 2], "c": [None, 1.0]}
     assert files.read_json(tmp_path / "b.json") is None
-    assert [files.is_partial(name) for name in (".points.ply.partial", "points.ply.partial", ".lock")] == [
-        True,
-        False,
-        False,
-    ]
-
-
-@pytest.mark.parametrize(
-    ("name", "shown"),
-    [
-        ("größe 写真 \U0001f4f7 e\u0301.jpg", "größe 写真 \U0001f4f7 e\u0301.jpg"),
-        ("a\nb\t\x1b[31m\x7f\x85", "a\\x0ab\\x09\\x1b[31m\\x7f\\x85"),
-        ("a\u2028b\u2029c", "a\\u2028b\\u2029c"), ("\u202egpj.exe\u2066", "\\u202egpj.exe\\u2066"),
-        (os.fsdecode(b"gr\xfc\xdfe"), "gr\\xfc\\xdfe"), ("half \ud800", "half \\ud800"),
-        ("both \ud800\udcff", "both \\ud800\\udcff"), ("<b>&\"'", "<b>&\"'"),
-    ],
-)  # fmt: skip
-def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
-    assert files.printable(name) == shown
-    shown.encode("utf-8")
-
-
-def test_a_long_sentence_keeps_its_beginning_and_its_end():
-    said = f"'--seed': '{'9' * 50}' is no integer"
-    assert files.shorten_middle(said, len(said)) == said
-    assert files.shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
-    assert len(files.shorten_middle(said, 60)) == 60
-    assert files.shortened("x" * 60) == "x" * 60
-    assert files.shortened("x" * 61) == "x" * 57 + "..."
+    partial = [files.is_partial(name) for name in (".points.ply.partial", "points.ply.partial", ".lock")]
+    assert partial == [True, False, False]
 
 
 def test_only_regular_files_of_a_size_are_read(tmp_path):
@@ -128,30 +90,3 @@ def test_a_line_that_is_not_a_pair_is_named(tmp_path, line):
     path = tmp_path / "pairs.txt"
     path.write_text(f"a.jpg b.jpg\n{line}\n", encoding="utf-8")
     refuses(UsageError, r"line 2 of .* must hold two file names", files.read_pairs, path)
-
-
-ONE = {
-    "name": "a.jpg", "width": 160, "height": 120, "K": [[150.0, 0, 79.5], [0, 151.0, 59.5], [0, 0, 1]],
-    "distortion": [-0.05, 0, 0], "R": np.eye(3).tolist(), "t": [0.1, 0.2, 3.0],
-    "centre": [-0.1, -0.2, -3.0],
-}  # fmt: skip
-
-
-def written(folder, content):
-    path = folder / "cameras.json"
-    path.write_text(json.dumps(content), encoding="utf-8")
-    return path
-
-
-def test_cameras_are_those_of_the_file_in_its_order(tmp_path):
-    cameras = read_cameras(written(tmp_path, {"cameras": [{**ONE, "name": "b.jpg"}, ONE]}))
-    assert list(cameras) == ["b.jpg", "a.jpg"]
-    assert cameras["a.jpg"].size == (160, 120)
-    np.testing.assert_array_equal(cameras["a.jpg"].K, ONE["K"])
-    np.testing.assert_allclose(cameras["a.jpg"].centre, ONE["centre"])
-
-
-def test_an_absent_or_damaged_file_is_reported(tmp_path):
-    refuses(UsageError, r"there is no cameras\.json", read_cameras, tmp_path / "cameras.json")
-    (tmp_path / "cameras.json").write_text("{", encoding="utf-8")
-    refuses(UsageError, "does not hold cameras", read_cameras, tmp_path / "cameras.json")

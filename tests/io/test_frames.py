@@ -151,13 +151,8 @@ def test_bad_sources_of_frames_are_one_sentence(folder, tmp_path, monkeypatch, r
 
 def test_a_video_of_frames_that_do_not_fit_in_memory_is_refused(video, tmp_path, monkeypatch):
     monkeypatch.setattr("thesisrecon.io._frames.MAX_DECODED_BYTES", 160 * 120 * 28)
-    names, _, _ = FrameSource(video, 3).choose(tmp_path / "fits", threads=64)
-    assert len(names) == 3
+    choose, words = FrameSource(video, 3).choose, "frames of 160 x 120 pixels; .* the limit of"
+    assert len(choose(tmp_path / "fits", threads=64)[0]) == 3
     monkeypatch.setattr("thesisrecon.io._frames.MAX_DECODED_BYTES", 160 * 120 * 27)
-    refuses(
-        UsageError,
-        "frames of 160 x 120 pixels; .* the limit of",
-        FrameSource(video, 3).choose,
-        tmp_path / "o",
-    )
+    refuses(UsageError, words, choose, tmp_path / "o")
     assert not list(tmp_path.rglob("o/*/*.png"))

@@ -224,16 +224,3 @@ def test_impossible_cameras_of_a_colmap_model_are_refused(tmp_path, camera, sent
     for name, text in (("cameras", camera), ("images", ""), ("points3D", "")):
         (tmp_path / f"{name}.txt").write_text(text + "\n")
     refuses(UsageError, sentence, read_model, tmp_path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"width": float("inf")}, {"width": 0}, {"height": -5}, {"K": [[100, 0, 64], [0, -100, 48], [0, 0, 1]]},
-     {"K": [[float("nan"), 0, 64], [0, 100, 48], [0, 0, 1]]}, {"t": [0, 0, float("inf")]},
-     {"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, {"R": [[0, 0, 0]] * 3}],
-)  # fmt: skip
-def test_impossible_cameras_of_a_file_are_refused_by_name(tmp_path, change):
-    K = [[100, 0, 64], [0, 100, 48], [0, 0, 1]]
-    camera = {"name": "a.png", "width": 128, "height": 96, "K": K, "R": np.eye(3).tolist(), "t": [0, 0, 0]}
-    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera | change]}))
-    refuses(UsageError, "the entry 'a.png' cannot be used", read_model, tmp_path)

@@ -83,22 +83,15 @@ RAW_FILES = {
     "DSC_2.nef": tiff([THUMBNAIL], [image(192, 144), LARGE], order=">"),
     "a.tif": tiff([image(96, 72)], [LARGE]),
     "b.tiff": tiff([image(96, 72)], [image(288, 216, GREY)], order=">"),
-    "big.tif": tiff([THUMBNAIL], [LARGE], big=True),
-    "c.DNG": tiff([image(96, 72, _50706=0x01040000)]),
+    "big.tif": tiff([THUMBNAIL], [LARGE], big=True), "c.DNG": tiff([image(96, 72, _50706=0x01040000)]),
     "d.tif": tiff([image(96, 72, _50706=0x01040000)]),
     "e.cr2": tiff([image(96, 72)], header=b"CR\2\0\0\0\0\0"),
-    "e.tif": tiff([image(96, 72)], header=b"CR\2\0\0\0\0\0"),
-    "f.arw": tiff([image(96, 72)]),
-    "g.tif": tiff([image(96, 72), image(96, 72, 34892)]),
-    "h.pef": tiff([image(288, 216, SENSOR)]),
-    "i.tif": tiff([image(288, 216, SENSOR)]),
-    "j.RAF": b"FUJIFILMCCD-RAW 0201" + bytes(99),
-    "k.orf": b"IIRO\x08\0\0\0" + bytes(99),
-    "l.rw2": b"IIU\0\x18\0\0\0" + bytes(99),
-    "m.CR3": b"\0\0\0\x18ftypcrx " + bytes(99),
-    "n": tiff([THUMBNAIL], [LARGE]),
-    "o.mos": b"something else",
-}
+    "e.tif": tiff([image(96, 72)], header=b"CR\2\0\0\0\0\0"), "f.arw": tiff([image(96, 72)]),
+    "g.tif": tiff([image(96, 72), image(96, 72, 34892)]), "h.pef": tiff([image(288, 216, SENSOR)]),
+    "i.tif": tiff([image(288, 216, SENSOR)]), "j.RAF": b"FUJIFILMCCD-RAW 0201" + bytes(99),
+    "k.orf": b"IIRO\x08\0\0\0" + bytes(99), "l.rw2": b"IIU\0\x18\0\0\0" + bytes(99),
+    "m.CR3": b"\0\0\0\x18ftypcrx " + bytes(99), "n": tiff([THUMBNAIL], [LARGE]), "o.mos": b"something else",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RAW_FILES)
@@ -107,7 +100,7 @@ def test_raw_files_are_refused_by_name(tmp_path, name):
     assert reason(tmp_path / name) == RAW
 
 
-def test_a_jpeg_beside_its_raw_file_is_used(tmp_path):
+def test_a_jpeg_beside_its_raw_file_is_used_and_no_raw_file_is_a_mask(tmp_path):
     files.picture(1).save(tmp_path / "DSC_1.JPG", "JPEG")
     (tmp_path / "DSC_1.NEF").write_bytes(RAW_FILES["DSC_1.NEF"])
     # The content decides, not the suffix.
@@ -115,36 +108,29 @@ def test_a_jpeg_beside_its_raw_file_is_used(tmp_path):
     found = read_images(tmp_path, max_size_px=1600)
     assert [one.name for one in found.images] == ["DSC_1.JPG", "DSC_2.NEF"]
     assert found.refused == {"DSC_1.NEF": RAW}
+    words = r"the mask .*DSC_1\.NEF is a raw file"
+    refuses(UsageError, words, read_mask, tmp_path / "DSC_1.NEF", found.images[0])
 
 
-@pytest.mark.parametrize(
-    "pages",
-    [
-        [image(96, 72, _254=1), image(90, 80)],
-        [image(96, 72, _255=2), image(90, 80)],
-        [image(96, 72), image(288, 216)],
-    ],
-)
+FIRST = image(96, 72)
+REDUCED = [
+    [image(96, 72, _254=1), image(90, 80)], [image(96, 72, _255=2), image(90, 80)], [FIRST, image(288, 216)],
+]  # fmt: skip
+ORDINARY = [
+    tiff([FIRST]), tiff([FIRST], order=">"), tiff([image(96, 72, _254=1)]),
+    tiff([FIRST, image(48, 36, _254=1)]), tiff([FIRST], [image(48, 36, _254=1), image(24, 18)]),
+    tiff([FIRST, FIRST]), tiff([FIRST, image(100, 200)]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("pages", REDUCED)
 def test_a_reduced_image_before_the_full_one_is_refused(tmp_path, pages):
     (tmp_path / "a.tif").write_bytes(tiff(pages))
-    assert (
-        reason(tmp_path / "a.tif")
-        == "begins with a reduced image of 96 x 72 pixels: save the full image alone"
-    )
+    words = "begins with a reduced image of 96 x 72 pixels: save the full image alone"
+    assert reason(tmp_path / "a.tif") == words
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        tiff([image(96, 72)]),
-        tiff([image(96, 72)], order=">"),
-        tiff([image(96, 72, _254=1)]),
-        tiff([image(96, 72), image(48, 36, _254=1)]),
-        tiff([image(96, 72)], [image(48, 36, _254=1), image(24, 18)]),
-        tiff([image(96, 72), image(96, 72)]),
-        tiff([image(96, 72), image(100, 200)]),
-    ],
-)
+@pytest.mark.parametrize("content", ORDINARY)
 def test_ordinary_tiff_files_are_read(tmp_path, content):
     """Pyramids and pages of other images are no thumbnails."""
     (tmp_path / "a.tif").write_bytes(content)
@@ -162,13 +148,6 @@ def test_damaged_tags_end_with_a_sentence(tmp_path, order, seed):
         content[place] = rng.integers(256)
     (tmp_path / "a.tif").write_bytes(content[: rng.integers(8, len(content))])
     assert reason(tmp_path / "a.tif")
-
-
-def test_masks_are_not_read_from_raw_files(tmp_path):
-    (tmp_path / "a.tif").write_bytes(RAW_FILES["a.tif"])
-    files.picture(0, (288, 216)).save(tmp_path / "b.png")
-    (found,) = read_images([tmp_path / "b.png"], max_size_px=1600).images
-    refuses(UsageError, r"the mask .*a\.tif is a raw file", read_mask, tmp_path / "a.tif", found)
 
 
 def test_files_are_listed_by_their_content(tmp_path):

@@ -182,9 +182,9 @@ class FakeMetric:
 
 @dataclass(frozen=True)
 class FakeDense:
-    """A wall across the scene, 8 from the first camera."""
+    """A wall across the scene, 8 from the first camera, and views that do not confirm it."""
 
-    confirmed: bool = True
+    unknown: tuple[int, ...] = ()
 
     def prepare(self, images, reconstruction, *, depth_range=None, threads=1):
         CALLS.append("prepare dense")
@@ -210,7 +210,7 @@ class FakeDense:
 
     def confirm(self, scene, depth_maps, view):
         depth = depth_maps[view].depth
-        return replace(depth_maps[view], depth=depth if self.confirmed else np.full_like(depth, np.nan))
+        return replace(depth_maps[view], depth=np.full_like(depth, np.nan) if view in self.unknown else depth)
 
 
 def fake_config(**changes):

@@ -1,20 +1,28 @@
-"""Many views: a core is reconstructed projectively, the others join calibrated, in windows."""
+"""Many views: a core of them is reconstructed and calibrated, the others join calibrated, in windows."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.conftest import refuses
 from tests.metric.test_metric_refinement import centre_error
-from tests.synthetic import TrueScene, make_scene, true_pairs, with_poses
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction, true_pairs, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.errors import StageFailure
 from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
+from thesisrecon.pipeline.large_sets import (
+    CORE_VIEWS,
+    MAX_CORES,
+    calibrate_with_core,
+    calibrated_part,
+)
 from thesisrecon.projective._model import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
-from thesisrecon.records import Tracks
+from thesisrecon.records import SelfCalibration, Tracks
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from validation.scenes.walks import SIZE, make_walk
 
@@ -120,19 +128,6 @@ def test_points_that_hold_every_view_are_enough(monkeypatch, limits):
     assert centre_error(metric, scene) < 2e-3
 
 
-def test_images_of_other_groups_do_not_make_a_set_large():
-    scene = make_scene(views=12, points=100)
-    t = scene.tracks
-    wide = replace(t, view_index=t.view_index + 30, n_views=45)
-    assert _model.seen_views(t) == _model.seen_views(wide) == 12
-    n = len(t.xy)
-    model = _model.MetricEstimate(
-        wide, np.tile(scene.sizes[:1], (45, 1)), None, np.ones(45, bool), scene.X,
-        np.ones(100, bool), np.ones(n, bool), 0.5,
-    )  # fmt: skip
-    assert _model.with_enough_points(model) is model
-
-
 def test_a_core_has_ties_with_parallax_and_doubles():
     pairs = true_pairs(make_scene(views=12, points=60))
     core = select_core(pairs, 12, 5)
@@ -172,50 +167,6 @@ def test_threads_do_not_change_the_adjustment():
     np.testing.assert_array_equal(fits[0].cameras.intrinsics, fits[1].cameras.intrinsics)
 
 
-def test_points_are_chosen_until_every_cell_has_enough():
-    rng = np.random.default_rng(3)
-    length = rng.integers(2, 9, 400)
-    start = np.concatenate([[0], np.cumsum(length)])
-    cell = np.concatenate([rng.choice(50, n, replace=False) for n in length])
-    order, keep, needed = rng.permutation(400), np.zeros(400, dtype=bool), np.full(50, 12)
-    left, expected = needed.copy(), np.zeros(400, dtype=bool)
-    for j in order:
-        mine = cell[start[j] : start[j + 1]]
-        if np.mean(left[mine] > 0) >= 0.5:
-            expected[j] = True
-            np.subtract.at(left, mine, 1)
-    _model.choose_points(order, start, cell, needed, keep)
-    np.testing.assert_array_equal(keep, expected)
-    np.testing.assert_array_equal(needed, left)
-    assert 0.2 < keep.mean() < 0.6
-    assert left.max() <= 3
-
-
-def test_points_are_chosen_again_by_their_residuals(monkeypatch):
-    scene = street(40)
-    rng, n = np.random.default_rng(2), scene.tracks.n_points
-    noisy = np.arange(n) % 2 == 0
-    shift = rng.normal(0.0, 1.0, scene.tracks.xy.shape) * noisy[scene.tracks.point_index, None]
-    tracks = replace(scene.tracks, xy=scene.tracks.xy + shift)
-    cameras = make_walk(40, np.random.default_rng(1)).cameras
-    model = _model.MetricEstimate(
-        tracks, scene.sizes, cameras, np.ones(40, bool), scene.X, np.ones(n, bool),
-        np.ones(len(tracks.xy), bool), 0.5,
-    )  # fmt: skip
-    monkeypatch.setattr(_model, "MAX_OBSERVATIONS", len(tracks.xy) // 4)
-    few = _model.with_enough_points(model)
-    chosen, points = _model.with_precise_points(few, tracks)
-    assert len(points) == chosen.tracks.n_points
-
-    def positions(tracks):
-        return {tuple(row) for row in tracks.xy.tolist()}
-
-    noisy_xy = positions(replace(tracks, xy=tracks.xy[noisy[tracks.point_index]]))
-    by_length, by_residual = (len(positions(m.tracks) & noisy_xy) / len(m.tracks.xy) for m in (few, chosen))
-    assert by_residual < 0.5 * by_length
-    assert np.bincount(chosen.tracks.view_index, minlength=40).min() >= 20
-
-
 def test_shared_intrinsics_of_many_views_are_tested_in_runs(monkeypatch):
     scene = make_scene(views=24, points=250, sigma_px=0.4, seed=13)
     K = scene.K.copy()
@@ -232,3 +183,66 @@ def test_shared_intrinsics_of_many_views_are_tested_in_runs(monkeypatch):
     reconstruct(zoomed, 8)
     assert not tests[0].found
     assert tests[1].contradicted[0]
+
+
+class OfFewViews:
+    """A method that fails for more than ``most`` views and notes those it was given."""
+
+    def __init__(self, most, *, identifiable=True):
+        self.most, self.identifiable, self.given = most, identifiable, []
+
+    def calibrate(self, projective, **_):
+        self.given.append(projective.registered)
+        if projective.registered.sum() > self.most:
+            raise StageFailure("self-calibration failed", f"{projective.registered.sum()} views", "fewer")
+        K = projective.registered[:, None, None] * np.eye(3)
+        return SelfCalibration(np.eye(4), K, np.zeros_like(K), self.identifiable, ())
+
+
+def bent_scene():
+    """Eleven views of which the last three are in another projective frame than the rest."""
+    scene = make_scene(views=11, points=400, sigma_px=0.2, seed=2)
+    projective = projective_reconstruction(scene)
+    P = projective.P.copy()
+    rng = np.random.default_rng(0)
+    P[8:] = P[8:] @ (np.eye(4) + 0.5 * rng.normal(size=(4, 4)))
+    # They are tied to the others by fewer points.
+    inlier = projective.inlier & (
+        (projective.tracks.view_index < 8) | (rng.random(len(projective.inlier)) < 0.5)
+    )
+    return scene, replace(projective, P=P, inlier=inlier)
+
+
+def test_a_core_calibrates_what_a_bent_reconstruction_cannot_and_the_metric_stage_adds_the_rest():
+    scene, projective = bent_scene()
+    prior, method = prior_for(projective), HypothesesAndRefinement()
+    with pytest.raises(StageFailure):
+        method.calibrate(projective, prior=prior, rng=np.random.default_rng(0))
+    calibration = calibrate_with_core(method, projective, prior=prior, rng=np.random.default_rng(0))
+    used = calibration.K[:, 0, 0] > 0
+    assert used.sum() == CORE_VIEWS
+    assert not used[8:].any()
+    part = calibrated_part(projective, calibration)
+    result = MetricRefinement().refine(part, calibration, prior=prior, rng=np.random.default_rng(0))
+    assert result.trusted, result.failed_checks
+    assert result.reconstruction.registered.all()
+    np.testing.assert_allclose(result.reconstruction.K[:, 0, 0], 1500.0, rtol=5e-3)
+    assert centre_error(result, scene) < 0.01
+
+
+def test_the_first_core_that_determines_the_calibration_is_taken_and_tries_are_limited():
+    projective = projective_reconstruction(make_scene(views=12))
+    prior = prior_for(projective)
+    whole = calibrate_with_core(method := OfFewViews(12), projective, prior=prior, rng=None)
+    assert len(method.given) == 1
+    assert calibrated_part(projective, whole) is projective
+    for method, tries in ((OfFewViews(5), 2), (OfFewViews(5, identifiable=False), 1 + MAX_CORES)):
+        calibration = calibrate_with_core(method, projective, prior=prior, rng=None)
+        assert len(method.given) == tries
+        assert len({views.tobytes() for views in method.given}) == tries
+        assert (calibration.K[:, 0, 0] > 0).tolist() == method.given[1].tolist()
+        part = calibrated_part(projective, calibration)
+        seen = np.bincount(part.tracks.point_index[part.inlier], minlength=part.tracks.n_points)
+        assert ((seen >= 2) == part.valid).all()
+        assert (part.X[~part.valid] == 0).all()
+    refuses(StageFailure, "12 views", calibrate_with_core, OfFewViews(4), projective, prior=prior, rng=None)

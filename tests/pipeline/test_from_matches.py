@@ -18,7 +18,6 @@ from thesisrecon.io._models import read_model
 from thesisrecon.pipeline import stages
 
 SCENE = given_scene()
-ORIENTATIONS = "CREATE TABLE {} (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB)"
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +32,13 @@ def focal_is_right(result, scene=SCENE):
     return camera.K[0, 0]
 
 
-def test_rows_of_keypoints_give_the_focal_length_within_its_interval(from_rows):
-    focal_is_right(from_rows)
+def test_rows_positions_and_pairs_in_the_other_order_give_the_same_cameras(from_rows):
+    focal_px = focal_is_right(from_rows)
     assert from_rows.summary["trusted"]
-
-
-def test_positions_give_the_same_cameras_as_rows(from_rows):
     k = SCENE.keypoints
     positions = {(i, j): (k[i], k[j]) for i, j in SCENE.matches}
     result = reconstruct_from_matches(None, positions, SCENE.sizes)
-    assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-3)
-
-
-def test_pairs_in_the_other_order_are_the_same(from_rows):
+    assert focal_is_right(result) == pytest.approx(focal_px, rel=1e-3)
     turned = {(j, i): rows[:, ::-1] for (i, j), rows in SCENE.matches.items()}
     result = reconstruct_from_matches(SCENE.keypoints, turned, SCENE.sizes)
     assert np.array_equal(result.points, from_rows.points)
@@ -149,11 +142,8 @@ WRONG = {
 @pytest.mark.parametrize("sentence", WRONG)
 def test_wrong_input_gets_one_sentence(sentence):
     refuses(UsageError, sentence, reconstruct_from_matches, *WRONG[sentence])
-
-
-def test_the_model_needs_images():
-    with pytest.raises(UsageError, match="needs the images"):
-        reconstruct_from_matches(SCENE.keypoints, SCENE.matches, SCENE.sizes, until="model")
+    right = SCENE.keypoints, SCENE.matches, SCENE.sizes
+    refuses(UsageError, "needs the images", reconstruct_from_matches, *right, until="model")
 
 
 def test_wrong_tracks_are_refused():
@@ -187,12 +177,15 @@ def test_masks_drop_matches_and_observations(tmp_path, from_rows):
 
 def write_database(path, *, verified):
     """The tables of COLMAP's database that hold keypoints and matches."""
+    used, other = ("two_view_geometries", "matches") if verified else ("matches", "two_view_geometries")
+    blob = "rows INTEGER, cols INTEGER, data BLOB"
     base = sqlite3.connect(path)
-    base.execute("CREATE TABLE cameras (camera_id INTEGER, model INTEGER, width INTEGER, height INTEGER)")
-    base.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
-    base.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
-    for table in ("matches", "two_view_geometries"):
-        base.execute(ORIENTATIONS.format(table))
+    for table in (
+        "cameras (camera_id INTEGER, model INTEGER, width INTEGER, height INTEGER)",
+        "images (image_id INTEGER, name TEXT, camera_id INTEGER)", f"keypoints (image_id INTEGER, {blob})",
+        f"{used} (pair_id INTEGER PRIMARY KEY, {blob})", f"{other} (pair_id INTEGER PRIMARY KEY, {blob})",
+    ):  # fmt: skip
+        base.execute(f"CREATE TABLE {table}")
     base.execute("INSERT INTO cameras VALUES (7, 2, 640, 480)")
     for i, xy in enumerate(SCENE.keypoints):
         # Names in the opposite order of the numbers.
@@ -201,9 +194,7 @@ def write_database(path, *, verified):
         base.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (i + 1, len(xy), data))
     for (i, j), rows in SCENE.matches.items():
         row = ((i + 1) * (2**31 - 1) + j + 1, len(rows), 2, rows.astype("<u4").tobytes())
-        base.execute(
-            f"INSERT INTO {'two_view_geometries' if verified else 'matches'} VALUES (?, ?, ?, ?)", row
-        )
+        base.execute(f"INSERT INTO {used} VALUES (?, ?, ?, ?)", row)
     base.commit()
     base.close()
     return path
@@ -217,12 +208,6 @@ def test_a_database_gives_the_same_cameras(verified, tmp_path, from_rows):
     assert result.cameras["9.jpg"].K[0, 0] == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-3)
 
 
-def test_other_files_are_no_database(tmp_path):
-    (tmp_path / "text.db").write_text("no database")
-    refuses(UsageError, "is not a valid COLMAP database", reconstruct_from_colmap, tmp_path / "text.db")
-    refuses(UsageError, "there is no COLMAP database or model", reconstruct_from_colmap, tmp_path / "none.db")
-
-
 def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, capsys):
     database = write_database(tmp_path / "database.db", verified=True)
     assert run_command(["reconstruct", "--from", str(database), "-o", str(tmp_path / "first")]) == 0
@@ -231,6 +216,9 @@ def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, ca
     assert run_command(["reconstruct", "--from", sparse, "-o", str(tmp_path / "second")]) == 0
     one, two = (thesisrecon.load(tmp_path / name).cameras["7.jpg"].K[0, 0] for name in ("first", "second"))
     assert two == pytest.approx(one, rel=5e-3)
+    (tmp_path / "text.db").write_text("no database")
+    refuses(UsageError, "is not a valid COLMAP database", reconstruct_from_colmap, tmp_path / "text.db")
+    refuses(UsageError, "there is no COLMAP database or model", reconstruct_from_colmap, tmp_path / "none.db")
 
 
 @pytest.mark.parametrize("orientation", [3, 6])
@@ -261,15 +249,6 @@ def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
     )
     with PIL.Image.open(exported) as image:
         assert np.asarray(image)[100, 320].argmax() == 0
-
-
-def test_the_command_takes_one_source_of_images(tmp_path, refused):
-    for arguments, sentence in (
-        (["-o", tmp_path], "give the folder of the images, or --from"),
-        (["a", "--from", "b", "-o", tmp_path], "with --from the images are given by --images"),
-        (["a", "--images", "b", "-o", tmp_path], "give the folder of the images, or --from"),
-    ):
-        assert sentence in refused(["reconstruct", *arguments])
 
 
 def with_few_matches(index):

@@ -1,14 +1,19 @@
-"""Folders with several groups of images that do not overlap, with fake stages: one model for each."""
+"""Several models of one set of images: of groups that do not overlap, and of what one model leaves over.
+
+The first tests use fake stages, the last ones two places with one weak link between them.
+"""
 
 import re
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 
 from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
-from thesisrecon import load
+from tests.pipeline.given_scene import SIZE, given_scene
+from thesisrecon import load, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.api import reconstruct as api
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config import ImageOptions
@@ -90,8 +95,7 @@ def test_groups_are_resumed_to_the_same_bytes(tmp_path):
         if stopped.count(("projective", 0)) == 2:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "cut", threads=1, progress=interrupt)
+    refuses(KeyboardInterrupt, None, run, tmp_path / "cut", threads=1, progress=interrupt)
     CALLS.clear()
     run(tmp_path / "cut", threads=3)
     assert files_of(tmp_path / "cut") == files_of(tmp_path / "whole")
@@ -163,15 +167,100 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
     assert re.findall("not registered: (.*):", said) == ["06.png", "07.png"]
     assert "is reconstructed in group-2" in result.refused["03.png"]
     assert result.refused["07.png"] == "sees 5 points"
-    off = replace(config, images=ImageOptions(groups=False))
-    result = api.reconstruct(photographs(8), tmp_path / "off", config=off, until="metric")
+    # A projective run may end at the core of a large set, whose other images the metric stage registers.
+    result = api.reconstruct(photographs(8), tmp_path / "short", config=config, until="projective")
     assert "groups" not in result.summary
-    assert not (tmp_path / "off" / "group-2").exists()
+    assert not list(tmp_path.glob("short/group-*"))
 
 
-def test_a_projective_run_leaves_no_images_over(tmp_path):
-    """It may end at the core of a large set, whose other images the metric stage registers."""
-    config = fake_config(projective=ProjectiveOfAFew())
-    result = api.reconstruct(photographs(8), tmp_path, config=config, until="projective")
+SCENE = given_scene()
+LINK = 80
+"""Points that only the last view of the first place and one view of the second see."""
+
+
+def two_places(common=0):
+    """Pixels (10, N, 2), NaN where a point is not seen; two views of either place see ``common`` more points.
+
+    Each view of the second place sees at most half of these.
+    """
+    rng = np.random.default_rng(1)
+    views, points = len(SCENE.keypoints), len(SCENE.X)
+    X = np.concatenate([SCENE.X, SCENE.X, rng.uniform(-1, 1, (2 * LINK + common, 3))])
+    seen = np.zeros((2 * views, len(X)), dtype=bool)
+    for place in (0, 1):
+        seen[place * views : (place + 1) * views, place * points : (place + 1) * points] = True
+    link, more, shared = np.split(np.arange(2 * points, len(X)), [LINK, 2 * LINK])
+    seen[np.ix_([views - 1, views], link)] = True
+    if common:
+        seen[np.ix_([views - 1, views + 2], more)] = True
+        seen[views - 2 : views, shared] = True
+        seen[views : views + 2, shared[::2]] = seen[views + 2 : views + 4, shared[1::2]] = True
+    pixels = np.array([camera.project(X) for camera in SCENE.cameras * 2])
+    return np.where(seen[:, :, None], pixels + rng.normal(0, SCENE.noise_px, pixels.shape), np.nan)
+
+
+def from_tracks(xy, out):
+    return reconstruct_from_tracks(xy, [SIZE] * len(xy), out)
+
+
+def from_matches(xy, out):
+    seen = np.isfinite(xy).all(axis=2)
+    rows = np.cumsum(seen, axis=1) - 1
+    matches = {}
+    for i in range(len(xy)):
+        for j in range(i + 1, len(xy)):
+            both = seen[i] & seen[j]
+            if both.any():
+                matches[i, j] = np.column_stack([rows[i, both], rows[j, both]])
+    return reconstruct_from_matches(
+        [xy[i, there] for i, there in enumerate(seen)], matches, [SIZE] * len(xy), out
+    )
+
+
+@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches])
+def test_images_beyond_a_weak_link_become_a_model_with_the_same_camera(reconstruct, tmp_path):
+    result = reconstruct(two_places(), tmp_path)
+    (group,) = result.summary["groups"]
+    other = load(tmp_path / "group-2")
+    assert len(result.cameras) == len(other.cameras) == 5
+    assert not set(result.cameras) & set(other.cameras)
+    assert group["registered"] == 5
+    assert group["trusted"]
+    assert any("5 images in this model, 5 in group-2" in text for text in result.summary["warnings"])
+    assert all("is reconstructed in group-2" in reason for reason in result.refused.values())
+    focal = SCENE.cameras[0].K[0, 0]
+    first, second = (next(iter(found.cameras.values())) for found in (result, other))
+    assert abs(second.K[0, 0] - focal) < 3 * second.std["focal_px"]
+    for (model,) in (result.further_models, load(tmp_path).further_models):
+        assert list(model.cameras) == list(other.cameras)
+    # Its interval is that of all images.
+    assert second.std["focal_px"] < 0.9 * first.std["focal_px"]
+
+
+@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches])
+def test_a_further_model_that_shares_points_is_joined(reconstruct, tmp_path):
+    result = reconstruct(two_places(common=8), tmp_path)
+    assert len(result.cameras) == len(load(tmp_path).cameras) == 10
+    assert result.summary["trusted"]
     assert "groups" not in result.summary
-    assert not list(tmp_path.glob("group-*"))
+    assert result.further_models == ()
+    # Both places have the same cameras in the same world.
+    centres = np.array([camera.centre for camera in result.cameras.values()])
+    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    assert np.linalg.norm(centres[:5] - centres[5:], axis=1).max() < 0.02 * size
+
+
+def test_further_models_are_part_of_a_result_without_a_folder():
+    result = from_tracks(two_places(), None)
+    (other,) = result.further_models
+    assert len(result.cameras) == len(other.cameras) == 5
+    assert other.out is None
+    assert len(other.points) > 100
+
+
+def test_images_in_no_model_that_matches_connect_with_one_are_named(tmp_path):
+    # Two images of the second place are too few for a model.
+    result = from_tracks(two_places()[:7], tmp_path)
+    assert len(result.cameras) == 5
+    (text,) = (text for text in result.warnings if getattr(text, "code", "") == "linked-images")
+    assert text == "1 image in no model, although verified matches connect them with one: image-5"

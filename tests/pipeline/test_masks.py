@@ -141,13 +141,3 @@ def test_stored_results_are_not_those_of_another_mask(tmp_path):
     assert half[1] < whole[1]
     assert half[2] == whole[2]
     assert corners(masks=masks) == half
-
-
-def test_the_command_takes_masks_of_images(tmp_path, refused):
-    images, masks = masked_photographs(tmp_path / "masks")
-    out, folder = ["-o", tmp_path / "out"], tmp_path / "images"
-    folder.mkdir()
-    for image in images:
-        PIL.Image.fromarray(image.rgb).save(folder / f"other{image.name}")
-    said = refused(["reconstruct", folder, *out, "--masks", masks])
-    assert "no file in" in said

@@ -14,20 +14,18 @@ from tests.conftest import refuses, same_pairs
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
 from thesisrecon import load
-from thesisrecon.api.reconstruct import _exif_warnings, reconstruct
+from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.cli.runs import summary_text
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._meshes import read_mesh
-from thesisrecon.matching.pair_selection import ListedPairs, SequenceWindow
+from thesisrecon.matching.pair_selection import SequenceWindow
 from thesisrecon.pipeline import algorithm1, matching, outputs, stages
 from thesisrecon.pipeline.job import name_images
 from thesisrecon.records import Image
-from thesisrecon.runtime._executors import Workers
 from thesisrecon.runtime._run import stream
-from thesisrecon.runtime._run_folder import RunDirectory
 from thesisrecon.surface import fusion
 from thesisrecon.surface.fusion import VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
@@ -90,9 +88,13 @@ def test_summary_and_cameras_are_in_original_pixels(tmp_path):
 def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     """COLMAP has no camera with skew; everything else is there, and nothing of an older model stays."""
     assert (run(tmp_path).out / "sparse" / "0" / "cameras.bin").is_file()
-    knowledge = IntrinsicsOptions(skew="constant", skew_std_px=5.0)
+    knowledge = IntrinsicsOptions(skew="constant", skew_std_px=5.0, focal_px=100.0, focal_std_rel=0.1)
     config = fake_config(intrinsics=knowledge, selfcalibration=fakes.FakeCalibrator(skew_px=2.0))
     result = run(tmp_path, config=config, overwrite=True)
+    assert [c for c in CALLS if c.startswith("calibrate")] == [
+        "calibrate prior=False",
+        "calibrate prior=True",
+    ]
     (sentence,) = (w for w in result.summary["warnings"] if "sparse/0" in w)
     assert "COLMAP has no camera model with skew" in sentence
     assert sentence in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -101,7 +103,7 @@ def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     assert [view["K"][0][1] for view in read(tmp_path / "cameras.json")["cameras"]] == [2.0] * 4
 
 
-def test_a_second_run_computes_nothing(tmp_path):
+def test_a_second_run_computes_only_what_is_damaged_or_new(tmp_path):
     first = run(tmp_path)
     before = kept_bytes(tmp_path)
     CALLS.clear()
@@ -112,22 +114,40 @@ def test_a_second_run_computes_nothing(tmp_path):
     assert set(second.summary["resumed"]) == set(first.summary["seconds"]) - {"images", "outputs", "total"}
     assert second.summary["elapsed_seconds"] > 0.0
     assert second.summary["seconds"]["matches"] == first.summary["seconds"]["matches"]
-
-
-@pytest.mark.parametrize(
-    ("stage", "done"),
-    [("features", 2), ("matches", 0), ("matches", 3), ("projective", 0), ("projective", 1), ("metric", 0)],
-)
-def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path, stage, done):
-    run(tmp_path / "whole", threads=1)
-    whole = list(CALLS)
+    for name in ("00001-00002", "00000-00001"):
+        (tmp_path / "02-matches" / f"{name}.npz").write_bytes(b"damaged")
+    (tmp_path / "01-features" / "00003.npz").unlink()
+    third = run(tmp_path)
+    called = sorted(c for c in CALLS if not c.startswith("prepare"))
+    assert called == ["detect 03.png", "match (0, 1)", "match (1, 2)"]
+    assert kept_bytes(tmp_path) == before
+    reported = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
+    assert f"{reported} and were computed again" in third.warnings
     CALLS.clear()
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "cut", threads=1, progress=interrupt_at(stage, done))
-    run(tmp_path / "cut", threads=1)
+    run(tmp_path, 5, overwrite=True)
+    assert [c for c in CALLS if c.startswith("detect")] == ["detect 04.png"]
+    assert sorted(c for c in CALLS if c.startswith("match")) == [f"match ({k}, 4)" for k in range(4)]
+
+
+STOPS = [
+    ("features", 2), ("matches", 0), ("matches", 3), ("projective", 0), ("projective", 1), ("metric", 0),
+    ("dense", 2),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("stage", "done"), STOPS)
+def test_a_run_stopped_anywhere_goes_on_and_ends_the_same(tmp_path, stage, done):
+    def computed():
+        return sorted(call for call in CALLS if not call.startswith(("prepare", "metric")))
+
+    run(tmp_path / "whole", threads=1, until="model")
+    whole = computed()
+    CALLS.clear()
+    cut = {"out": tmp_path / "cut", "threads": 1, "until": "model"}
+    refuses(KeyboardInterrupt, None, run, progress=interrupt_at(stage, done), **cut)
+    run(**cut)
     assert kept_bytes(tmp_path / "cut") == kept_bytes(tmp_path / "whole")
-    computed = [call for call in CALLS if not call.startswith(("prepare", "metric"))]
-    assert sorted(computed) == sorted(call for call in whole if not call.startswith(("prepare", "metric")))
+    assert computed() == whole
 
 
 def test_a_run_to_its_end_leaves_a_textured_model(tmp_path):
@@ -157,46 +177,35 @@ def test_depth_maps_that_do_not_fit_in_memory_give_the_same_model(tmp_path, monk
     refuses(UsageError, "confirmed-00002.npz was removed or changed", result.depth_maps.__getitem__, 2)
 
 
-def test_a_model_above_the_size_limit_is_written_whole_and_reduced(tmp_path):
-    result = run(tmp_path / "a", until="model", threads=1)
-    whole = (tmp_path / "a" / "model.glb").read_bytes()
-    directory, limit_mb = RunDirectory(tmp_path / "b"), 0.6e-6 * len(whole)
-    directory.path.mkdir()
-    (sentence,) = outputs._write_surface(directory, result, limit_mb, 1)
-    assert "1 tile (tiles/tiles.json) hold" in sentence
+@pytest.fixture
+def small_limit(monkeypatch):
+    """The configuration of a model of all faces, which is larger than its limit."""
+    config = fake_config(model=SurfaceModel(fusion=VolumetricFusion(tolerance=0.0)))
+    object.__setattr__(config.model, "max_glb_mb", 0.03)
+    monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
+    monkeypatch.setattr(outputs, "TILE_FACES", 500)
+    monkeypatch.setattr(outputs, "TILE_MB", 0.02)
+    return config
+
+
+def test_a_model_above_the_size_limit_is_reduced_and_whole_in_tiles_of_bounded_size(tmp_path, small_limit):
+    result = run(tmp_path, until="model", threads=1, config=small_limit)
+    mesh = result.mesh
+    (sentence,) = (text for text in result.warnings if "tiles/tiles.json" in text)
     assert sentence.endswith("model-full.glb holds all")
-    assert (tmp_path / "b" / "model-full.glb").read_bytes() == whole
-    assert (tmp_path / "b" / "model.glb").stat().st_size <= 1e6 * limit_mb
-    reduced = read_mesh(tmp_path / "b" / "model.glb")
-    assert len(reduced.faces) < len(result.mesh.faces)
+    assert (tmp_path / "model.glb").stat().st_size <= 30_000
+    reduced = read_mesh(tmp_path / "model.glb")
+    assert len(reduced.faces) < len(mesh.faces) == len(read_mesh(tmp_path / "model-full.glb").faces)
     np.testing.assert_allclose(reduced.vertices[:, 2], 8.0, atol=0.05)
-    assert outputs._write_surface(directory, result, 50.0, 1) == []
-    assert not (tmp_path / "b" / "model-full.glb").exists()
-    assert not (tmp_path / "b" / "tiles").exists()
-    refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
-
-
-def of_all_faces():
-    return fake_config(model=SurfaceModel(fusion=VolumetricFusion(tolerance=0.0)))
-
-
-def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkeypatch):
-    result = run(tmp_path / "a", until="model", threads=1, config=of_all_faces())
-    directory, mesh = RunDirectory(tmp_path / "b"), result.mesh
-    whole = (tmp_path / "a" / "model.glb").stat().st_size
-    monkeypatch.setattr(outputs, "TILE_FACES", len(mesh.faces) // 2)
-    monkeypatch.setattr(outputs, "TILE_MB", 0.2e-6 * whole)
-    count = outputs.write_tiles(directory, mesh, mesh)
-    coarse, *tiles = read(tmp_path / "b" / "tiles" / "tiles.json")["tiles"]
-    assert (coarse["file"], coarse["level"], coarse["faces"]) == ("../model.glb", 0, len(mesh.faces))
-    assert len(tiles) == count > 4
-    assert {path.name for path in (tmp_path / "b" / "tiles").iterdir()} == {
-        "tiles.json", *(tile["file"] for tile in tiles),
-    }  # fmt: skip
+    coarse, *tiles = read(tmp_path / "tiles" / "tiles.json")["tiles"]
+    assert (coarse["file"], coarse["level"], coarse["faces"]) == ("../model.glb", 0, len(reduced.faces))
+    assert len(tiles) > 4
+    names = {"tiles.json", *(tile["file"] for tile in tiles)}
+    assert {path.name for path in (tmp_path / "tiles").iterdir()} == names
     found = []
     for tile in tiles:
-        path = tmp_path / "b" / "tiles" / tile["file"]
-        assert path.stat().st_size <= 0.2 * whole
+        path = tmp_path / "tiles" / tile["file"]
+        assert path.stat().st_size <= 20_000
         there = read_mesh(path)
         assert (tile["level"], tile["faces"]) == (1, len(there.faces))
         loaded = trimesh.load(path, force="mesh", process=False)
@@ -205,47 +214,41 @@ def test_the_tiles_hold_each_face_once_in_files_of_bounded_size(tmp_path, monkey
     wanted = mesh.vertices[mesh.faces].reshape(-1, 9).astype(np.float32)
     np.testing.assert_array_equal(*(np.unique(rows, axis=0) for rows in (np.concatenate(found), wanted)))
     assert sum(map(len, found)) == len(mesh.faces)
+    refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
 
 
-def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path, monkeypatch):
-    out, largest = tmp_path / "out", SurfaceModel.max_glb_mb
-    config = of_all_faces()
-    object.__setattr__(config.model, "max_glb_mb", 0.03)
-    monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
-    monkeypatch.setattr(outputs, "TILE_FACES", 500)
-    result = run(out, until="model", config=config)
-    tiles = {path.name for path in (out / "tiles").iterdir()}
-    assert len(tiles) > 3
-    assert (out / "model.glb").stat().st_size <= 30_000
+def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path, small_limit, monkeypatch):
+    out = tmp_path / "out"
+    result = run(out, until="model", config=small_limit)
     thesisrecon.save(result, tmp_path / "copy")
-    assert {path.name for path in (tmp_path / "copy" / "tiles").iterdir()} == tiles
+    for name in ("tiles", "model-full.glb"):
+        assert (tmp_path / "copy" / name).exists()
+        assert (out / name).exists()
     assert "all triangles are in the tiles of" in summary_text(result.summary, out)
-    object.__setattr__(config.model, "max_glb_mb", largest)
-    monkeypatch.setattr(SurfaceModel, "max_glb_mb", largest)
-    run(out, 3, until="model", config=config, overwrite=True)
+    object.__setattr__(small_limit.model, "max_glb_mb", 50.0)
+    monkeypatch.setattr(SurfaceModel, "max_glb_mb", 50.0)
+    run(out, 3, until="model", config=small_limit, overwrite=True)
     assert (out / "model.glb").is_file()
     assert not (out / "tiles").exists()
+    assert not (out / "model-full.glb").exists()
     assert "tiles" not in summary_text(read(out / "summary.json"), out)
 
 
-def test_a_run_stopped_between_depth_maps_goes_on(tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, until="model", threads=1, progress=interrupt_at("dense", 2))
-    CALLS.clear()
-    run(tmp_path, until="model", threads=1)
-    assert [call for call in CALLS if call.startswith("depth")] == ["depth 2", "depth 3"]
-    CALLS.clear()
-    assert run(tmp_path).mesh is None
-    assert (tmp_path / "model.glb").exists()
-    assert run(tmp_path, until="model").mesh is not None
-    assert not [call for call in CALLS if call.startswith("depth")]
-
-
-def test_no_depths_are_a_refusal_that_keeps_the_cameras(tmp_path):
-    config = fake_config(dense=fakes.FakeDense(confirmed=False))
-    refuses(StageFailure, "no depth was found", run, tmp_path, until="model", config=config)
-    assert (tmp_path / "cameras.json").exists()
-    assert "no depth" in read(tmp_path / "summary.json")["failure"]
+def test_no_depths_are_one_sentence_and_the_cameras_stay(tmp_path):
+    config = fake_config(dense=fakes.FakeDense(unknown=(0, 1, 2, 3)))
+    refuses(StageFailure, "no depth was found", run, tmp_path / "model", until="model", config=config)
+    assert "no depth" in read(tmp_path / "model" / "summary.json")["failure"]
+    result = run(tmp_path / "any", until=None, config=config)
+    (sentence,) = (w for w in result.warnings if "No surface model was built" in w)
+    assert "no depth was found" in sentence
+    assert result.mesh is None
+    for out in (tmp_path / "model", tmp_path / "any"):
+        assert read(out / "summary.json")["registered"] == 4
+        assert (out / "report.html").exists()
+        assert not (out / "model.glb").exists()
+    some = run(tmp_path / "some", until=None, config=fake_config(dense=fakes.FakeDense(unknown=(3,))))
+    assert len(some.mesh.faces) > 50
+    assert [w for w in some.warnings if "no depth values" in w] == ["Image 03.png has no depth values"]
 
 
 def test_a_run_ends_with_a_model_by_default(tmp_path):
@@ -261,21 +264,6 @@ def test_a_run_ends_with_a_model_by_default(tmp_path):
     assert [m["known_fraction"] for m in summary["depth_maps"]] == [
         pytest.approx(np.isfinite(m.depth).mean()) for m in result.depth_maps
     ]
-
-
-def test_a_damaged_result_is_computed_again(tmp_path):
-    run(tmp_path)
-    before = kept_bytes(tmp_path)
-    CALLS.clear()
-    for name in ("00001-00002", "00000-00001"):
-        (tmp_path / "02-matches" / f"{name}.npz").write_bytes(b"damaged")
-    (tmp_path / "01-features" / "00003.npz").unlink()
-    result = run(tmp_path)
-    called = sorted(c for c in CALLS if not c.startswith("prepare"))
-    assert called == ["detect 03.png", "match (0, 1)", "match (1, 2)"]
-    assert kept_bytes(tmp_path) == before
-    reported = "02-matches/00000-00001.npz and 1 more were damaged or changed by another program"
-    assert f"{reported} and were computed again" in result.warnings
 
 
 def test_the_seed_matters_and_streams_are_apart(tmp_path):
@@ -316,14 +304,6 @@ def test_the_folder_is_judged_before_any_photograph_is_read(tmp_path, monkeypatc
     refuses(UsageError, "cannot be written", run, tmp_path / "file" / "out")
 
 
-def test_a_new_photograph_under_overwrite_computes_only_what_it_touches(tmp_path):
-    run(tmp_path, 3)
-    CALLS.clear()
-    run(tmp_path, 4, overwrite=True)
-    assert [c for c in CALLS if c.startswith("detect")] == ["detect 03.png"]
-    assert sorted(c for c in CALLS if c.startswith("match")) == [f"match ({k}, 3)" for k in range(3)]
-
-
 def test_the_page_is_called_after_the_photographs(tmp_path):
     (tmp_path / "castle").mkdir()
     for image in photographs(2):
@@ -340,52 +320,34 @@ def test_an_earlier_end_leaves_the_finished_result(tmp_path):
     run(tmp_path)
     before = {name: (tmp_path / name).read_bytes() for name in ("summary.json", "report.html", "points.ply")}
     early = run(tmp_path, until="features")
+    assert early.mesh is None
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
     assert early.summary["until"] == "features"
     assert any("up to metric: its summary and report are kept" in warning for warning in early.warnings)
 
 
-def test_an_earlier_end_of_another_run_replaces_the_finished_result(tmp_path):
-    run(tmp_path)
-    run(tmp_path, until="features", seed=1, overwrite=True)
-    assert read(tmp_path / "summary.json")["until"] == "features"
-    assert not any((tmp_path / name).exists() for name in MODEL)
-
-
-def test_a_failure_leaves_no_model_of_the_run_before(tmp_path):
-    run(tmp_path)
-    assert all((tmp_path / name).exists() for name in MODEL)
-    with pytest.raises(StageFailure):
-        run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=9)), overwrite=True)
-    assert not any((tmp_path / name).exists() for name in MODEL)
-    summary = read(tmp_path / "summary.json")
-    assert "the initial pair is bad" in summary["failure"]
-    assert summary["pairs"]["accepted"] == 6
-    assert "the initial pair is bad" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize("images", [3, 4])
-def test_a_replaced_run_is_not_read_back_with_the_new_one(tmp_path, images):
+def test_nothing_of_a_replaced_run_is_left_or_read_back(tmp_path, images):
     """Records of the old one stay for reuse, with their manifests."""
     run(tmp_path, until="model")
+    assert all((tmp_path / name).exists() for name in MODEL)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("matches", 1))
+    assert not any((tmp_path / name).exists() for name in (*MODEL, "summary.json", "report.html"))
+    run(tmp_path, until="model", overwrite=True)
     run(tmp_path, images, until="matches", seed=1, overwrite=True)
+    assert not any((tmp_path / name).exists() for name in MODEL)
     loaded = load(tmp_path)
     assert [report.stage for report in loaded.reports] == ["features", "pairs", "matches"]
     assert len(loaded.images) == len(loaded.features) == images
     assert loaded.tracks is loaded.best_reconstruction is loaded.calibration is loaded.mesh is None
     failing = fake_config(projective=fakes.FakeProjective(fail_below=9))
     refuses(StageFailure, "the initial pair is bad", run, tmp_path, images, config=failing, overwrite=True)
+    assert "the initial pair is bad" in (tmp_path / "report.html").read_text(encoding="utf-8")
     loaded = load(tmp_path)
     assert loaded.tracks.n_views == images
     assert loaded.best_reconstruction is loaded.calibration is None
     assert "the initial pair is bad" in loaded.failure
-
-
-def test_a_replaced_run_leaves_no_result_even_if_the_new_one_is_interrupted(tmp_path):
-    run(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, seed=1, overwrite=True, threads=1, progress=interrupt_at("matches", 1))
-    assert not any((tmp_path / name).exists() for name in (*MODEL, "summary.json", "report.html"))
 
 
 def test_until_ends_early_and_a_longer_run_goes_on(tmp_path):
@@ -400,37 +362,33 @@ def test_until_ends_early_and_a_longer_run_goes_on(tmp_path):
     assert CALLS == ["calibrate prior=False", "metric 0"]
 
 
-def test_a_distrusted_result_is_tried_from_other_pairs(tmp_path):
-    result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=1)))
-    assert [c for c in CALLS if c.startswith("projective")] == ["projective 0", "projective 1"]
+@pytest.mark.parametrize(
+    ("changes", "tries"),
+    [
+        ({"metric": fakes.FakeMetric(trusted_from=1)}, 2),
+        ({"projective": fakes.FakeProjective(fail_below=2)}, 3),
+    ],
+)
+def test_a_distrusted_or_failed_attempt_is_followed_by_another(tmp_path, changes, tries):
+    result = run(tmp_path, config=fake_config(**changes))
+    assert [c for c in CALLS if c.startswith("projective")] == [f"projective {k}" for k in range(tries)]
     assert result.metric.trusted
-    assert any("2 initial pairs" in warning for warning in result.warnings)
+    assert result.warnings == (f"{tries} initial pairs were tried; the best result is used",)
 
 
-def test_an_untrusted_result_is_written_with_its_warning(tmp_path):
-    result = run(tmp_path, config=fake_config(metric=fakes.FakeMetric(trusted_from=9)))
-    assert sum(c.startswith("projective") for c in CALLS) == 3
-    assert any("cannot be trusted: odd focal" in warning for warning in result.warnings)
-    assert read(tmp_path / "summary.json")["trusted"] is False
-    assert (tmp_path / "sparse" / "0" / "images.bin").exists()
-    assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
-def test_every_failed_check_is_reported_once(tmp_path):
+def test_an_untrusted_result_is_written_with_each_failed_check_once(tmp_path):
     doubted = fake_config(
         metric=fakes.FakeMetric(trusted_from=9, failed_checks=("odd focal", "the camera only rotates")),
         selfcalibration=fakes.FakeCalibrator(identifiable=False),
     )
     warnings = run(tmp_path, config=doubted).warnings
-    assert sum(warning.count("only rotates") for warning in warnings) == 1
-    assert sum(warning.count("odd focal") for warning in warnings) == 1
-
-
-def test_a_failed_attempt_is_followed_by_another(tmp_path):
-    result = run(tmp_path, config=fake_config(projective=fakes.FakeProjective(fail_below=2)))
-    assert [c for c in CALLS if c.startswith("projective")] == [f"projective {k}" for k in range(3)]
-    assert result.metric.trusted
-    assert result.warnings == ("3 initial pairs were tried; the best result is used",)
+    assert sum(c.startswith("projective") for c in CALLS) == 3
+    assert any("cannot be trusted: odd focal" in warning for warning in warnings)
+    for words in ("only rotates", "odd focal"):
+        assert sum(warning.count(words) for warning in warnings) == 1
+    assert read(tmp_path / "summary.json")["trusted"] is False
+    assert (tmp_path / "sparse" / "0" / "images.bin").exists()
+    assert "odd focal" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("first", "chosen"), [(0, 0), (1, 1)])
@@ -454,36 +412,16 @@ def test_a_large_set_is_divided_once_whichever_attempt_is_the_first_to_be_calibr
     assert len(divided) == 1
 
 
-def test_a_pair_that_fails_is_a_refused_pair(tmp_path):
-    result = run(tmp_path, config=fake_config(matching=fakes.FakeMatcher(fail_pair=(0, 2))))
+def test_a_pair_that_fails_is_refused_and_without_an_accepted_pair_the_best_is_named(tmp_path):
+    result = run(tmp_path / "a", config=fake_config(matching=fakes.FakeMatcher(fail_pair=(0, 2))))
     refused = [pair for pair in result.pairs if not pair.accepted]
     assert [(pair.i, pair.j) for pair in refused] == [(0, 2)]
     assert refused[0].reason.startswith("only 3 matches")
-
-
-def test_no_accepted_pair_is_a_failure_with_the_best_pair_named(tmp_path):
-    with pytest.raises(StageFailure, match=r"best of 6 pairs has 30 verified matches: too few verified"):
-        run(tmp_path, config=fake_config(verification=fakes.FakeVerifier(accept=False)))
-
-
-def test_a_focal_prior_reaches_the_stages_only_on_demand(tmp_path):
-    knowledge = IntrinsicsOptions(focal_px=100.0, focal_std_rel=0.1)
-    run(tmp_path, config=fake_config(intrinsics=knowledge))
-    assert "calibrate prior=True" in CALLS
-
-
-@pytest.mark.parametrize(
-    ("knowledge", "focal_px", "words"),
-    [
-        (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, np.nan], "1 of the 2 images"),
-        (IntrinsicsOptions(exif=True, focal_std_rel=0.1), [800.0, 900.0], None),
-        (IntrinsicsOptions(exif=True, focal_px=9.0, focal_std_rel=0.1), [np.nan, np.nan], None),
-        (IntrinsicsOptions(), [np.nan, np.nan], None),
-    ],
-)
-def test_only_an_ignored_option_gives_a_warning(knowledge, focal_px, words):
-    warnings = _exif_warnings(knowledge, np.array(focal_px))
-    assert [words in warning for warning in warnings] == ([True] if words else [])
+    none, words = (
+        fake_config(verification=fakes.FakeVerifier(accept=False)),
+        "has 30 verified matches: too few",
+    )
+    refuses(StageFailure, f"best of 6 pairs {words}", run, tmp_path / "b", config=none)
 
 
 @pytest.mark.parametrize(
@@ -496,23 +434,8 @@ def test_only_an_ignored_option_gives_a_warning(knowledge, focal_px, words):
 )  # fmt: skip
 def test_wrong_options_are_rejected_before_any_output(tmp_path, options, words):
     refuses(UsageError, words, run, tmp_path / "out", **options)
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_unknown_option_is_a_wrong_call(tmp_path):
     refuses(TypeError, "did you mean threads", run, tmp_path / "out", thread=3)
-
-
-def test_the_first_error_of_a_worker_ends_the_rest():
-    def fail(n):
-        if n == 3:
-            raise StageFailure("three")
-        return n
-
-    heard = []
-    with pytest.raises(StageFailure, match="three"):
-        Workers(2).run(fail, [(n,) for n in range(1000)], lambda n, _: heard.append(n))
-    assert len(heard) < 1000
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_chosen_pairs_are_matched_and_the_choice_is_kept(tmp_path):
@@ -565,12 +488,6 @@ def test_oblique_views_are_tried_while_they_help(tmp_path, monkeypatch):
     monkeypatch.setattr(matching, "_matched", matched)
     run(tmp_path, until="matches", threads=1)
     assert tried == [("", 6), ("-oblique", 1), ("-oblique", 1), ("-oblique", 1)]
-
-
-def test_a_list_that_names_no_photograph_is_refused_before_anything_is_computed(tmp_path):
-    with pytest.raises(UsageError, match=r"'9\.png', which is not among the 4 images"):
-        run(tmp_path, config=fake_config(pairs=ListedPairs((("00.png", "9.png"),))))
-    assert CALLS == []
 
 
 def test_sentences_name_images_by_file():

@@ -1,4 +1,4 @@
-"""The page of a run, its data and figures of residuals, and the page of interpolated images."""
+"""The page of a run, its assessment, its data and figures of residuals."""
 
 import base64
 import hashlib
@@ -11,10 +11,15 @@ import pytest
 
 from tests.report import synthetic
 from thesisrecon.errors import StageFailure
-from thesisrecon.io._files import write_text
 from thesisrecon.records import IntrinsicInterval, TexturedMesh
-from thesisrecon.report._data import ReportData, reprojection_distances, summarize_distances
-from thesisrecon.report._page import render_report, strip_page
+from thesisrecon.report import _assessment
+from thesisrecon.report._data import (
+    ReportData,
+    ResidualSummary,
+    reprojection_distances,
+    summarize_distances,
+)
+from thesisrecon.report._page import render_report
 
 
 @pytest.fixture(scope="module")
@@ -22,29 +27,31 @@ def page():
     return render_report(synthetic.made_up_run())
 
 
-def test_the_page_fetches_nothing_is_small_and_the_same_each_time(page):
+def require_closed(page):
+    """Require that a page fetches nothing and its links lead to elements; return them and its structure."""
     structure = synthetic.Structure(page)
     assert all(address.startswith(("data:", "#")) for address in structure.addresses)
+    wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
+    assert wanted <= set(structure.ids)
+    assert len(structure.ids) == len(set(structure.ids))
+    assert structure.handlers == []
+    return wanted, structure
+
+
+def test_the_page_holds_every_section_and_is_small_and_the_same_each_time(page):
+    wanted, structure = require_closed(page)
+    assert wanted == {"main", "view", "images", "pairs", "stages", "warnings", "config"}
+    assert structure.count("svg") == 8  # a histogram of each registered view
+    assert structure.count("img") == 9 + 2  # thumbnails, best and weakest pair
+    texts = ("Computing time", "2081.4 ± 1.7", "Trusted, but incomplete", "2 pairs lie on one plane")
+    for text in (*texts, "peak_memory_mb"):
+        assert text in page
+    # Nothing of a model is on a page without one.
+    for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
+        assert trace not in page
     assert len(page.encode()) < 4_000_000
     assert synthetic.unpacked(page, "plotly").count("plotly.js v") == 1
     assert render_report(synthetic.made_up_run()) == page
-
-
-def test_the_page_holds_every_section_and_its_links_lead_somewhere(page):
-    structure = synthetic.Structure(page)
-    wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
-    assert wanted == {"main", "view", "images", "pairs", "stages", "warnings", "config"}
-    assert wanted <= set(structure.ids)
-    assert structure.count("svg") == 8  # a histogram of each registered view
-    assert structure.count("img") == 9 + 2  # thumbnails, best and weakest pair
-    for text in (
-        "Computing time",
-        "2081.4 ± 1.7",
-        "Trusted, but incomplete",
-        "2 pairs lie on one plane",
-        "peak_memory_mb",
-    ):
-        assert text in page
 
 
 def test_runs_that_stopped_early_say_how_far_they_got():
@@ -57,6 +64,10 @@ def test_runs_that_stopped_early_say_how_far_they_got():
     page = render_report(only_features)
     assert "corners were detected" in page
     assert 'id="plotly"' not in page  # nothing to draw, nothing to carry
+    failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
+    page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))
+    for text in ("No photograph was found.", "No stage finished.", "Put JPEG files in the folder."):
+        assert text in page
 
 
 def test_strata_are_told_apart(page):
@@ -96,13 +107,6 @@ def test_affine_cameras_at_infinity_are_left_out_by_number(count, offset):
     assert ('id="affine-figure"' in page) == (count < 8)
 
 
-def test_a_failed_run_without_anything_has_a_page():
-    failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
-    page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))
-    for text in ("No photograph was found.", "No stage finished.", "Put JPEG files in the folder."):
-        assert text in page
-
-
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     data = replace(synthetic.projective_run(), reconstruction=None, until="matches")
     nothing = replace(
@@ -125,12 +129,6 @@ def test_warnings_of_the_run_stand_beside_those_of_its_stages():
     assert "2 initial pairs were tried" in section
 
 
-def test_a_name_that_is_not_unicode_can_be_written(tmp_path):
-    page = render_report(synthetic.made_up_run(names=["a\udcff.jpg", "b.jpg", "c.jpg"], points=60))
-    write_text(tmp_path / "report.html", page)
-    assert "a?.jpg" in (tmp_path / "report.html").read_text(encoding="utf-8")
-
-
 def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
@@ -141,19 +139,11 @@ def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     # Like the largest model and scene of a page.
     steps = np.arange(150 * 151).reshape(150, 151)[:, :-1].ravel()
     faces = np.concatenate([steps[:, None] + (0, 1, 152), steps[:, None] + (0, 152, 151)])
-    vertices = rng.normal(size=(151 * 151, 3))
+    uv, vertices = rng.uniform(0, 2047, (151 * 151, 2)), rng.normal(size=(151 * 151, 3))
     texture = np.repeat(np.repeat(rng.integers(60, 190, (512, 512, 3), dtype=np.uint8), 4, 0), 4, 1)
-    model = TexturedMesh(
-        vertices, faces, uv=rng.uniform(0, 2047, vertices[:, :2].shape)[faces], texture=texture
-    )
-    page = render_report(
-        replace(
-            data,
-            model=model,
-            summary={**data.summary, "cameras": cameras},
-            depth_maps=dict.fromkeys(range(1000), depth),
-        )
-    )
+    model = TexturedMesh(vertices, faces, uv=uv[faces], texture=texture)
+    summary, maps = data.summary | {"cameras": cameras}, dict.fromkeys(range(1000), depth)
+    page = render_report(replace(data, model=model, summary=summary, depth_maps=maps))
     structure = synthetic.Structure(page)
     # 25,000 coloured points take 0.7 MB more than those of this run.
     assert len(page.encode()) < 9_300_000
@@ -166,13 +156,8 @@ def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
 def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     data = synthetic.sphere_run()
     page = render_report(data)
-    structure = synthetic.Structure(page)
+    _, structure = require_closed(page)
     assert {"model", "depth", "held-out", "model-data", "model-figure"} <= set(structure.ids)
-    assert len(structure.ids) == len(set(structure.ids))
-    wanted = {address[1:] for address in structure.addresses if address.startswith("#")}
-    assert wanted <= set(structure.ids)
-    assert all(address.startswith(("data:", "#")) for address in structure.addresses)
-    assert structure.handlers == []
     assert structure.count("img") == 8 + 7 + 3
     assert structure.count("option") == 8 + 1
     texels = f"{data.model.texture.shape[1]} × {data.model.texture.shape[0]} texels"
@@ -180,6 +165,10 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
         assert text in page
     assert "<b>.jpg" not in page
     assert render_report(synthetic.sphere_run()) == page
+    empty = replace(data.model, faces=np.zeros((0, 3), dtype=np.int64))
+    bare = render_report(replace(data, model=empty, held_out=None, depth_maps={}))
+    for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
+        assert trace not in bare
 
 
 def test_only_the_scripts_of_the_page_may_run():
@@ -197,79 +186,20 @@ def test_only_the_scripts_of_the_page_may_run():
     assert "<script" not in nothing
 
 
-def test_without_a_model_nothing_of_it_is_on_the_page(page):
-    for trace in ('id="model', 'id="depth"', 'id="held-out"', "model.glb", "WebGL 2"):
-        assert trace not in page
-    empty = replace(synthetic.sphere_run().model, faces=np.zeros((0, 3), dtype=np.int64))
-    bare = render_report(replace(synthetic.sphere_run(), model=empty, held_out=None, depth_maps={}))
-    for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
-        assert trace not in bare
-
-
 def test_the_table_of_cameras_has_a_column_for_every_estimate():
     data = synthetic.made_up_run()
-    square = {
-        "aspect": IntrinsicInterval(1.0, 0.0, "assumed"),
-        "skew_px": IntrinsicInterval(0.0, 0.0, "assumed"),
-    }
-    own = {"aspect": IntrinsicInterval(1.0023, 0.0004, "b"), "skew_px": IntrinsicInterval(0.5, 0.1, "b")}
 
-    def reported(more):
+    def reported(aspect, skew):
+        more = {"aspect": IntrinsicInterval(*aspect, "a"), "skew_px": IntrinsicInterval(*skew, "a")}
         views = tuple({**view, **more} if view else {} for view in data.metric.intrinsics)
-        metric = replace(data.metric, intrinsics=views)
-        return render_report(replace(data, metric=metric))
+        return render_report(replace(data, metric=replace(data.metric, intrinsics=views)))
 
-    assert "Aspect (fy/fx)" not in reported(square)
-    page = reported(own)
+    assert "Aspect (fy/fx)" not in reported((1.0, 0.0), (0.0, 0.0))
+    page = reported((1.0023, 0.0004), (0.5, 0.1))
     assert page.index("Aspect (fy/fx)") < page.index("Skew (px)") < page.index("Principal x (px)")
     assert "1.0023 ± 0.0004" in page
     # At a quarter of the size: four times as much in the photograph.
     assert "2.0 ± 0.4" in page
-
-
-LEVELS = (20, 120, 220)
-
-
-def strip():
-    frames = [(f"picture <{k}>", np.full((60, 80, 3), level, np.uint8)) for k, level in enumerate(LEVELS)]
-    return strip_page("Between <a> and b", frames, notes=["all is well"])
-
-
-def test_a_strip_has_its_notes():
-    assert "all is well." in strip()
-
-
-@pytest.mark.browser
-def test_one_turns_through_the_pictures(browser, tmp_path):
-    path = tmp_path / "strip.html"
-    path.write_text(strip(), encoding="utf-8")
-    seen = synthetic.Witness(browser, path, 900, drawn=())
-    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[0]) < 4
-    seen.page.locator("#place").press("ArrowRight")
-    assert seen.page.inner_text("#caption") == "picture <1>"
-    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - LEVELS[1]) < 4
-    seen.page.click("#play")
-    for caption in ("picture <2>", "picture <0>"):
-        seen.page.locator("#caption", has_text=caption).wait_for()
-    seen.page.click("#play")
-    assert seen.page.inner_text("#play") == "Play"
-    assert seen.errors == []
-    assert not [url for url in seen.requests if not url.startswith(("file:", "data:"))]
-    seen.context.close()
-
-
-def test_intrinsics_are_reported_in_pixels_of_the_file():
-    data = synthetic.made_up_run(points=100)  # worked at a quarter of the size
-    working, original = data.metric.intrinsics[0], data.original_intrinsics[0]
-    assert original["focal_px"].value == pytest.approx(4 * working["focal_px"].value)
-    assert original["focal_px"].std == pytest.approx(4 * working["focal_px"].std)
-    # The middle of the file stays the middle: (x + 0.5) / s - 0.5.
-    assert original["principal_x_px"].value == pytest.approx(
-        4 * (working["principal_x_px"].value + 0.5) - 0.5
-    )
-    assert original["k1"] == working["k1"]
-    assert data.original_intrinsics[-1] == {}
-    assert replace(data, metric=None, colors=None).original_intrinsics == ({},) * 9
 
 
 def test_the_residuals_are_the_noise_that_was_added():
@@ -285,3 +215,53 @@ def test_the_residuals_are_the_noise_that_was_added():
     # Without the distortion the residuals grow by what it moved.
     without = reprojection_distances(synthetic.projective_run().reconstruction)
     assert summarize_distances(np.concatenate(without)).rms_px > 2 * synthetic.NOISE_PX
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (1520.34, 1.84, "1520.3 ± 1.8"), (1520.34, 4.2, "1520 ± 4"), (1520.34, 0.42, "1520.3 ± 0.4"),
+        (-0.03012, 0.00042, "-0.0301 ± 0.0004"), (512.0, 0.0, "512 (fixed)"),
+        (1520.34, float("inf"), "1520 (not determined)"),
+    ],
+)  # fmt: skip
+def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
+    assert _assessment.plus_minus(value, std) == text
+
+
+def test_the_assessment_is_honest():
+    data = synthetic.made_up_run(points=100)
+    assert data.metric is not None
+    assert _assessment.assess(data).word == "Trusted, but incomplete"
+    phone = replace(data.metric, limitations=("image #1 is blurred",))
+    assert _assessment.assess(replace(data, metric=phone)).reasons == ("Image #1 is blurred.",)
+    doubt = replace(data.metric, trusted=False, failed_checks=("pure rotation",))
+    assessment = _assessment.assess(replace(data, metric=doubt))
+    assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))
+    early = _assessment.assess(synthetic.projective_run())
+    assert early.level == "open"
+    assert "projective reconstruction" in early.sentence
+
+
+def test_a_failure_states_reason_evidence_and_advice():
+    failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
+    data = replace(synthetic.projective_run(), reconstruction=None, until=None, failure=failure)
+    assessment = _assessment.assess(replace(data, reports=data.reports[:2]))
+    assert assessment.level == "bad"
+    assert assessment.sentence == "No pair overlaps."
+    assert assessment.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
+    assert assessment.advice == "Take more photographs."
+
+
+def test_the_head_of_the_page_summarises_the_run():
+    labels = [fact.label for fact in _assessment.key_facts(synthetic.made_up_run(points=100), None)]
+    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", "Computing time"]
+    facts = _assessment.key_facts(synthetic.made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
+    assert facts[3].value == "0.80 px median"
+    assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
+    early = replace(synthetic.projective_run(), reconstruction=None)
+    assert [fact.label for fact in _assessment.key_facts(early, None)] == [
+        "Images",
+        "Pairs accepted",
+        "Computing time",
+    ]

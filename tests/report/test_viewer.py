@@ -1,4 +1,4 @@
-"""The viewer of the model and the page as a browser shows them."""
+"""The viewer of the model and the pages of runs, comparisons and strips as a browser shows them."""
 
 import base64
 import io
@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
+from tests.io.test_colmap import export, scene
 from tests.report import synthetic
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
+from thesisrecon import compare_models
 from thesisrecon.camera import decompose_camera
-from thesisrecon.records import TexturedMesh
+from thesisrecon.io._models import read_model
+from thesisrecon.records import Similarity, TexturedMesh
 from thesisrecon.report import _figures
 from thesisrecon.report._figures import LEVELS, upright_rotation, viewer_data
-from thesisrecon.report._page import render_report
+from thesisrecon.report._page import comparison_page, render_report, strip_page
 
 
 def unpacked(text, kind, columns):
@@ -66,7 +69,11 @@ def test_a_model_with_colours_or_none_needs_no_texture():
 
 
 def test_the_viewer_stands_where_photographs_were_taken():
-    data = data_of(synthetic.sphere_model())
+    data, cameras = data_of(synthetic.sphere_model()), synthetic.sphere_reconstruction()
+    some = np.arange(8) != 3
+    without = replace(cameras, registered=some, P=cameras.P * some[:, None, None])
+    shown = viewer_data(synthetic.sphere_model(), without, synthetic.SPHERE_NAMES)["viewpoints"]
+    assert [stand["name"][0] for stand in shown] == list("1235678")
     names = [f"{k + 1} · {name}" for k, name in enumerate(synthetic.SPHERE_NAMES)]
     assert [stand["name"] for stand in data["viewpoints"]] == names
     turn = upright()
@@ -83,17 +90,6 @@ def test_the_viewer_stands_where_photographs_were_taken():
     assert 0 <= data["start"] < len(synthetic.SPHERE_NAMES)
 
 
-def test_views_without_a_camera_are_not_viewpoints():
-    reconstruction = synthetic.sphere_reconstruction()
-    registered = reconstruction.registered.copy()
-    registered[3] = False
-    P = reconstruction.P * registered[:, None, None]
-    data = viewer_data(
-        synthetic.sphere_model(), replace(reconstruction, registered=registered, P=P), synthetic.SPHERE_NAMES
-    )
-    assert [stand["name"][0] for stand in data["viewpoints"]] == list("1235678")
-
-
 def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
     monkeypatch.setattr(_figures, "MAX_TEXELS", 100 * 100)
     data = data_of(synthetic.sphere_model())
@@ -101,19 +97,15 @@ def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
     assert 0.9 * 100 * 100 < picture.width * picture.height <= 100 * 100
 
 
-def test_a_flat_model_has_a_box():
-    mesh = TexturedMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0, 1, 2]]))
-    data = data_of(mesh)
+def test_flat_models_and_fans_about_a_stray_are_shown():
+    flat = TexturedMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0, 1, 2]]))
+    data = data_of(flat)
     assert np.isfinite(corners(data)).all()
     assert (np.array(data["high"]) > data["low"]).all()
-
-
-def test_a_fan_about_a_stray_is_shown_all_the_same():
     angle = np.linspace(0.0, 2.0 * np.pi, 41)[:-1]
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.full(40, 4.0)])
     faces = np.array([[k, (k + 1) % 40, 40] for k in range(40)])
-    fan = TexturedMesh(np.vstack([rim, [[0.0, 0.0, 1000.0]]]), faces)
-    assert len(corners(data_of(fan))) == 40
+    assert len(corners(data_of(TexturedMesh(np.vstack([rim, [[0.0, 0.0, 1000.0]]]), faces)))) == 40
 
 
 def test_a_stray_does_not_take_the_resolution_of_the_rest():
@@ -147,17 +139,20 @@ def witness(request, browser, report):
     opened.context.close()
 
 
-@pytest.mark.browser
-def test_nothing_complains_runs_reaches_out_or_is_too_wide(witness):
-    witness.page.hover("#matrix-figure .nsewdrag")
+def require_quiet(witness):
+    """Require that a page does not complain, reaches nothing outside, and is not too wide."""
     assert witness.errors == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in witness.requests)
     width = witness.page.evaluate("document.documentElement.scrollWidth")
     assert width <= witness.page.viewport_size["width"]
-    overhang = witness.page.evaluate(
-        "(() => { const t = document.querySelector('.listing'); return t.scrollWidth - t.clientWidth; })()"
-    )
-    assert overhang <= 0
+
+
+@pytest.mark.browser
+def test_nothing_complains_runs_reaches_out_or_is_too_wide(witness):
+    witness.page.hover("#matrix-figure .nsewdrag")
+    require_quiet(witness)
+    overhang = "(t => t.scrollWidth - t.clientWidth)(document.querySelector('.listing'))"
+    assert witness.page.evaluate(overhang) <= 0
 
 
 @pytest.mark.browser
@@ -336,10 +331,7 @@ def test_it_comes_back_after_the_graphics_card_was_lost(model_page):
 
 @pytest.mark.browser
 def test_all_is_shown_and_nothing_complains_reaches_out_or_is_too_wide(model_page):
-    assert model_page.errors == []
-    assert all(url.startswith(("file:", "data:", "blob:")) for url in model_page.requests)
-    width = model_page.page.evaluate("document.documentElement.scrollWidth")
-    assert width <= model_page.page.viewport_size["width"]
+    require_quiet(model_page)
     widths = model_page.page.evaluate(
         "[...document.querySelectorAll('#depth img, #held-out img')].map(i => i.complete && i.naturalWidth)"
     )
@@ -379,3 +371,54 @@ def test_missing_webgl_is_reported(browser, model_report):
     assert not model_page.page.locator("#model-reset").is_visible()
     assert all("viewer" not in error.lower() for error in model_page.errors)
     model_page.context.close()
+
+
+def page_in(browser, tmp_path, page, width=900, drawn=("scene-figure",)):
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    return synthetic.Witness(browser, tmp_path / "page.html", width, drawn=drawn)
+
+
+@pytest.mark.browser
+def test_all_points_are_in_view_although_the_reference_has_none(browser, tmp_path):
+    export(tmp_path, scene())
+    a = read_model(tmp_path)
+    b = replace(a, X=a.X[:0], view_index=a.view_index[:0], point_index=a.point_index[:0], xy=a.xy[:0])
+    a = replace(a, X=a.X - np.array([0.0, 4.0, 0.0]))
+    seen = page_in(browser, tmp_path, comparison_page(compare_models(a, b), "a", "b"))
+    points = np.abs(seen.pixels("#scene-figure").astype(int) - (255, 199, 138)).max(axis=2) < 30
+    assert points.sum() > 20
+    assert not points[:3].any()
+    assert not points[-3:].any()
+
+
+@pytest.mark.browser
+def test_a_browser_draws_both_models(browser, tmp_path):
+    export(tmp_path, scene())
+    b = read_model(tmp_path)
+    a = replace(b, X=b.X + 0.2).transformed(Similarity(3.0, np.eye(3), np.ones(3)))
+    seen = page_in(browser, tmp_path, comparison_page(compare_models(a, b), "a", "b"))
+    colors = seen.pixels("#scene-figure").reshape(-1, 3).astype(int)
+    for points in ((255, 199, 138), (159, 216, 247)):
+        assert (np.abs(colors - points).max(axis=1) < 30).sum() > 20
+    assert seen.errors == []
+
+
+@pytest.mark.browser
+def test_one_turns_through_the_pictures_of_a_strip(browser, tmp_path):
+    levels = (20, 120, 220)
+    frames = [(f"picture <{k}>", np.full((60, 80, 3), level, np.uint8)) for k, level in enumerate(levels)]
+    page = strip_page("Between <a> and b", frames, notes=["all is well"])
+    assert "all is well." in page
+    seen = page_in(browser, tmp_path, page, drawn=())
+    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - levels[0]) < 4
+    seen.page.locator("#place").press("ArrowRight")
+    assert seen.page.inner_text("#caption") == "picture <1>"
+    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - levels[1]) < 4
+    seen.page.click("#play")
+    for caption in ("picture <2>", "picture <0>"):
+        seen.page.locator("#caption", has_text=caption).wait_for()
+    seen.page.click("#play")
+    assert seen.page.inner_text("#play") == "Play"
+    assert seen.errors == []
+    assert not [url for url in seen.requests if not url.startswith(("file:", "data:"))]
+    seen.context.close()

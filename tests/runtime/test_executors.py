@@ -1,13 +1,12 @@
 """Every executor gives the same bytes, and a run survives the loss of workers."""
 
-import builtins
 import concurrent.futures as futures
 import hashlib
 import multiprocessing
 import os
-import pickle
 import signal
 import socket
+import sys
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -20,14 +19,10 @@ import pytest
 from tests.conftest import LOCAL, address, refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import fake_config, photographs
-from thesisrecon._numba import ThreadPool
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
-from thesisrecon.pipeline import matching, stages
-from thesisrecon.pipeline import matching as preparing
-from thesisrecon.pipeline.matching import PreparedViews, batch_pairs
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 
@@ -172,58 +167,14 @@ class SlowMatcher(fakes.FakeMatcher):
         return super().match(*views, **given)
 
 
-class Recorder(futures.Executor):
-    """Runs tasks at once and keeps their pickled results."""
-
-    def __init__(self):
-        self.found = {}
-
-    def submit(self, fn, key, task):
-        answer, (function, given) = futures.Future(), pickle.loads(task)
-        answer.set_result(fn(key, task))
-        self.found.setdefault(function, []).append((given, answer.result()))
-        return answer
-
-
-def test_results_of_real_tasks_are_as_small_as_stated(tmp_path, monkeypatch):
-    """Batches of pairs are cut where their results might be too large; maps need 9 bytes a pixel."""
-    largest = 400_000
-    monkeypatch.setattr(preparing, "MAX_RESULT_BYTES", largest)
-    monkeypatch.setattr(preparing, "BATCHES_PER_WORKER", 1)
-    recorder = Recorder()
-    config = replace(PipelineConfig(), images=ImageOptions(max_size_px=200))
-    images = sorted(COURTYARD.iterdir())[4:8]
-    result = reconstruct(images, tmp_path, config=config, until="dense", threads=1, executor=recorder)
-    corners = [len(features.xy) for features in result.features]
-    batches = recorder.found[matching._match_all]
-    assert 1 < len(batches) < 6
-    for (_, _, pairs, _), answer in batches:
-        matches = sum(min(corners[i], corners[j]) for i, j in pairs)
-        bound = preparing.PAIR_BYTES * len(pairs) + preparing.MATCH_BYTES * matches
-        assert len(answer) <= bound <= largest
-    for (_, answer), image in zip(recorder.found[stages._depths], result.images, strict=True):
-        assert len(answer) <= 9 * image.rgb[..., 0].size + 4096
-    assert set(recorder.found) == {matching._detect, matching._match_all, stages._depths}
-
-
 @pytest.mark.parametrize("port", ["", "8786/x", "0", "70000", "port"])
-def test_an_invalid_address_is_rejected_before_any_output(port, tmp_path):
-    with pytest.raises(UsageError, match=r"dask://HOST:PORT, for example .* got 'dask://there"):
-        reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor=f"dask://there:{port}")
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_missing_extra_is_named(monkeypatch, tmp_path):
-    found = builtins.__import__
-
-    def without(name, *given, **more):
-        if name.split(".")[0] == "distributed":
-            raise ImportError(name)
-        return found(name, *given, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(UsageError, match="not installed; install the extra distributed"):
-        reconstruct(photographs(2), tmp_path / "out", config=fake_config(), executor="dask://localhost:8786")
+def test_an_invalid_address_or_a_missing_extra_is_named_before_any_output(port, tmp_path, monkeypatch):
+    given = {"config": fake_config(), "out": tmp_path / "out"}
+    words = r"dask://HOST:PORT, for example .* got 'dask://there"
+    refuses(UsageError, words, reconstruct, photographs(2), executor=f"dask://there:{port}", **given)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    words = "not installed; install the extra distributed"
+    refuses(UsageError, words, reconstruct, photographs(2), executor="dask://localhost:8786", **given)
     assert not (tmp_path / "out").exists()
 
 
@@ -245,60 +196,6 @@ def test_workers_of_other_code_unknown_tasks_and_invalid_executors_are_refused()
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
         workers._answer(workers.package_key(), missing)
     refuses(UsageError, "or a concurrent", Workers, 1, 3)
-
-
-def test_an_executor_is_given_few_tasks_at_a_time():
-    """Large sets must not lie in memory as tasks."""
-    asked, done = 0, 0
-
-    def tasks():
-        nonlocal asked
-        for n in range(50):
-            asked += 1
-            assert asked - done <= 2 * workers.AHEAD + 2
-            yield (n,)
-
-    def finished(_, __):
-        nonlocal done
-        done += 1
-
-    with futures.ThreadPoolExecutor(2) as pool:
-        Workers(2, pool).run(abs, tasks(), finished)
-    assert done == 50
-
-
-def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
-    made = []
-
-    class Counting(fakes.FakeMatcher):
-        def prepare(self, image, features):
-            del image
-            made.append(features)
-            return np.zeros(100)
-
-    monkeypatch.setattr(preparing, "CACHE_BYTES", 4 * 800)
-    views = PreparedViews(Counting().prepare, {i: (None, i) for i in range(6)})
-    assert [len(view) for view in views] == [100] * 6
-    assert [views[5] is views[5], made] == [True, [0, 1, 2, 3, 4, 5]]
-    assert len(views[0]) == 100
-    assert made[-1] == 0
-    assert len(views.subset([4, 5])) == 2
-    with pytest.raises(IndexError):
-        views.subset([4, 5])[0]
-
-
-@pytest.mark.parametrize(("pairs", "workers_there"), [(91, 2), (7, 4), (3000, 2)])
-def test_batches_hold_every_pair_once_and_few_views(pairs, workers_there):
-    views = next(n for n in range(100) if n * (n - 1) // 2 >= pairs)
-    every = [(i, j) for i in range(views) for j in range(i + 1, views)][:pairs]
-    numbers = list(range(0, pairs, 2))
-    dealt = batch_pairs(every, numbers, workers_there, [3000] * views)
-    assert sorted(n for batch in dealt for n in batch) == numbers
-    assert len(dealt) >= min(len(numbers), 8 * workers_there)
-    assert min(len(batch) for batch in dealt[:-1]) == max(len(batch) for batch in dealt)
-    for batch in dealt:
-        assert len(batch) <= preparing.MAX_BATCH
-        assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5
 
 
 def refuse(*_):
@@ -326,11 +223,3 @@ def test_without_worker_processes_this_process_does_the_work(refused, serial, tm
     small_job(serial[0], tmp_path, threads=2, executor="processes")
     assert results(tmp_path) == results(serial[1])
     assert caplog.text.count("no worker processes can be started") == 1
-
-
-def test_the_calling_thread_passes_errors_and_nested_tasks_on(monkeypatch):
-    monkeypatch.setattr(threading.Thread, "start", refuse)
-    with ThreadPool(2) as pool:
-        assert list(pool.map(lambda n: sum(pool.map(abs, [-n, n])), range(3))) == [0, 2, 4]
-        with pytest.raises(ZeroDivisionError):
-            pool.submit(lambda: 1 / 0).result()

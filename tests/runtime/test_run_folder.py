@@ -1,19 +1,26 @@
-"""The run folder, its record files, and a disk that is full."""
+"""The run folder, its record files, a disk that is full, and the position of an unfinished run."""
 
 import errno
 import json
+import os
+import re
 import shutil
+import time
 import zipfile
 
 import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from tests.pipeline.fake_stages import fake_config, photographs
+from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import records
 from thesisrecon.api.reconstruct import reconstruct
+from thesisrecon.cli.main import run_command
 from thesisrecon.errors import OutputError, UsageError
-from thesisrecon.io._files import read_json, write_atomically
+from thesisrecon.io._files import read_json, write_atomically, write_json
+from thesisrecon.io._outputs import LOCK_FILE
+from thesisrecon.pipeline import algorithm1
+from thesisrecon.runtime._run import run_position
 from thesisrecon.runtime._run_folder import (
     ChangedRecord,
     RunDirectory,
@@ -73,12 +80,6 @@ def test_another_key_or_absence_recomputes_and_damage_is_reported(tmp_path):
         refuses(ChangedRecord, r"a\.npz: ", folder.load, "a", "key")
 
 
-def test_a_pickle_is_never_loaded(tmp_path):
-    np.savez(tmp_path / "a.npz", description=np.array([{"key": "key"}], dtype=object))
-    (tmp_path / "a.npz").write_bytes(sealed((tmp_path / "a.npz").read_bytes()))
-    refuses(ChangedRecord, "allow_pickle", StageFolder(tmp_path).load, "a", "key")
-
-
 def test_the_manifest_ends_a_stage_and_removes_stale_files(tmp_path):
     folder = StageFolder(tmp_path)
     folder.save("old", "1", some_features())
@@ -102,92 +103,45 @@ def test_keys_distinguish_values_types_and_arrays():
 IDENTITY = {"seed": 0, "settings": {"features": {"max": 5}}, "images": {"a.jpg": "1", "b.jpg": "2"}}
 
 
-def claim_is_refused(directory, words, identity=IDENTITY, *, overwrite=False):
-    with pytest.raises(UsageError, match=words), directory.claim(identity, overwrite=overwrite):
-        pass
-
-
 def test_the_same_run_is_resumed_and_another_is_rejected_with_the_difference(tmp_path):
     directory = RunDirectory(tmp_path / "new" / "out")
-    with directory.claim(IDENTITY, overwrite=False):
-        directory.adopt(IDENTITY, overwrite=False)
-        directory.stage("01").save("a", "key", some_features())
-    with directory.claim(IDENTITY, overwrite=False):
-        directory.adopt(IDENTITY, overwrite=False)
+    for _ in ("new", "the same"):
+        with directory.claim(IDENTITY, overwrite=False):
+            directory.adopt(IDENTITY, overwrite=False)
+            directory.stage("01").save("a", "key", some_features())
+    two = IDENTITY["images"]
     changed = [
-        ({**IDENTITY, "settings": {"features": {"max": 6}}}, r"features\.max was 5 and is now 6"),
-        ({**IDENTITY, "seed": 1}, "seed was 0 and is now 1"), ({**IDENTITY, "images": {"a.jpg": "1"}},
-        "without 'b.jpg'"), ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "3"}}, "a changed 'b.jpg'"),
-        ({**IDENTITY, "images": {"a.jpg": "1", "b.jpg": "2", "c.jpg": "4", "d.jpg": "5"}},
-        "new 'c.jpg' and 1 more",),
+        ({"settings": {"features": {"max": 6}}}, r"features\.max was 5 and is now 6"),
+        ({"seed": 1}, "seed was 0 and is now 1"), ({"images": {"a.jpg": "1"}}, r"without 'b\.jpg'"),
+        ({"images": two | {"b.jpg": "3"}}, r"a changed 'b\.jpg'"),
+        ({"images": two | {"c.jpg": "4", "d.jpg": "5"}}, r"new 'c\.jpg' and 1 more"),
     ]  # fmt: skip
-    for identity, words in changed:
-        claim_is_refused(directory, words, identity)
+    for change, words in changed:
+        with pytest.raises(UsageError, match=words), directory.claim(IDENTITY | change, overwrite=False):
+            pass
     assert read_json(directory.path / "run.json") == IDENTITY
-    assert directory.stage("01").load("a", "key") is not None
-    with directory.claim(changed[0][0], overwrite=True):
+    with directory.claim(IDENTITY | changed[0][0], overwrite=True):
         assert directory.stage("01").load("a", "key") is not None
 
 
-def test_settings_are_judged_before_the_photographs_are_known(tmp_path):
-    directory = RunDirectory(tmp_path)
-    with directory.claim(IDENTITY, overwrite=False):
-        directory.adopt(IDENTITY, overwrite=False)
-    options = {name: value for name, value in IDENTITY.items() if name != "images"}
-    with directory.claim(options, overwrite=False), pytest.raises(UsageError, match=r"without 'b\.jpg'"):
-        directory.adopt({**IDENTITY, "images": {"a.jpg": "1"}}, overwrite=False)
-    claim_is_refused(directory, "seed was 0", {**options, "seed": 2})
-
-
-def test_replacing_another_run_removes_its_results_and_resuming_keeps_them(tmp_path):
-    directory = RunDirectory(tmp_path / "out")
-    results = ["summary.json", "sparse/0/cameras.bin", "absent.txt"]
-
-    def adopt(seed):
-        identity = {**IDENTITY, "seed": seed}
-        with directory.claim(identity, overwrite=True):
-            directory.adopt(identity, overwrite=True, results=results)
-
-    adopt(0)
-    write_atomically(directory.path / "summary.json", b"{}")
-    write_atomically(directory.path / "sparse" / "0" / "cameras.bin", b"")
-    write_atomically(directory.path / "sparse" / "note.txt", b"of the user")
-    adopt(0)
-    assert (directory.path / "sparse" / "0" / "cameras.bin").exists()
-    adopt(1)
-    assert not (directory.path / "summary.json").exists()
-    assert not (directory.path / "sparse" / "0").exists()
-    assert (directory.path / "sparse" / "note.txt").exists()
-
-
-def test_a_folder_of_something_else_is_left_alone(tmp_path):
-    (tmp_path / "letter.txt").write_text("dear")
-    words = r"holds 'letter\.txt', which thesisrecon did not create"
-    claim_is_refused(RunDirectory(tmp_path), words, overwrite=True)
-    assert not (tmp_path / "run.json").exists()
-
-
-def test_two_runs_cannot_share_a_folder(tmp_path):
-    directory = RunDirectory(tmp_path / "out")
-    with directory.claim(IDENTITY, overwrite=False):
-        claim_is_refused(directory, "another run is writing")
-    with directory.claim(IDENTITY, overwrite=False):
-        pass
-
-
-def test_a_place_that_cannot_be_written_gets_a_sentence(tmp_path):
-    (tmp_path / "file").write_text("")
-    claim_is_refused(RunDirectory(tmp_path / "file" / "out"), "cannot be written")
-
-
-def test_cached_results_are_shared_by_key(tmp_path):
+def test_cached_results_are_shared_by_key_and_replace_damaged_ones(tmp_path):
     one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01-features") for name in "ab")
     one.save("00000", "key", some_features(2.0))
     assert two.load("00007", "other") is None
     found = two.load("00007", "key")
     assert bytes_from_record(found, "") == bytes_from_record(some_features(2.0), "")
+    own, kept = two.path / "00007.npz", tmp_path / "shared" / "01-features" / "key.npz"
+    for damaged in (own, kept):
+        write_atomically(damaged, b"damaged")
+        assert two.load("00007", "key") is not None
+    write_atomically(own, b"damaged")
+    refuses(ChangedRecord, "npz: ", two.load, "00007", "key")
+    kept.unlink()
+    one.save("00000", "key", some_features(2.0))
+    own.unlink()
+    assert two.load("00007", "key") is not None
     # Taken once, it is there whatever becomes of the others.
-    (tmp_path / "shared" / "01-features" / "key.npz").unlink()
+    kept.unlink(missing_ok=True)
     one.path.joinpath("00000.npz").unlink()
     assert two.load("00007", "key") is not None
     assert not list(tmp_path.rglob("*.partial"))
@@ -195,20 +149,6 @@ def test_cached_results_are_shared_by_key(tmp_path):
     two.save("00007", "new", some_features(3.0))
     one.save("00000", "key", some_features(2.0))
     assert two.load("00007", "new") is not None
-
-
-def test_damaged_records_are_taken_from_the_other_place(tmp_path):
-    one, two = (RunDirectory(tmp_path / name, tmp_path / "shared").stage("01") for name in "ab")
-    one.save("0", "key", some_features())
-    own, kept = tmp_path / "b" / "01" / "0.npz", tmp_path / "shared" / "01" / "key.npz"
-    write_atomically(own, b"damaged")
-    assert two.load("0", "key") is not None
-    assert own.read_bytes() == kept.read_bytes()
-    write_atomically(kept, b"damaged")
-    assert two.load("0", "key") is not None
-    write_atomically(own, b"damaged")
-    with pytest.raises(ChangedRecord):
-        two.load("0", "key")
 
 
 def saved(path, record, *, packed=False, **arrays):
@@ -235,6 +175,9 @@ def test_only_records_are_made(tmp_path):
     for kind in ("Path", "annotations", "__builtins__", "field", "soup", "F64"):
         assert refused(saved(path, {"type": kind, "fields": {}}))
     assert refused(saved(path, {"array": "array0"}), "array0")
+    np.savez(path, description=np.array([{"key": "key"}], dtype=object))
+    path.write_bytes(sealed(path.read_bytes()))
+    assert refused(path, "allow_pickle")
     assert read_record(saved(path, {"array": "array0"}, array0=np.arange(3)), "k").tolist() == [0, 1, 2]
 
 
@@ -281,7 +224,7 @@ def whole(tmp_path_factory):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.55, 0.7, 0.85, 1.0])
-def test_a_run_stopped_by_a_full_disk_resumes(share, whole, tmp_path):
+def test_a_run_stopped_by_a_full_disk_resumes_and_keeps_what_is_good(share, whole, tmp_path):
     wanted, count = whole
     out = tmp_path / "out"
     with disk_ends(1 + round(share * (count - 1)), errno.ENOSPC), pytest.raises(OutputError) as refused:
@@ -294,33 +237,16 @@ def test_a_run_stopped_by_a_full_disk_resumes(share, whole, tmp_path):
     assert {name: wanted.get(name) for name in there} == there
     run(out)
     assert different(outputs(out), wanted) == ()
-
-
-def test_a_file_in_the_place_of_a_folder_of_the_run(whole, tmp_path):
-    out = tmp_path / "out"
-    run(out, until="features")
-    (out / "02-matches").write_text("of nobody")
-    refuses(OutputError, r"02-matches.* move the file that is in the place of a folder", run, out)
-    (out / "02-matches").unlink()
-    run(out)
-    assert different(outputs(out), whole[0]) == ()
-
-
-def test_the_results_of_a_whole_run_stay_until_they_are_replaced(whole, tmp_path):
-    """Rewritten on a full disk, no good file is lost or truncated."""
-    out = tmp_path / "out"
-    run(out)
+    # Rewritten on a full disk, no good file is lost or truncated.
     shutil.rmtree(out / "08-model")
     with disk_ends(1, errno.ENOSPC), pytest.raises(OutputError):
         run(out)
     there = outputs(out)
-    assert {name: whole[0].get(name) for name in there} == there
+    assert {name: wanted.get(name) for name in there} == there
     assert "model.glb" in there
-    run(out)
-    assert different(outputs(out), whole[0]) == ()
 
 
-def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, refused):
+def test_the_command_reports_a_full_disk_in_one_sentence(tmp_path, monkeypatch, refused):
     runs = SmallRuns(tmp_path, 2, 128, "features")
     wanted = runs.whole(tmp_path / "whole")
     refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
@@ -334,3 +260,57 @@ def test_the_command_reports_it_in_one_sentence(tmp_path, monkeypatch, refused):
     said = refused(["reconstruct", tmp_path / "images", "-o", tmp_path / "other"])
     sentence = "kernels/index.nbi cannot be written: No space left on device; free space there"
     assert said == f"thesisrecon: {sentence}\n"
+
+
+IMAGES = 10
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run whose features were done 100 s ago, and 5 of 45 pairs since."""
+    now = time.time()
+    write_json(tmp_path / "run.json", {"images": {f"{i}.jpg": "" for i in range(IMAGES)}})
+    os.utime(tmp_path / "run.json", (now - 300, now - 300))
+    pairs = np.array([(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)])
+    stages = {"01-features": IMAGES, "02-matches": 5}
+    for name, count in stages.items():
+        for n in range(count):
+            path = tmp_path / name / f"{n:05d}.npz"
+            path.parent.mkdir(exist_ok=True)
+            path.touch()
+            os.utime(path, (now - 100 - n, now - 100 - n) if name == "01-features" else (now - n, now - n))
+    choice = StageFolder(tmp_path / "02-pairs")
+    choice.save("choice", "key", records.PairChoice(pairs, "all"))
+    choice.finish(records.StageReport("pairs", 0.0, {}, {}, ()), {}, {"choice": "key"})
+    for path in (tmp_path / "02-pairs").iterdir():
+        os.utime(path, (now - 100, now - 100))
+    return tmp_path
+
+
+def test_a_folder_tells_its_stage_and_the_time_left_or_how_to_go_on(folder, capsys, tmp_path):
+    assert run_position(folder) == "interrupted: matches, 5 of 45 done; repeat the command to resume"
+    with RunDirectory(folder).claim({}, overwrite=True):
+        # Resumed items do not count for the rate.
+        assert run_position(folder) == "running: matches, 5 of 45 done"
+        os.utime(folder / LOCK_FILE, (begun := time.time() - 200.0, begun))
+        assert run_command(["inspect", str(folder)]) == 0
+    # 5 pairs in 100 s, 40 are left: 800 s.
+    words = r"running: matches, 5 of 45 done, about 1[34] min left in this stage\n"
+    assert re.match(words, capsys.readouterr().out)
+    assert run_position(tmp_path / "01-features") == ""
+
+
+def test_records_of_a_replaced_run_are_not_counted(tmp_path, monkeypatch):
+    def again(images, **options):
+        return reconstruct(photographs(images), tmp_path, config=fake_config(), threads=1, **options)
+
+    again(4)
+    refuses(KeyboardInterrupt, None, again, 5, seed=1, overwrite=True, progress=interrupt_at("matches", 2))
+    assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
+    # Killed while it compiles: what the run had done before still counts.
+    with monkeypatch.context() as patch:
+        patch.setattr(algorithm1, "precompile", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        refuses(KeyboardInterrupt, None, again, 5, seed=1)
+    assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
+    refuses(KeyboardInterrupt, None, again, 5, seed=1, progress=interrupt_at("matches", 3))
+    assert run_position(tmp_path) == "interrupted: matches, 3 of 10 done; repeat the command to resume"

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from thesisrecon.cli.main import run_command
-from thesisrecon.runtime._executors import ProcessPool
-from thesisrecon.runtime._signals import CODES, with_resume_advice
+from thesisrecon.runtime._signals import CODES
 from validation.studies.robustness import different, outputs, stopped
 
 ROOT = Path(__file__).parents[2]
@@ -134,21 +133,3 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path):
     assert run_command([*arguments, "-o", str(out)]) == 0
     assert run_command([*arguments, "-o", str(tmp_path / "whole")]) == 0
     assert different(outputs(out), outputs(tmp_path / "whole")) == ()
-
-
-def test_a_pool_is_abandoned_at_once():
-    pool = ProcessPool(1)
-    number = pool.submit(os.getpid).result()
-    pool.submit(time.sleep, 600)
-    assert is_alive(number)
-    pool.abandon()
-    assert not is_alive(number)
-
-
-def test_an_interrupt_carries_advice():
-    with (
-        pytest.raises(KeyboardInterrupt, match="go on"),
-        with_resume_advice("begin again"),
-        with_resume_advice("go on"),
-    ):
-        raise KeyboardInterrupt
