@@ -12,6 +12,7 @@ from hypothesis import settings
 from thesisrecon.cli.main import run_command
 from thesisrecon.errors import STRICT_VARIABLE, made
 from thesisrecon.runtime._run_folder import bytes_from_record
+from validation.scenes.real import data_root
 
 # The same examples on every machine: whether a test passes is no matter of chance.
 settings.register_profile("same", derandomize=True, database=None)
@@ -57,6 +58,14 @@ def refuses(error, words, call, *arguments, **options):
     """Require that a call raises the error with these words."""
     with pytest.raises(error, match=words):
         call(*arguments, **options)
+
+
+def real_data(name):
+    """A file or folder of the real images; a test that needs it is skipped without it."""
+    root = data_root()
+    if root is None or not (root / name).exists():
+        pytest.skip(f"the real data are not on this machine ({name})")
+    return root / name
 
 
 def before_each_output(monkeypatch, call):

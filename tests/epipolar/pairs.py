@@ -38,6 +38,12 @@ def make_pair(n, rng, *, planar=False):
     return Pair(project(P1, X), project(P2, X), fundamental_from_cameras(P1, P2), P1, P2)
 
 
+def with_points(pair, X, *, sigma=0.0, rng=None):
+    """The matches of a pair and, after them, those of further points; noise on all of them."""
+    xy = [np.r_[a, project(P, X)] for a, P in ((pair.xy1, pair.P1), (pair.xy2, pair.P2))]
+    return [a + rng.normal(0.0, sigma, a.shape) if sigma else a for a in xy]
+
+
 def spoil(pair, rng, *, sigma, outliers):
     """Noise on every coordinate, a share of image 2's points anywhere; xy1, xy2 and which are wrong (N,)."""
     xy1 = pair.xy1 + rng.normal(0.0, sigma, pair.xy1.shape)

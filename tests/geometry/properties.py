@@ -7,7 +7,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre
-from thesisrecon.geometry.strata import bilinear_form
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.strata import bilinear_form, transform
 
 
 def holds_for_every(*more, examples=30):
@@ -37,6 +38,15 @@ def random_camera(rng, *, distance=8.0):
     return camera_from_centre(K, R, centre), K, R, centre
 
 
+def random_round(rng, d, n):
+    """An ellipse or ellipsoid (d, d) about the origin and n of its points (n, d)."""
+    T = np.eye(d)
+    T[:-1] += 0.3 * rng.uniform(-1.0, 1.0, (d - 1, d))
+    unit = rng.normal(size=(n, d - 1))
+    x = homogenize(unit / np.linalg.norm(unit, axis=1, keepdims=True)) @ T.T
+    return transform(T, np.diag([1.0] * (d - 1) + [-1.0]), "conics"), x
+
+
 def gap(a, b):
     """Distance of two arrays of any scale and sign: the sine of their angle."""
     a, b = a.ravel() / np.linalg.norm(a), b.ravel() / np.linalg.norm(b)
@@ -63,20 +73,13 @@ def reprojection_costs(P, X, xy):
 def view_scales(P, xy):
     """1 over the norm of M's first two rows, the pixels' origin in the middle of the view's points."""
     middle = np.nanmean(xy, axis=1)
-    return np.asarray(
-        1.0 / np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2)), dtype=np.float64
-    )
+    return 1.0 / np.linalg.norm(P[:, :2, :3] - middle[:, :, None] * P[:, 2:, :3], axis=(1, 2))
 
 
 def linear_point(P, scale, xy):
     """Least singular vector of the rows of one point; P (V, 3, 4), scale (V,), xy (V, 2)."""
-    rows = [
-        scale[v] * (xy[v, i] * P[v, 2] - P[v, i])
-        for v in range(len(P))
-        for i in range(2)
-        if xy[v, 0] == xy[v, 0]
-    ]
-    return np.asarray(np.linalg.svd(np.array(rows))[2][3])
+    rows = scale[:, None, None] * (xy[:, :, None] * P[:, 2:] - P[:, :2])
+    return np.linalg.svd(rows[np.isfinite(xy[:, 0])].reshape(-1, 4))[2][3]
 
 
 def iterated_point(P, scale, xy, *, passes=10, tolerance=1e-6):
@@ -96,13 +99,12 @@ def midpoint(P, xy):
     """Point (3,) nearest to the rays of one point."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera, pixel in zip(P, xy, strict=True):
-        if np.isnan(pixel).any():
-            continue
-        centre = -np.linalg.solve(camera[:, :3], camera[:, 3])
-        ray = np.linalg.solve(camera[:, :3], [*pixel, 1.0])
-        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        A, b = A + across, b + across @ centre
-    return np.asarray(np.linalg.solve(A, b))
+        if np.isfinite(pixel).all():
+            centre = -np.linalg.solve(camera[:, :3], camera[:, 3])
+            ray = np.linalg.solve(camera[:, :3], [*pixel, 1.0])
+            across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+            A, b = A + across, b + across @ centre
+    return np.linalg.solve(A, b)
 
 
 def least_reprojection_cost(P, xy, start):
@@ -110,7 +112,7 @@ def least_reprojection_cost(P, xy, start):
 
     def residual(x):
         xh = P @ np.append(x, 1.0)
-        return np.asarray((xh[:, :2] / xh[:, 2:] - xy).ravel())
+        return (xh[:, :2] / xh[:, 2:] - xy).ravel()
 
     best = least_squares(residual, start[:3] / start[3], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    return float(2.0 * best.cost)
+    return 2.0 * best.cost

@@ -1,22 +1,26 @@
-"""Table 3.3 and section 3.4: each stratum's transforms keep its own invariants and break the next one's."""
+"""Table 3.3 and section 3.4: transforms of each stratum and their invariants, conics and quadrics."""
 
 import numpy as np
 import pytest
 from hypothesis import strategies as st
 
 from tests.conftest import refuses
-from tests.geometry.properties import (
-    gap,
-    holds_for_every,
-    incidence_residual,
-    incidence_sine,
-    random_camera,
-    random_points,
-)
+from tests.geometry import properties
+from tests.geometry.properties import gap, holds_for_every, incidence_sine, random_camera, random_points
 from thesisrecon.geometry import strata
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.geometry.strata import ABSOLUTE_CONIC, ABSOLUTE_DUAL_QUADRIC, curvature_sign, dual
+from thesisrecon.geometry.strata import (
+    ABSOLUTE_CONIC,
+    ABSOLUTE_DUAL_QUADRIC,
+    bilinear_form,
+    calibration_from_image,
+    curvature_sign,
+    dual,
+    image_of_absolute_conic,
+    intersect_line,
+    transform,
+)
 from validation.scenes.rigs import random_transform
 
 groups = st.sampled_from(list(strata.DEGREES_OF_FREEDOM))
@@ -45,40 +49,18 @@ def volume(X):
 
 
 @holds_for_every(groups)
-def test_table_3_3_images_do_not_change(rng, group):
+def test_table_3_3_images_do_not_change_and_planes_and_lines_keep_their_points(rng, group):
     G, (P, *_), X = random_transform(group, rng), random_camera(rng), random_points(rng, 6)
     moved = strata.transform(G, X, "points") @ strata.transform(G, P, "cameras").T
     np.testing.assert_allclose(moved, X @ P.T, rtol=1e-9, atol=1e-9 * np.abs(P).max())
     centre = camera_centre(strata.transform(G, P, "cameras"))
     assert gap(centre, strata.transform(G, camera_centre(P), "points")) < 1e-7
-
-
-@holds_for_every(groups)
-def test_table_3_3_planes_and_lines_keep_their_points(rng, group):
     G, X = random_transform(group, rng), random_points(rng, 3)
     Y = strata.transform(G, X, "points")
     assert incidence_sine(strata.transform(G, camera_centre(X), "planes"), Y).max() < 1e-12
     assert gap(strata.transform(G, line(*X[:2]), "dual conics"), line(*Y[:2])) < 1e-7
     dual_line, moved = (line(*np.linalg.svd(Z[:2])[2][2:]) for Z in (X, Y))
     assert gap(strata.transform(G, dual_line, "conics"), moved) < 1e-7
-
-
-@holds_for_every(st.sampled_from([3, 4]))
-def test_table_3_3_conics_quadrics_and_their_duals(rng, d):
-    A = rng.normal(size=(d, d))
-    G = np.eye(d) + 0.4 * A / np.linalg.norm(A)
-    # A sphere-like conic or quadric, moved anywhere, and points on it.
-    T = np.eye(d) + 0.3 * rng.normal(size=(d, d)) / d
-    C = strata.transform(T, np.diag([1.0] * (d - 1) + [-1.0]), "conics")
-    unit = rng.normal(size=(5, d - 1))
-    x = np.column_stack([unit / np.linalg.norm(unit, axis=1, keepdims=True), np.ones(5)]) @ T.T
-    tangents = x @ C
-    assert incidence_residual(C, x).max() < 1e-12
-    moved_x, moved_tangents = strata.transform(G, x, "points"), strata.transform(G, tangents, "planes")
-    assert incidence_residual(strata.transform(G, C, "conics"), moved_x).max() < 1e-12
-    assert incidence_residual(strata.transform(G, dual(C), "dual conics"), moved_tangents).max() < 1e-12
-    assert gap(strata.transform(G, dual(C), "dual conics"), dual(strata.transform(G, C, "conics"))) < 1e-7
-    assert gap(moved_x @ strata.transform(G, C, "conics"), moved_tangents) < 1e-7
 
 
 @holds_for_every(groups)
@@ -90,40 +72,15 @@ def test_3_4_each_group_holds_its_members_and_is_closed(rng, group):
     assert ORDER.index(strata.group_of(np.linalg.inv(G))) >= ORDER.index(group)
 
 
-def test_3_4_a_reflection_is_affine_only_and_wrong_matrices_are_refused():
-    assert strata.group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
-    assert strata.group_of(np.eye(4)) == "euclidean"
-    for wrong in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 0.0])):
-        refuses(ValueError, "group_of", strata.group_of, wrong)
-
-
-def test_3_4_groups_do_not_depend_on_the_unit_of_length():
-    G = np.eye(4)
-    G[0, 3], G[3, 0] = 1e6, 1e-4
-    unit = np.diag([1e3, 1e3, 1e3, 1.0])
-    for one in (G, unit @ G @ np.linalg.inv(unit), np.linalg.inv(G)):
-        assert strata.group_of(one) == "projective"
-    G[0, 3], G[3, 0] = 1e9, 0.0
-    assert strata.group_of(G) == "euclidean"
-
-
-def test_an_unknown_kind_of_entity_is_named():
-    one = strata.transform, np.eye(4), np.ones(4), "point"
-    refuses(ValueError, "unknown kind of entity .*point.*mean points", *one)
-
-
 def _tangent_vectors(group, rng):
     """Small moves away from the identity within a group, without its scale."""
-    moves = []
-    for _ in range(40):
-        move = rng.normal(size=(4, 4))
-        if group != "projective":
-            move[3] = 0.0
-        if group in ("metric", "euclidean"):
-            skew = move[:3, :3] - move[:3, :3].T
-            move[:3, :3] = skew + (rng.normal() * np.eye(3) if group == "metric" else 0.0)
-        moves.append((move - move[3, 3] * np.eye(4)).ravel())
-    return np.array(moves)
+    moves = rng.normal(size=(40, 4, 4))
+    if group != "projective":
+        moves[:, 3] = 0.0
+    if group in ("metric", "euclidean"):
+        scale = rng.normal(size=(40, 1, 1)) * (group == "metric")
+        moves[:, :3, :3] += scale * np.eye(3) - moves[:, :3, :3].transpose(0, 2, 1)
+    return (moves - moves[:, 3:, 3:] * np.eye(4)).reshape(40, 16)
 
 
 @pytest.mark.parametrize("group", ORDER)
@@ -155,7 +112,7 @@ def test_3_4_2_projective_invariants_are_kept_by_all(rng, group):
         assert curvature_sign(strata.transform(G, Q, "conics")) == sign
 
 
-def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist():
+def test_3_4_special_transforms_and_cross_ratios():
     base, direction = np.array([0.0, 1.0, 2.0, 1.0]), np.array([1.0, 0.0, 0.5, 0.0])
     x = base + np.array([0.0, 1.0, 3.0, 0.0])[:, None] * direction
     x[3] = direction
@@ -164,6 +121,18 @@ def test_3_4_2_cross_ratio_at_the_base_point_and_where_it_does_not_exist():
     refuses(ValueError, "three of the four", strata.cross_ratio, x[[0, 0, 0, 1]])
     refuses(ValueError, "collinear", strata.cross_ratio, np.eye(4))
     refuses(ValueError, "four finite points", strata.cross_ratio, np.eye(3))
+    assert strata.group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
+    assert strata.group_of(np.eye(4)) == "euclidean"
+    for wrong in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 0.0])):
+        refuses(ValueError, "group_of", strata.group_of, wrong)
+    G, unit = np.eye(4), np.diag([1e3, 1e3, 1e3, 1.0])
+    G[0, 3], G[3, 0] = 1e6, 1e-4
+    for one in (G, unit @ G @ np.linalg.inv(unit), np.linalg.inv(G)):
+        assert strata.group_of(one) == "projective"
+    G[0, 3], G[3, 0] = 1e9, 0.0
+    assert strata.group_of(G) == "euclidean"
+    one = strata.transform, np.eye(4), np.ones(4), "point"
+    refuses(ValueError, "unknown kind of entity .*point.*mean points", *one)
 
 
 @holds_for_every(groups)
@@ -189,7 +158,7 @@ def test_3_4_3_affine_invariants_are_kept_by_affine_transforms_only(rng, group):
 
 
 @holds_for_every(groups)
-def test_3_4_4_metric_invariants_are_kept_by_metric_transforms_only(rng, group):
+def test_3_4_4_and_3_4_5_metric_invariants_and_lengths_are_kept_by_their_groups_only(rng, group):
     G, X = random_transform(group, rng), random_points(rng, 3)
     Y = strata.transform(G, X, "points")
     ratios = length(*Y[:2]) / length(*Y[1:]) / (length(*X[:2]) / length(*X[1:])) - 1.0
@@ -203,10 +172,6 @@ def test_3_4_4_metric_invariants_are_kept_by_metric_transforms_only(rng, group):
         assert quadric < 1e-12
         conic = strata.transform(G[:3, :3], ABSOLUTE_CONIC, "conics")
         assert gap(conic, ABSOLUTE_CONIC) < 1e-12
-
-
-@holds_for_every(groups)
-def test_3_4_5_lengths_are_kept_by_euclidean_transforms_only(rng, group):
     G, (X, Y) = random_transform(group, rng), random_points(rng, 2)
     change = float(length(strata.transform(G, X, "points"), strata.transform(G, Y, "points")) / length(X, Y))
     assert (abs(change - 1.0) < 1e-9) == (group == "euclidean")
@@ -218,24 +183,22 @@ def test_3_4_3_projective_to_affine(rng):
     G = strata.affine_from_projective(plane)
     assert gap(strata.transform(G, plane, "planes"), strata.PLANE_AT_INFINITY) < 1e-9
     np.testing.assert_allclose(G[3], plane / plane[3])
-
-
-@pytest.mark.parametrize("plane", [[1.0, 2.0, -1.0, 0.0], [0.0, 0.0, 2.0, 1e-9], [0.0, 0.0, 0.0, -4.0]])
-def test_3_4_3_planes_through_the_origin_have_an_upgrade_too(plane):
-    G = strata.affine_from_projective(np.array(plane))
-    assert np.linalg.cond(G) < 1.001
-    assert gap(strata.transform(G, np.array(plane), "planes"), strata.PLANE_AT_INFINITY) < 1e-12
+    # Planes through the origin, or nearly, have an upgrade too.
+    for last in ([1.0, 2.0, -1.0, 0.0], [0.0, 0.0, 2.0, 1e-9], [0.0, 0.0, 0.0, -4.0]):
+        G = strata.affine_from_projective(np.array(last))
+        assert np.linalg.cond(G) < 1.001
+        assert gap(strata.transform(G, np.array(last), "planes"), strata.PLANE_AT_INFINITY) < 1e-12
     refuses(ValueError, "not zero", strata.affine_from_projective, np.zeros(4))
 
 
 @holds_for_every()
-def test_3_4_1_stratified_and_direct_upgrades_restore_ratios_of_lengths(rng):
-    truth = random_points(rng, 6)
-    G = random_transform("projective", rng)
+def test_3_4_1_and_3_9_stratified_and_direct_upgrades_restore_ratios_of_lengths(rng):
+    truth, G = random_points(rng, 6), random_transform("projective", rng)
     X = strata.transform(G, truth, "points")
     quadric = strata.transform(G, ABSOLUTE_DUAL_QUADRIC, "dual conics") * rng.choice([-2.0, 2.0])
     direct = strata.metric_from_projective(quadric)
     assert np.linalg.det(direct) > 0.0
+    # The plane at infinity is the null vector of the absolute dual quadric.
     to_affine = strata.affine_from_projective(np.linalg.svd(quadric)[2][3])
     affine_quadric = strata.transform(to_affine, quadric, "dual conics")
     to_metric = strata.metric_from_affine(np.linalg.inv(affine_quadric[:3, :3]))
@@ -244,8 +207,110 @@ def test_3_4_1_stratified_and_direct_upgrades_restore_ratios_of_lengths(rng):
         scale = length(Y[0], Y[1]) / length(truth[0], truth[1])
         np.testing.assert_allclose(length(Y[2:4], Y[4:6]), scale * length(truth[2:4], truth[4:6]), rtol=1e-6)
         assert np.isfinite(dehomogenize(Y)).all()
-
-
-def test_3_4_4_conics_of_no_metric_frame_are_refused():
     refuses(ValueError, "definite", strata.metric_from_affine, np.diag([1.0, 1.0, -1.0]))
     refuses(ValueError, "semi-definite", strata.metric_from_projective, np.diag([1.0, 1.0, -1.0, 0.0]))
+
+
+@properties.holds_for_every()
+def test_3_2_absolute_conic_has_no_real_points(rng):
+    x = rng.normal(size=(20, 3))
+    assert (bilinear_form(ABSOLUTE_CONIC, x, x) > 0.0).all()
+    imaginary = np.array([1.0, 1j, 0.0])
+    assert imaginary @ ABSOLUTE_CONIC @ imaginary == 0.0
+
+
+dimensions = st.sampled_from([3, 4])
+
+
+@properties.holds_for_every(dimensions)
+def test_3_4_and_3_10_tangents_belong_to_the_inverse(rng, d):
+    C, x = properties.random_round(rng, d, 6)
+    np.testing.assert_allclose(dual(C), np.linalg.det(C) * np.linalg.inv(C), atol=1e-9)
+    assert properties.incidence_residual(dual(C), x @ C).max() < 1e-12
+    assert properties.incidence_residual(dual(C), rng.normal(size=(6, d))).max() > 1e-6
+    assert properties.gap(dual(dual(C)), C) < 1e-9
+    # That of two lines is their point.
+    l, m = rng.normal(size=(2, 3))
+    meet = np.cross(l, m)
+    assert properties.gap(dual(np.outer(l, m) + np.outer(m, l)), np.outer(meet, meet)) < 1e-9
+
+
+@properties.holds_for_every(dimensions)
+def test_3_5_and_3_6_lines_meet_in_two_points_or_touch_or_miss(rng, d):
+    C, x = properties.random_round(rng, d, 2)
+    inside, away = np.ones(d), rng.normal(size=d - 1)
+    far = np.append(50.0 * away / np.linalg.norm(away), 1.0)
+    inside[:-1] = (x[0] + x[1])[:-1] / 2.0
+    other = far.copy()
+    other[:-1] += np.linalg.svd(far[None, :-1])[2][1]
+    found = intersect_line(C, inside, far)
+    assert found.shape == (2, d)
+    assert properties.incidence_residual(C, found).max() < 1e-10
+    assert intersect_line(C, far, other).shape == (0, d)
+    through_both = intersect_line(C, x[0], x[1])
+    assert min(properties.gap(through_both[0], x[0]), properties.gap(through_both[0], x[1])) < 1e-7
+
+
+@properties.holds_for_every()
+def test_3_12_to_3_15_images_of_the_absolute_conic_are_those_of_the_calibration(rng):
+    P, K, _, _ = properties.random_camera(rng)
+    H, image, dual_image = P[:, :3], image_of_absolute_conic(K), image_of_absolute_conic(K, is_dual=True)
+    scale = rng.choice([-3.0, 3.0])
+    assert properties.gap(transform(H, ABSOLUTE_CONIC, "conics"), image) < 1e-7
+    assert properties.gap(transform(H, ABSOLUTE_CONIC, "dual conics"), dual_image) < 1e-12
+    assert properties.gap(P @ ABSOLUTE_DUAL_QUADRIC @ P.T, dual_image) < 1e-12
+    assert properties.gap(np.linalg.inv(image), dual_image) < 1e-7
+    np.testing.assert_allclose(calibration_from_image(scale * dual_image, is_dual=True), K, atol=1e-6)
+    np.testing.assert_allclose(calibration_from_image(scale * image), K, atol=1e-3)
+    for wrong in (np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan)):
+        for is_dual in (False, True):
+            refuses(ValueError, "conic", calibration_from_image, wrong, is_dual=is_dual)
+
+
+@properties.holds_for_every(dimensions)
+def test_table_3_3_and_3_4_2_surfaces_duals_intersection_and_tangency_are_kept(rng, d):
+    C, x = properties.random_round(rng, d, 3)
+    # A shear of the last row keeps the surface finite, which a general transform need not.
+    G = np.eye(d)
+    G[:-1] += 0.3 * rng.normal(size=(d - 1, d))
+    G[-1, :-1] = 0.2 * rng.uniform(-1.0, 1.0, d - 1)
+    plane = C @ x[0]
+    touching = C + rng.uniform(0.5, 2.0) * np.outer(plane, plane)
+    moved, moved_touching = transform(G, C, "conics"), transform(G, touching, "conics")
+    y = transform(G, x, "points")
+    # The two surfaces share x[0] with its tangent plane, before and after.
+    for surface in (moved, moved_touching):
+        assert properties.gap(surface @ y[0], transform(G, plane, "planes")) < 1e-9
+    assert properties.gap(transform(G, dual(C), "dual conics"), dual(moved)) < 1e-9
+    assert properties.incidence_residual(dual(moved), moved @ y[0]) < 1e-9
+    # A line through two points of the surface meets it in their images, one that misses it still does.
+    assert properties.incidence_residual(moved, y[1]) < 1e-9
+    for start, end in ((x[1], x[2]), rng.normal(size=(2, d))):
+        assert len(intersect_line(C, start, end)) == len(intersect_line(moved, G @ start, G @ end))
+
+
+@pytest.mark.parametrize(
+    ("centre", "radius"), [(100.0, 1.0), (-1e4, 2.0), (5e6, 1e3), (0.0, 1e5), (0.0, 1e-3)]
+)
+def test_the_sign_of_the_curvature_depends_neither_on_the_place_nor_on_the_unit(centre, radius):
+    away = np.eye(4)
+    away[:3, 3] = -centre * np.array([1.0, -0.3, 0.2])
+    square = radius**2
+    forms = {1: [1, 1, 1, -square], -1: [1, 1, -1, -square], 0: [1, 1, -1, 0]}
+    for sign, form in forms.items():
+        assert curvature_sign(away.T @ np.diag(form) @ away) == sign
+    assert curvature_sign(away.T @ np.diag([1.0, 1.0, 0.0, -square]) @ away) == 0
+
+
+@pytest.mark.parametrize("radius", [0.5, 10.0, 300.0])
+def test_secants_tangents_and_misses_of_a_circle_far_from_the_origin(radius):
+    away = np.array([[1.0, 0, -1e4], [0, 1, -1e4], [0, 0, 1]])
+    C = away.T @ np.diag([1.0, 1.0, -(radius**2)]) @ away
+    for height, expected in ((0.0, 2), (0.99, 2), (1.0, 1), (1.01, 0), (3.0, 0)):
+        y = 1e4 + height * radius
+        for start, end in ((0.0, 2e4), (1e4 - 0.3 * radius, 1e4 + 2.0 * radius)):
+            found = intersect_line(C, np.array([start, y, 1.0]), np.array([end, y, 1.0]))
+            assert len(found) == expected
+            half = radius * np.sqrt(max(1.0 - height**2, 0.0))
+            for x in dehomogenize(found):
+                np.testing.assert_allclose([abs(x[0] - 1e4), x[1]], [half, y], atol=1e-6 * radius)

@@ -2,26 +2,17 @@
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 
-from tests.conftest import refuses
 from tests.geometry.properties import gap, holds_for_every, random_camera
-from thesisrecon.api.pairs import _check_triplets
 from thesisrecon.epipolar.three_view_estimation import _tensor_equations
 from thesisrecon.geometry import three_view
 from thesisrecon.geometry.camera_matrix import camera_centre, project
-from thesisrecon.geometry.conditioning import unit_tensor
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
 from validation.scenes.rigs import random_transform
 
-NO_POINTS, NO_SEGMENTS = np.zeros((3, 0, 2)), np.zeros((3, 0, 2, 2))
-
-
-def estimate_tensor_linear(points, segments):
-    equations = _tensor_equations(points, segments)
-    return equations.in_pixels(equations.solve())
+NO_SEGMENTS = np.zeros((3, 0, 2, 2))
 
 
 def three_cameras(rng):
@@ -48,7 +39,17 @@ def lines_of(segments):
 
 
 @holds_for_every()
-def test_tensor_of_canonical_cameras(rng):
+def test_tensor_of_cameras_in_any_frame_of_one_centre_and_of_canonical_ones(rng):
+    P = three_cameras(rng)
+    G = random_transform("projective", rng)
+    scales = rng.uniform(0.5, 2.0, 3) * rng.choice([-1.0, 1.0], 3)
+    moved = scales[:, None, None] * transform(G, P, "cameras")
+    assert gap(three_view.tensor_from_cameras(*moved), three_view.tensor_from_cameras(*P)) < 1e-6
+    centre = rng.normal(size=3)
+    P = rng.normal(size=(3, 3, 3)) @ np.column_stack([np.eye(3), -centre])
+    assert not three_view.tensor_from_cameras(*P).any()
+    P[2] = rng.normal(size=(3, 3)) @ np.column_stack([np.eye(3), -centre - 1e-6])
+    assert np.linalg.norm(three_view.tensor_from_cameras(*P)) == pytest.approx(1.0)
     P2, P3 = rng.normal(size=(2, 3, 4))
     T = np.einsum("ji,k->ijk", P2[:, :3], P3[:, 3]) - np.einsum("j,ki->ijk", P2[:, 3], P3[:, :3])
     np.testing.assert_allclose(
@@ -57,88 +58,59 @@ def test_tensor_of_canonical_cameras(rng):
 
 
 @holds_for_every()
-def test_tensor_is_the_same_in_every_projective_frame(rng):
+def test_trifocal_constraints_of_points_and_lines(rng):
     P = three_cameras(rng)
-    G = random_transform("projective", rng)
-    scales = rng.uniform(0.5, 2.0, 3) * rng.choice([-1.0, 1.0], 3)
-    moved = scales[:, None, None] * transform(G, P, "cameras")
-    assert gap(three_view.tensor_from_cameras(*moved), three_view.tensor_from_cameras(*P)) < 1e-6
-    assert not unit_tensor(np.zeros((3, 3, 3))).any()
-
-
-@holds_for_every()
-def test_cameras_with_one_centre_have_no_tensor(rng):
-    centre = rng.normal(size=3)
-    P = rng.normal(size=(3, 3, 3)) @ np.column_stack([np.eye(3), -centre])
-    assert not three_view.tensor_from_cameras(*P).any()
-    P[2] = rng.normal(size=(3, 3)) @ np.column_stack([np.eye(3), -centre - 1e-6])
-    assert np.linalg.norm(three_view.tensor_from_cameras(*P)) == pytest.approx(1.0)
-
-
-@holds_for_every()
-def test_trifocal_constraint_of_points(rng):
-    P = three_cameras(rng)
-    X = homogenize(rng.uniform(-1.5, 1.5, (6, 3)))
-    x = np.einsum("vab,nb->vna", P, X)
-    x /= np.linalg.norm(x, axis=2, keepdims=True)
     T = three_view.tensor_from_cameras(*P)
-    # Two lines through each point span all others: four independent equations.
-    l2, l3 = (np.linalg.svd(x[v][:, None])[2][:, 1:] for v in (1, 2))
-    right, wrong = (
-        np.abs(three_view.trifocal_residuals(T, x[0][:, None, None], l2[:, :, None], lines[:, None])).max()
-        for lines in (l3, np.roll(l3, 1, axis=0))
+    x, l = (
+        a / np.linalg.norm(a, axis=-1, keepdims=True)
+        for a in (
+            np.einsum("vab,nb->vna", P, homogenize(rng.uniform(-1.5, 1.5, (6, 3)))),
+            lines_of(seen_segments(P, rng, 6)),
+        )
     )
-    assert right < 1e-9
-    assert wrong > 1e5 * right
+    # Two lines through each point span all others: four independent equations; two points span a line.
+    on_first, l2, l3 = (np.linalg.svd(a[:, None])[2][:, 1:] for a in (l[0], x[1], x[2]))
+    for first, second, third in (
+        (x[0][:, None, None], l2[:, :, None], l3[:, None]),
+        (on_first, l[1][:, None], l[2][:, None]),
+    ):
+        right, wrong = (
+            np.abs(three_view.trifocal_residuals(T, first, second, lines)).max()
+            for lines in (third, np.roll(third, 1, axis=0))
+        )
+        assert right < 1e-9
+        assert wrong > 1e3 * right
 
 
 @holds_for_every()
-def test_trifocal_constraint_of_lines(rng):
-    P = three_cameras(rng)
-    l = lines_of(seen_segments(P, rng, 6))
-    l /= np.linalg.norm(l, axis=2, keepdims=True)
-    T = three_view.tensor_from_cameras(*P)
-    on_first = np.linalg.svd(l[0][:, None])[2][:, 1:]
-    right, wrong = (
-        np.abs(three_view.trifocal_residuals(T, on_first, l[1][:, None], lines[:, None])).max()
-        for lines in (l[2], np.roll(l[2], 1, axis=0))
-    )
-    assert right < 1e-9
-    assert wrong > 1e3 * right
-
-
-@holds_for_every()
-def test_figure_3_14_points_are_transferred_to_the_third_view(rng):
+def test_figures_3_14_and_3_15_points_and_lines_are_transferred_to_the_third_view(rng):
     P = three_cameras(rng)
     xy = seen_points(P, rng, 12)
     T = three_view.tensor_from_cameras(*P)
     assert np.abs(three_view.transfer_points(T, xy[0], xy[1]) - xy[2]).max() < 1e-3
     F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
     assert np.median(np.abs(three_view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2])) < 1e-5
+    P = three_cameras(rng)
+    l = lines_of(seen_segments(P, rng, 6))
+    found = unit_normals(three_view.transfer_lines(three_view.tensor_from_cameras(*P), l[0], l[1]))
+    assert max(gap(a, b) for a, b in zip(found, l[2], strict=True)) < 1e-5
 
 
 @holds_for_every()
 def test_figure_3_14_the_tensor_serves_the_trifocal_plane_where_epipolar_lines_do_not(rng):
     P = three_cameras(rng)
-    centres = np.stack([dehomogenize(camera_centre(camera)) for camera in P])
-    X = rng.dirichlet(np.ones(3), 8) @ centres
+    X = rng.dirichlet(np.ones(3), 8) @ dehomogenize(np.stack([camera_centre(camera) for camera in P]))
     xy = np.stack([project(camera, X) for camera in P])
     F31, F32 = fundamental_from_cameras(P[0], P[2]), fundamental_from_cameras(P[1], P[2])
-    size = np.abs(xy).max(axis=(0, 2))
-    T = three_view.tensor_from_cameras(*P)
-    by_tensor = np.abs(three_view.transfer_points(T, xy[0], xy[1]) - xy[2]).max(axis=1) / size
-    by_lines = np.abs(three_view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]) - xy[2])
-    by_lines = by_lines.max(axis=1) / size
+    by_tensor, by_lines = (
+        np.abs(found - xy[2]).max(axis=1) / np.abs(xy).max(axis=(0, 2))
+        for found in (
+            three_view.transfer_points(three_view.tensor_from_cameras(*P), xy[0], xy[1]),
+            three_view.transfer_by_epipolar_lines(F31, F32, xy[0], xy[1]),
+        )
+    )
     assert np.median(by_tensor) < 1e-6
     assert np.nanmedian(by_lines) > 1e-4
-
-
-@holds_for_every()
-def test_figure_3_15_lines_are_transferred_to_the_third_view(rng):
-    P = three_cameras(rng)
-    l = lines_of(seen_segments(P, rng, 6))
-    found = unit_normals(three_view.transfer_lines(three_view.tensor_from_cameras(*P), l[0], l[1]))
-    assert max(gap(a, b) for a, b in zip(found, l[2], strict=True)) < 1e-5
 
 
 @holds_for_every()
@@ -168,22 +140,6 @@ def test_views_that_are_rectified_to_the_first_have_their_epipoles_and_cameras(K
         np.testing.assert_allclose(three_view.transfer_points(T, xy[0], xy[1]), xy[2], atol=1e-8)
 
 
-@holds_for_every()
-def test_cameras_from_the_tensor_have_the_tensor(rng):
-    T = three_view.tensor_from_cameras(*three_cameras(rng))
-    P = three_view.cameras_from_tensor(T)
-    np.testing.assert_array_equal(P[0], np.eye(3, 4))
-    assert gap(three_view.tensor_from_cameras(*P), T) < 1e-6
-
-
-@holds_for_every(st.sampled_from([(7, 0), (0, 13), (4, 5), (20, 0), (0, 30), (10, 10)]))
-def test_linear_estimate_is_exact_on_exact_points_and_lines(rng, counts):
-    P = three_cameras(rng)
-    points, segments = seen_points(P, rng, counts[0]), seen_segments(P, rng, counts[1])
-    T = estimate_tensor_linear(points, segments)
-    assert gap(T, three_view.tensor_from_cameras(*P)) < 1e-5
-
-
 @holds_for_every(examples=10)
 def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rng):
     P = three_cameras(rng)
@@ -194,24 +150,3 @@ def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rn
     noisy = equations.solve_with_epipoles(*np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
     conditioned = three_view.tensor_from_cameras(*three_view.cameras_from_tensor(noisy))
     assert gap(conditioned, noisy) < 1e-6
-
-
-def test_wrong_triplets_are_refused():
-    rng = np.random.default_rng(0)
-    P = three_cameras(rng)
-    points, segments = seen_points(P, rng, 6), seen_segments(P, rng, 3)
-    refuses(ValueError, "needs points", _check_triplets, points[:2], segments)
-    refuses(ValueError, "needs points", _check_triplets, points, segments[:, :, 0])
-    with pytest.raises(ValueError, match="finite"):
-        _check_triplets(np.where(points > points[0, 0, 0], np.nan, points), segments)
-    segments[1, 0, 1] = segments[1, 0, 0]
-    refuses(ValueError, "no length", _check_triplets, points, segments)
-
-
-def test_coplanar_and_equal_points_are_refused():
-    rng = np.random.default_rng(1)
-    P = three_cameras(rng)
-    X = np.column_stack([rng.uniform(-1.5, 1.5, (20, 2)), np.zeros(20)])
-    with pytest.raises(ValueError, match="general position"):
-        estimate_tensor_linear(np.stack([project(camera, X) for camera in P]), NO_SEGMENTS)
-    refuses(ValueError, "equal points", estimate_tensor_linear, np.ones((3, 8, 2)), NO_SEGMENTS)
