@@ -13,8 +13,7 @@ from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from validation.references.ceres import CeresOptions, bundle_adjuster, colmap_model
-from validation.references.fundamental import SOLVERS
-from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
+from validation.references.fundamental import SOLVERS, colmap_points, opencv_linear, opencv_polynomial
 from validation.scenes.two_views import make_two_views
 from validation.scenes.walks import SIZE, make_walk
 from validation.stages.bundle import FOCAL_K1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
+from benchmarks.references import nearest_two, opencv_uncalibrated, warp_perspective
 from thesisrecon.config import preset
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.features.harris import HarrisCorners
@@ -20,13 +21,8 @@ from thesisrecon.stereo._frames import PlanarRectification, hartley
 from thesisrecon.stereo.rectification import rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
-from validation.references.opencv import (
-    OpenCVSemiGlobal,
-    harris_corners,
-    opencv_uncalibrated,
-    warp_perspective,
-)
-from validation.references.sift import compute_sift, grey_of, nearest_two, sift_front_end
+from validation.references.opencv import OpenCVSemiGlobal, harris_corners
+from validation.references.sift import compute_sift, grey_of, sift_front_end
 from validation.scenes.two_views import make_two_views
 
 DISPARITIES = 64

@@ -14,6 +14,7 @@ from benchmarks.references import (
     colmap_similarity,
     opencv_homography,
     opencv_projection,
+    opencv_seven_point,
     opencv_undistortion,
     poselib_three_points,
 )
@@ -24,8 +25,7 @@ from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.geometry.two_view import homography_linear
-from validation.references.fundamental import opencv_eight_point, opencv_seven_point
-from validation.references.triangulation import colmap_points
+from validation.references.fundamental import colmap_points, opencv_eight_point
 from validation.scenes.rigs import beside, cameras_of
 from validation.scenes.two_views import make_two_views
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.conftest import Bench
+from benchmarks.references import decimate_open3d
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
 from thesisrecon.surface._simplification import simplify_surface
 from thesisrecon.surface.fusion import VolumetricFusion
-from validation.references.open3d_geometry import OpenTsdf, decimate_open3d
+from validation.references.open3d_geometry import OpenTsdf
 from validation.scenes.real import load_fixture_depth, load_fixture_scene, read_rgb
 
 STEP = 2

@@ -22,7 +22,7 @@ import thesisrecon
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares
 from validation.ablation import Study, ablate, analyse
 from validation.ablation.analysis import as_reported
-from validation.ablation.tasks.fundamental import FundamentalOfCube
+from validation.ablation.tasks.synthetic import FundamentalOfCube
 
 
 @dataclass(frozen=True)

@@ -9,25 +9,38 @@ from __future__ import annotations
 import argparse
 import sys
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from signal import SIGINT
 
-from thesisrecon.errors import StageFailure, counted
+from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.io._files import printable
 from thesisrecon.io._outputs import join_claim
-from thesisrecon.runtime._signals import with_resume_advice
-from validation.ablation import command as ablation
+from thesisrecon.runtime._signals import CODES, with_resume_advice
+from validation.ablation.analysis import analyse, failures_of
+from validation.ablation.page import write_analysis
+from validation.ablation.plan import STUDIES, Plan, plan_study, read_study
+from validation.ablation.run import Rows, ablate, parts_of, read_rows
 from validation.runs.page import write_pages
 from validation.runs.processes import own_cores
-from validation.runs.records import ReportOptions
+from validation.runs.records import ReportOptions, load_images
 from validation.runs.report import run_tasks
-from validation.runs.results import Results, collect, read_gates, read_results, write_results
-from validation.runs.scenes import load_images
-from validation.runs.study import MODULES, OF_PAGES, report_progress, run_studies, run_study
+from validation.runs.results import Results, collect, read_gates, write_results
+from validation.runs.study import (
+    MODULES,
+    OF_PAGES,
+    report_at_terminal,
+    report_progress,
+    run_studies,
+    run_study,
+)
 from validation.stages import STAGES, available_scenes
 
-MIN_SIDE_PX = 64
-"""Smallest long side of depth maps, for the matching window."""
+KEPT = "run the same command to continue from the finished rows in {}"
+SHOWN = 20  # Most failures of an ablation that are printed
+MIN_SIDE_PX = 64  # Smallest long side of depth maps, for the matching window
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,25 +50,20 @@ def main(arguments: list[str] | None = None) -> int:
         return run_studies(given[1:])
     parsed = _parser().parse_args(given)
     if parsed.command == "ablate":
-        return ablation.run_command(parsed)
+        return run_ablation(parsed)
     if parsed.command == "study":
         return run_all(parsed.out)
     try:
-        options = _report_options(parsed)
-        gates = read_gates()
+        options, gates = _report_options(parsed), read_gates()
         for name in options.folders:
             load_images(name, options)
-    except (ValueError, StageFailure) as error:
-        print(f"validation: {error}", file=sys.stderr)
-        return 2
-    try:
         with with_resume_advice("run the same command to start again"), join_claim(options.out) as outputs:
             outputs.require(["index.html", "results.json", "options.json"])
-            judged = run_tasks(options, STAGES, _print_progress)
-            results, earlier = collect(options, judged, gates), _last_results(options)
+            judged = run_tasks(options, STAGES, report_at_terminal)
+            results = collect(options, judged, gates)
             write_results(options.out, results)
-            page = write_pages(options, STAGES, judged, results, earlier)
-    except ValueError as error:
+            page = write_pages(options, STAGES, judged, results)
+    except (ValueError, StageFailure) as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
     if parsed.command == "check":
@@ -87,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
-    ablation.add_parser(commands)
+    _add_ablate(commands)
     # One study has its own parser.
     help_text = "Run one study, or all; --list shows them."
     study = commands.add_parser("study", help=help_text, description=run_all.__doc__)
@@ -103,13 +111,10 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         if not parsed.images.is_dir():
             raise ValueError(f"the folder of images {parsed.images} does not exist")
         folders[parsed.images.resolve().name] = str(parsed.images.resolve())
-    here = available_scenes(quick=parsed.quick)
-    scenes = parsed.scenes or ([*folders] if folders else here)
-    unknown = [s for s in scenes if s not in (*available_scenes(quick=False), *folders)]
-    if unknown:
-        raise ValueError(
-            f"no scene is called {unknown[0]}; choose from {', '.join(available_scenes(quick=False))}"
-        )
+    known = available_scenes(quick=False)
+    scenes = parsed.scenes or ([*folders] if folders else available_scenes(quick=parsed.quick))
+    if unknown := [s for s in scenes if s not in (*known, *folders)]:
+        raise ValueError(f"no scene is called {unknown[0]}; choose from {', '.join(known)}")
     if parsed.resume is not None and parsed.resume.resolve() == parsed.out.resolve():
         raise ValueError("--resume names another folder than --out, whose earlier results are removed")
     if parsed.threads < 1 or parsed.time_limit <= 0:
@@ -117,11 +122,11 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
     if parsed.max_side and parsed.max_side < MIN_SIDE_PX:
         raise ValueError(f"--max-side must be at least {MIN_SIDE_PX} px")
     return ReportOptions(
-        out=parsed.out.resolve(),
-        scenes=tuple(dict.fromkeys([*scenes, *folders])),
-        stages=tuple(parsed.stages or STAGES),
-        folders=folders,
-        quick=parsed.quick,
+        parsed.out.resolve(),
+        tuple(dict.fromkeys([*scenes, *folders])),
+        tuple(parsed.stages or STAGES),
+        folders,
+        parsed.quick,
         gates_only=parsed.command == "check",
         seed=parsed.seed,
         threads=min(parsed.threads, len(own_cores())),
@@ -129,21 +134,6 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
         resume="" if parsed.resume is None else str(parsed.resume.resolve()),
         side_px=parsed.max_side,
     )
-
-
-def _last_results(options: ReportOptions) -> Results | None:
-    """Results of the last run in the output folder, else of the resumed one; None without either."""
-    for folder in (options.out, *([Path(options.resume)] if options.resume else [])):
-        try:
-            return read_results(folder)
-        except ValueError:
-            continue
-    return None
-
-
-def _print_progress(line: str) -> None:
-    if sys.stderr.isatty():
-        print(line, file=sys.stderr, flush=True)
 
 
 def _print_gates(results: Results) -> None:
@@ -157,6 +147,75 @@ def _print_gates(results: Results) -> None:
         print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")
 
 
+def _add_ablate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command ``ablate`` among the others."""
+    text = "Compare variants and parameters over scenes and seeds, with intervals."
+    command = commands.add_parser("ablate", help=text, description=text)
+    shipped = ", ".join(sorted(p.stem for p in STUDIES.glob("*.toml")))
+    text = f"TOML file, or the name of a shipped study: {shipped}"
+    command.add_argument("study", metavar="STUDY", help=text)
+    text = "output folder; a rerun continues from its rows"
+    command.add_argument("-o", "--out", type=Path, required=True, help=text)
+    command.add_argument("--executor", default="processes", help="local or processes (default)")
+    text = "number of parallel rows (default: number of processors)"
+    command.add_argument("--threads", type=int, help=text)
+    command.add_argument("--plan", action="store_true", help="print the plan only")
+    command.add_argument("--read", action="store_true", help="only analyse the rows in OUT")
+
+
+def run_ablation(parsed: argparse.Namespace) -> int:
+    """Run a study; exit code 0: done, 2: wrong option, 3: every row failed, 130: interrupted."""
+    try:
+        study = read_study(_study_path(parsed.study))
+        if parsed.plan:
+            print(plan_summary(plan_study(study)))
+            return 0
+        if parsed.read:
+            rows = read_rows(study, parsed.out)
+        else:
+            how = {"executor": parsed.executor, "threads": parsed.threads}
+            with with_resume_advice(KEPT.format(parsed.out)):
+                rows = ablate(study, parsed.out, **how, on_progress=report_at_terminal)
+        page = write_analysis(analyse(rows), parsed.out)
+    except UsageError as error:
+        print(f"ablate: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as stop:
+        print("; ".join(("ablate: interrupted", *map(str, stop.args))), file=sys.stderr)
+        return CODES[SIGINT]
+    print(_ablation_summary(rows, page))
+    return 3 if rows and all(r.failure for r in rows) else 0
+
+
+def _study_path(name: str) -> Path:
+    shipped = STUDIES / f"{name}.toml"
+    return shipped if not Path(name).exists() and shipped.is_file() else Path(name)
+
+
+def plan_summary(plan: Plan) -> str:
+    """Return the size of a study: rows and shared steps."""
+    unique = list({row.key: row for row in plan.rows}.values())
+    shared = Counter(part.step for part in parts_of(unique) if part.step)
+    steps = ", ".join(f"{step} ({count})" for step, count in shared.items())
+    parts = [
+        f"{counted(len(plan.variants), 'variant')}: {'; '.join(v.name for v in plan.variants)}",
+        f"baseline: {plan.baseline}",
+        f"{len(plan.conditions)} conditions" if len(plan.conditions) > 1 else "",
+        f"{counted(len({r.scene for r in unique}), 'scene')}, {counted(len(plan.seeds), 'seed')}: "
+        f"{counted(len(unique), 'row')}",
+        f"computed once for several rows: {steps}" if steps else "",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _ablation_summary(rows: Rows, page: Path) -> str:
+    failed = sum(bool(r.failure) for r in rows)
+    found = [f"{variant} failed on {scene}: {why}" for variant, scene, why in failures_of(rows)]
+    more = [f"... and {len(found) - SHOWN} more on the page"] if len(found) > SHOWN else []
+    text = counted(len(rows), "row") + f", {failed} of them failed" * bool(failed)
+    return "\n".join([*map(printable, found[:SHOWN]), *more, f"{text}; the page is {page}"])
+
+
 def run_all(out: Path) -> int:
     """Make every table of the documentation, each in its own folder: all studies with the options of
     the pages, all ablations, and the report. One that ends with an error does not end the others; the exit
@@ -165,10 +224,10 @@ def run_all(out: Path) -> int:
     runs: dict[str, Callable[[], int]] = {}
     for name in MODULES:
         for number, options in enumerate(OF_PAGES.get(name, [[]])):
-            folder = out / (f"{name}-{number + 1}" if number else name)
+            folder = str(out / (f"{name}-{number + 1}" if number else name))
             words = f"study {name} {' '.join(options)}".rstrip()
-            runs[words] = partial(run_study, name, ["-o", str(folder), *options])
-    for path in sorted(ablation.STUDIES.glob("*.toml")):
+            runs[words] = partial(run_study, name, ["-o", folder, *options])
+    for path in sorted(STUDIES.glob("*.toml")):
         runs[f"ablation {path.stem}"] = partial(main, ["ablate", path.stem, "-o", str(out / path.stem)])
     runs["report"] = partial(main, ["report", "-o", str(out / "report")])
     largest = 0

@@ -7,7 +7,7 @@ from tests.metric.test_population import refine
 from tests.metric.verdict_scenes import fisheye_rig, rolling_video, stabilised_arc, two_sides
 from tests.synthetic import make_scene
 from thesisrecon import reconstruct_from_tracks
-from validation.metrics.intervals import pose_scores
+from validation.metrics.cameras import pose_scores
 from validation.studies.moving_cameras import Lens, drive, hand_held, measure
 
 MAX_SIGMAS = 3.0

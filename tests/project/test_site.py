@@ -108,7 +108,7 @@ def commands_of(text):
 def test_commands_of_the_pages_exist(site):
     """Names of commands, studies and ablations, and all options."""
     pytest.importorskip("validation.runs.study")
-    from validation.ablation.command import STUDIES
+    from validation.ablation.plan import STUDIES
     from validation.command import _parser
     from validation.runs.study import MODULES, load_study, study_parser
 

@@ -250,7 +250,7 @@ def test_the_command_reports_a_full_disk_in_one_sentence(tmp_path, monkeypatch, 
     runs = SmallRuns(tmp_path, 2, 128, "features")
     wanted = runs.whole(tmp_path / "whole")
     refusal = refused_at(runs, 3, errno.ENOSPC, wanted)
-    assert refusal.wrong == ""
+    assert refusal.faults_of_refusal() == ""
     assert "No space left on device; free space there" in refusal.message
 
     def compile_kernels(*_, **__):

@@ -9,19 +9,16 @@ from functools import cache
 import pytest
 
 from validation.runs.processes import own_cores
-from validation.runs.records import ReportOptions
+from validation.runs.records import IMAGE_SCENES, ReportOptions, available_scenes
 from validation.runs.report import run_tasks
 from validation.runs.results import collect, read_gates
-from validation.runs.scenes import IMAGE_SCENES, available_scenes
 from validation.stages import STAGES
 
 pytestmark = pytest.mark.slow
 GATES = read_gates()
-ALWAYS = ("courtyard", "boards", "cloud", "street")
-"""Scenes that this repository makes or ships."""
+ALWAYS = ("courtyard", "boards", "cloud", "street")  # Scenes that this repository makes or ships
 HERE = available_scenes(quick=False)
-LIMIT_S = 900.0
-"""A machine with much other work is no broken gate."""
+LIMIT_S = 900.0  # A machine with much other work is no broken gate
 
 
 def scene_of(gate):

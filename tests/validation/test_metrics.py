@@ -1,32 +1,26 @@
-"""Metrics of the validation: numbers, intervals and cameras."""
+"""Metrics of the validation: numbers, intervals, cameras, and the comparison with COLMAP."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.synthetic import reconstruction_of
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from validation.metrics.cameras import (
-    TrueCameras,
+    interval_scores,
     measure_cameras,
     measure_reprojection,
     relative_centre_error,
 )
-from validation.metrics.intervals import interval_scores, join_scores
-from validation.runs.tables import number
+from validation.references.colmap import read_run, reconstruct_with_pycolmap
+from validation.scenes.real import load_fixture_scene
+from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
 
 V, N = 6, 30
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, "-"), (np.nan, "-"), (np.inf, "inf"), (12345, "12345"), (1553.4, "1553"), (0.03384, "0.0338")],
-)
-def test_numbers_have_three_digits_and_thousands_all(value, text):
-    assert number(value) == text
 
 
 def test_deviations_are_counted_in_stated_sigmas():
@@ -42,37 +36,34 @@ def test_deviations_are_counted_in_stated_sigmas():
         for value, std in ((1003.0, 1.0), (1011.0, 1.0), (1001.0, 10.0))
     ]
     scores = interval_scores(MetricResult(model, (*intervals, {}), {}, True), np.tile(K, (4, 1, 1)))
-    assert scores.z[:3, 0] == pytest.approx([2.0, 10.0, 0.0], abs=1e-3)
-    assert np.isnan(scores.z[3]).all()
-    assert np.isnan(scores.z[:, 2]).all()
-    assert scores.holding((0,)) == pytest.approx(1 / 3)
-    assert scores.std_rel[2] == pytest.approx(10.0 / 1001.0)
-    assert join_scores([scores, scores]).z.shape == (8, 3)
+    assert scores[:3, 0] == pytest.approx([2.0, 10.0, 0.0], abs=1e-3)
+    assert np.isnan(scores[3]).all()
+    assert np.isnan(scores[:, 2]).all()
+    assert scores[2, 3] == pytest.approx(10.0 / 1001.0)
 
 
 def _truth():
     rng = np.random.default_rng(2)
     K = np.broadcast_to([[1000.0, 0, 510.0], [0, 1002.0, 390.0], [0, 0, 1]], (V, 3, 3)).copy()
     R = Rotation.from_rotvec(rng.normal(0, 0.3, (V, 3))).as_matrix()
-    return TrueCameras(K, R, rng.normal(0, 1, (V, 3)) - [0, 0, 6])
+    return K, R, rng.normal(0, 1, (V, 3)) - [0, 0, 6]
 
 
 def _reconstruction(truth, *, k1=0.0):
     """The truth seen in another world frame: turned, shrunk and moved."""
     rng = np.random.default_rng(3)
     turn, shrink, move = Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix(), 0.1, np.array([3.0, 2.0, 1.0])
-    C = shrink * truth.C @ turn.T + move
-    R = truth.R @ turn.T
+    K, R, C = truth[0], truth[1] @ turn.T, shrink * truth[2] @ turn.T + move
     t = -np.einsum("vij,vj->vi", R, C)
     X = np.column_stack([shrink * rng.normal(0, 1, (N, 3)) @ turn.T + move, np.ones(N)])
     view, point = (grid.ravel() for grid in np.meshgrid(np.arange(V), np.arange(N)))
     xy = np.concatenate(
-        [project_camera(K, r, s, X[:, :3], distortion=k1) for K, r, s in zip(truth.K, R, t, strict=True)]
+        [project_camera(k, r, s, X[:, :3], distortion=k1) for k, r, s in zip(K, R, t, strict=True)]
     )
     tracks = Tracks(view, point, xy.reshape(V, N, 2).transpose(1, 0, 2).reshape(-1, 2), V, N)
     # Any positive scale of P is the same camera.
-    P, lens = 3.7 * compose_camera(truth.K, R, t), np.tile([k1, 0.0, 0.0], (V, 1))
-    return reconstruction_of(P, (1020, 780), X=X, tracks=tracks, K=truth.K.copy(), distortion=lens)
+    P, lens = 3.7 * compose_camera(K, R, t), np.tile([k1, 0.0, 0.0], (V, 1))
+    return reconstruction_of(P, (1020, 780), X=X, tracks=tracks, K=K.copy(), distortion=lens)
 
 
 def test_the_truth_in_another_frame_has_no_error():
@@ -85,18 +76,18 @@ def test_the_truth_in_another_frame_has_no_error():
 
 def test_known_errors_are_measured_in_their_units():
     truth = _truth()
-    K, R, C = truth.K.copy(), truth.R.copy(), truth.C.copy()
+    K, R, C = (part.copy() for part in truth)
     K[:, [0, 1], [0, 1]] *= 1.004
     K[:, :2, 2] += [3.0, -4.0]
-    errors = measure_cameras(_reconstruction(replace(truth, K=K)), truth)
+    errors = measure_cameras(_reconstruction((K, *truth[1:])), truth)
     assert errors.focal_error_pct == pytest.approx(0.4)
     assert errors.principal_point_error_px == pytest.approx(5.0)
     R[::2] = Rotation.from_rotvec([0, 0, np.radians(0.02)]).as_matrix() @ R[::2]
-    turned = measure_cameras(_reconstruction(replace(truth, R=R)), truth)
+    turned = measure_cameras(_reconstruction((truth[0], R, truth[2])), truth)
     assert turned.rotation_error_deg == pytest.approx(0.01, rel=0.05)
     C[0] += [0.0, 0.0, 0.06]
     # The alignment takes part of one camera's 60 mm away and spreads the rest over all six.
-    assert 0.004 < measure_cameras(_reconstruction(replace(truth, C=C)), truth).centre_error < 0.02
+    assert 0.004 < measure_cameras(_reconstruction((*truth[:2], C)), truth).centre_error < 0.02
     errors = replace(errors, centre_error=0.1)
     assert relative_centre_error(errors, np.array([[0.0, 0, 0], [4.0, 0, 0]])) == pytest.approx(0.025)
 
@@ -110,7 +101,7 @@ def test_only_registered_views_count():
     assert measure_reprojection(partial).observations == (V - 1) * N
     two = replace(partial, registered=np.arange(V) < 2)
     assert measure_cameras(two, truth).centre_error is None
-    assert np.isnan(relative_centre_error(measure_cameras(two, truth), truth.C))
+    assert np.isnan(relative_centre_error(measure_cameras(two, truth), truth[2]))
     with pytest.raises(ValueError, match="at least one registered"):
         measure_cameras(replace(partial, registered=np.zeros(V, bool)), truth)
 
@@ -124,3 +115,48 @@ def test_reprojection_is_recomputed_from_inliers_alone():
     measured = measure_reprojection(replace(ours, tracks=replace(ours.tracks, xy=xy), inlier=inlier))
     assert (measured.median_px, measured.rms_px) == pytest.approx((0.5, 0.5))
     assert measured.observations == V * N - 1
+
+
+def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
+    pytest.importorskip("pycolmap")
+    scene = load_fixture_scene()
+    images = tmp_path / "images"
+    images.mkdir()
+    views = slice(4, 9)
+    for path in scene.image_paths[views]:
+        with Image.open(path) as whole:
+            small = whole.resize((whole.width // 2, whole.height // 2))
+        exif = Image.Exif()
+        exif[0x8769] = {0x920A: 5.0, 0xA405: 300}
+        small.save(images / path.name, quality=95, exif=exif)
+    reconstruct_with_pycolmap(images, tmp_path / "out")
+    model, seconds = read_run(images, tmp_path / "out")
+    assert model.registered.sum() == 5
+    assert set(seconds) == {"extract", "match", "map"}
+    K = np.diag([0.5, 0.5, 1.0]) @ scene.K[views]
+    errors = measure_cameras(model, (K, scene.R[views], scene.C[views]))
+    # A focal length of 300 mm in EXIF would have been believed and barely refined.
+    assert errors.focal_error_pct < 5
+    assert errors.rotation_error_deg < 1
+    again, _ = read_run(images, tmp_path / "out")
+    np.testing.assert_array_equal(again.P, model.P)
+
+
+def test_rows_hold_both_methods_and_a_failure_misses_its_targets():
+    model = _reconstruction(_truth())
+    ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
+    failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
+    rows, missed = (
+        {
+            row.name: row
+            for row in check_reconstruction("fountain-P11", V, _truth(), {OURS: one, COLMAP: colmap})
+        }
+        for one in (ours, failed)
+    )
+    assert rows["wall time"].target == 10.0
+    # The residuals here are zero, so a claim of one pixel is far off.
+    verdicts = {f"cameras registered of {V}": "reached", "focal error": "reached", "wall time": "reached"}
+    verdicts |= {"rms it claims off by": "missed", "points": "reported"}
+    assert {name: rows[name].verdict for name in verdicts} == verdicts
+    assert (missed["focal error"].verdict, missed["focal error"].values[OURS]) == ("missed", None)
+    assert missed[f"cameras registered of {V}"].values[OURS] == 0

@@ -14,15 +14,7 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F64
 from validation.ablation.plan import Plan
 from validation.ablation.run import Row, Rows
-from validation.ablation.statistics import (
-    MIN_SCENES,
-    Interval,
-    Sample,
-    holm,
-    mean_ranks,
-    on_front,
-    paired_interval,
-)
+from validation.ablation.statistics import MIN_SCENES, Interval, Sample, holm, on_front, paired_interval
 from validation.ablation.study import Measure
 from validation.runs.tables import number, text_table
 
@@ -31,11 +23,10 @@ Verdict = Literal["better", "worse", "negligible", "no difference shown", "no sa
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a variant with another under one condition, by one measure.
-
-    ``interval`` holds differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported`
-    returns quotients). ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from
-    it, "negligible" where the whole interval is, and "no sample" where there is no interval.
+    """Comparison of a variant with another under one condition, by one measure. ``interval`` holds
+    differences variant - other, with ``ratio`` of the logarithms (:func:`as_reported` returns quotients).
+    ``p`` is adjusted for all comparisons of the measure (Holm); the verdict follows from it, "negligible"
+    where the whole interval is, and "no sample" where there is no interval.
     """
 
     measure: Measure
@@ -51,7 +42,7 @@ class Comparison:
 @dataclass(frozen=True)
 class Cell:
     """Summary of a variant under a condition: mean and median of a measure over the rows that have it, number
-    of rows and failures, median cost (s), mean rank (1 is best) and whether it is Pareto-optimal.
+    of rows and failures, median cost (s), and whether it is Pareto-optimal.
     """
 
     measure: Measure
@@ -62,12 +53,10 @@ class Cell:
     rows: int
     failed: int
     cost_s: float
-    rank: float
     on_front: bool
 
 
-@dataclass(frozen=True)
-class Analysis:
+class Analysis(NamedTuple):
     """All results of a study. ``steps`` compares each step of a ladder with the one before."""
 
     plan: Plan
@@ -82,20 +71,14 @@ class Analysis:
 
 
 def analyse(rows: Rows) -> Analysis:
-    """Compare all variants with the baseline on the same scene, seed and condition, and rank them."""
-    plan = rows.plan
+    """Compare all variants with the baseline on the same scene, seed and condition."""
+    plan, table = rows.plan, _Table(rows)
     names = [v.name for v in plan.variants]
     others = [(name, plan.baseline) for name in names if name != plan.baseline]
     steps = list(zip(names[1:], names, strict=False)) if plan.study.mode == "ladder" else []
-    table = _Table(rows)
-    return Analysis(
-        plan,
-        rows,
-        tuple(cell for m in plan.measures for cell in _cells(table, m)),
-        tuple(c for m in plan.measures for c in _comparisons(table, m, others)),
-        tuple(c for m in plan.measures for c in _comparisons(table, m, steps)),
-        tuple(_warnings(rows)),
-    )
+    cells = tuple(cell for m in plan.measures for cell in _cells(table, m))
+    compared = (tuple(c for m in plan.measures for c in _comparisons(table, m, p)) for p in (others, steps))
+    return Analysis(plan, rows, cells, *compared, tuple(_warnings(rows)))
 
 
 class _Table:
@@ -105,8 +88,8 @@ class _Table:
         self.plan = rows.plan
         self.scenes = tuple(dict.fromkeys(r.scene for r in rows.plan.rows))
         task = rows.plan.rows[0].setting.task
-        self.sample: Sample = getattr(task, "sample", "scenes")
-        scene_of = getattr(task, "scene_of", str)
+        self.sample: Sample = task.sample
+        scene_of = task.scene_of
         # Rows of one scene and its subsets: all of them, or their means over the seeds.
         self.groups = [
             [n for n, name in enumerate(self.scenes) if scene_of(name) == scene]
@@ -114,18 +97,13 @@ class _Table:
         ]
         self.by_place = {(r.variant, r.condition, r.scene, r.seed): r for r in rows}
 
-    def value(self, measure: Measure, variant: str, condition: str, scene: str, seed: int) -> float:
-        row = self.by_place.get((variant, condition, scene, seed))
-        return float("nan") if row is None else row.metrics.get(measure.name, float("nan"))
-
     def values(self, measure: Measure, variant: str, condition: str) -> F64:
         """(scenes, seeds), NaN where there is none."""
-        return np.array(
-            [
-                [self.value(measure, variant, condition, scene, seed) for seed in self.plan.seeds]
-                for scene in self.scenes
-            ]
-        )
+        found = np.full((len(self.scenes), len(self.plan.seeds)), np.nan)
+        for i, j in np.ndindex(found.shape):
+            row = self.by_place.get((variant, condition, self.scenes[i], self.plan.seeds[j]))
+            found[i, j] = np.nan if row is None else row.metrics.get(measure.name, np.nan)
+        return found
 
     def grouped(self, difference: F64, known: NDArray[np.bool_]) -> list[F64]:
         """The known differences (scenes, seeds) of each scene: every draw, or a mean for each subset."""
@@ -185,22 +163,18 @@ def _cells(table: _Table, measure: Measure) -> list[Cell]:
     found = []
     names = [v.name for v in table.plan.variants]
     for condition in (c.name for c in table.plan.conditions):
-        blocks = np.array([table.values(measure, name, condition).ravel() for name in names]).T
-        sign = 1.0 if measure.better == "less" else -1.0
-        some = blocks[np.isfinite(blocks).any(axis=1)]
-        ranks = mean_ranks(sign * some) if len(some) else np.full(len(names), np.nan)
+        blocks = [table.values(measure, name, condition).ravel() for name in names]
+        known = [values[np.isfinite(values)] for values in blocks]
         rows = [table.rows(name, condition) for name in names]
-        # The first rows of a process compile or load kernels; exclude them from the cost.
-        cost = np.array([float(np.median([r.cost_s for r in own])) if own else np.nan for own in rows])
-        # A variant that fails on hard rows is ranked on easier rows than the others.
-        whole = np.isfinite(some).all(axis=0)
-        known = [column[np.isfinite(column)] for column in blocks.T]
-        means = np.array([float(np.mean(values)) if len(values) else np.nan for values in known])
-        front = on_front(cost, np.where(whole, sign * means, np.nan))
+        # The median, because the first rows of a process compile or load kernels.
+        cost = np.array([np.median([r.cost_s for r in own]) if own else np.nan for own in rows])
+        means = np.array([np.mean(values) if len(values) else np.nan for values in known])
+        # The mean of a variant that fails on hard rows is one of easier rows than the others'.
+        whole = np.array([len(values) for values in known]) == np.isfinite(blocks).any(axis=0).sum()
+        front = on_front(cost, np.where(whole, means if measure.better == "less" else -means, np.nan))
         for k, name in enumerate(names):
-            count = len(known[k])
-            middle = float(np.median(known[k])) if count else float("nan")
-            numbers = (float(means[k]), middle, count, len(rows[k]) - count, float(cost[k]), float(ranks[k]))
+            count, middle = len(known[k]), float(np.median(known[k])) if len(known[k]) else float("nan")
+            numbers = (float(means[k]), middle, count, len(rows[k]) - count, float(cost[k]))
             found.append(Cell(measure, name, condition, *numbers, bool(front[k])))
     return found
 
@@ -214,14 +188,12 @@ def _warnings(rows: Rows) -> list[str]:
     missing = len(plan.rows) - len(rows)
     if missing:
         found.append(f"{missing} of {len(plan.rows)} rows have not been computed")
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for name in ("scene", "variant"):
-        for r in rows:
-            where = f"{r.scene} ({r.condition})" if name == "scene" and r.condition else getattr(r, name)
-            groups.setdefault((name, where), []).append(r)
-    for (_, where), here in groups.items():
-        if all(r.failure for r in here):
-            found.append(f"every row of {where} failed: {here[0].failure}")
+    scenes = [f"{r.scene} ({r.condition})" if r.condition else r.scene for r in rows]
+    for names in (scenes, [r.variant for r in rows]):
+        for where in dict.fromkeys(names):
+            here = [r for r, name in zip(rows, names, strict=True) if name == where]
+            if all(r.failure for r in here):
+                found.append(f"every row of {where} failed: {here[0].failure}")
     for measure in plan.measures:
         if len(rows) and not any(measure.name in r.metrics for r in rows):
             found.append(f"no row has the metric {measure.name}")
@@ -239,70 +211,75 @@ def text_of(analysis: Analysis) -> str:
     return "\n\n".join([*blocks, *([text_table(["failed", "scene", "why"], failed)] if failed else [])])
 
 
-class Failure(NamedTuple):
-    """A variant that failed on a scene, for one reason."""
-
-    variant: str
-    scene: str
-    why: str
-
-
-def failures_of(rows: Iterable[Row]) -> list[Failure]:
-    """Failed rows; those of one variant, scene and reason together, with their number."""
+def failures_of(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
+    """Variant, scene and reason of failed rows; those alike together, with their number."""
     found = Counter(
         (f"{r.variant} ({r.condition})" if r.condition else r.variant, r.scene, " ".join(r.failure.split()))
         for r in rows
         if r.failure
     )
     return [
-        Failure(who, f"{scene} ({count} seeds)" if count > 1 else scene, why)
+        (who, f"{scene} ({count} seeds)" if count > 1 else scene, why)
         for (who, scene, why), count in found.items()
     ]
 
 
-def _measure_text(analysis: Analysis, measure: Measure) -> str:
-    """A row for each variant. Under one condition: its mean, its difference from the baseline and, in a
-    ladder, from the step before. Under several: the means, bold if significantly better, italic if worse.
+class Entry(NamedTuple):
+    """A cell of a table, and the verdict that it shows."""
+
+    text: str
+    verdict: str = ""
+
+
+def measure_table(analysis: Analysis, measure: Measure) -> tuple[list[str], list[list[Entry]]]:
+    """Return the head and a row for each variant. Under one condition: its mean, its difference from the
+    baseline and, in a ladder, from the step before. Under several: the means with their verdicts.
     """
     plan = analysis.plan
-    cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
-    found = {(c.variant, c.condition): c for c in analysis.comparisons if c.measure == measure}
-    steps = {(c.variant, c.condition): c for c in analysis.steps if c.measure == measure}
+    cells, found, steps = (
+        {(c.variant, c.condition): c for c in some if c.measure == measure}
+        for some in (analysis.cells, analysis.comparisons, analysis.steps)
+    )
     several = len(plan.conditions) > 1
     head = [f"{measure.name}, {measure.unit}" if measure.unit else measure.name]
     head += [c.name for c in plan.conditions] if several else ["mean", f"against {plan.baseline}"]
     head += ["this step alone"] if steps and not several else []
-    head.append("cost, s")
-    lines = []
+    rows = []
     for name in (v.name for v in plan.variants):
         places = [(name, condition.name) for condition in plan.conditions]
         if several:
-            entries = [f"{name}{' (the baseline)' * (name == plan.baseline)}"]
-            for at in places:
-                verdict = found[at].verdict if at in found else ""
-                mark = {"better": "**", "worse": "*"}.get(verdict, "")
-                entries.append(f"{mark}{mean_text(cells[at])}{mark}")
+            row = [Entry(f"{name}{' (the baseline)' * (name == plan.baseline)}")]
+            row += [Entry(_mean_text(cells[at]), found[at].verdict if at in found else "") for at in places]
         else:
-            entries = [name, mean_text(cells[places[0]]), comparison_text(found.get(places[0]))]
-            entries += [comparison_text(steps.get(places[0]))] if steps else []
-        cost = sum(cells[at].cost_s / len(places) for at in places)
-        lines.append([*entries, number(cost)])
-    return text_table(head, lines)
+            row = [Entry(name), Entry(_mean_text(cells[places[0]])), _difference(found.get(places[0]))]
+            row += [_difference(steps.get(places[0]))] if steps else []
+        rows.append([*row, Entry(number(sum(cells[at].cost_s / len(places) for at in places)))])
+    return [*head, "cost, s"], rows
 
 
-def mean_text(cell: Cell) -> str:
+def _measure_text(analysis: Analysis, measure: Measure) -> str:
+    """Significant entries are bold; of means under several conditions the worse ones are italic."""
+    worse = "*" if len(analysis.plan.conditions) > 1 else "**"
+    head, rows = measure_table(analysis, measure)
+    marks = {"better": "**", "worse": worse}
+    return text_table(
+        head, [[f"{m}{e.text}{m}" for e in r for m in [marks.get(e.verdict, "")]] for r in rows]
+    )
+
+
+def _mean_text(cell: Cell) -> str:
     """The mean, and how many rows failed."""
     failed = f" ({cell.failed} of {cell.rows + cell.failed} failed)" if cell.failed else ""
     return f"{number(cell.mean)}{failed}"
 
 
-def comparison_text(found: Comparison | None) -> str:
-    """Return the difference or quotient with its interval and sample; bold if significant."""
+def _difference(found: Comparison | None) -> Entry:
+    """Return the difference or quotient with its interval and sample."""
     if found is None or not math.isfinite(found.interval.mean):
-        return ""
+        return Entry("")
     mean, low, high = as_reported(found)
     sign = "x " if found.ratio else "+" if mean > 0 else ""
     text = f"{sign}{number(mean)}"
     if math.isfinite(low) and high > low:
         text += f" [{number(low)}, {number(high)}] {found.interval.count} {found.interval.sample}"
-    return f"**{text}**" if found.verdict in ("better", "worse") else text
+    return Entry(text, found.verdict)

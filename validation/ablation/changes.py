@@ -6,11 +6,10 @@ import dataclasses
 import hashlib
 import sys
 import typing
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from thesisrecon.config import KINDS, PipelineConfig, preset
 from thesisrecon.config.text import config_from_tables, dataclass_from_table
@@ -20,8 +19,7 @@ from validation.ablation.study import FunctionTask
 PREFIX = "ablation_own_"
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """User source file: module name, path and text."""
 
     module: str
@@ -73,9 +71,9 @@ def load_own(word: str, where: str, folder: Path = Path()) -> Any:
     return getattr(module, name)
 
 
-def sources_of(modules: Iterable[str]) -> tuple[Source, ...]:
-    """The sources of those modules that are files of the user."""
-    return tuple(_SOURCES[m] for m in sorted(set(modules)) if m in _SOURCES)
+def loaded_sources() -> tuple[Source, ...]:
+    """The files of the user that were read in this process."""
+    return tuple(_SOURCES.values())
 
 
 TASK = "task"
@@ -90,14 +88,8 @@ class Setting:
     task: Any
 
 
-def apply_changes(setting: Setting, changes: Mapping[str, Any], folder: Path) -> Setting:
-    """``setting`` with every change made, in order."""
-    for path, value in changes.items():
-        setting = _changed(setting, path, value, folder)
-    return setting
-
-
-def _changed(setting: Setting, path: str, value: Any, folder: Path) -> Setting:
+def changed(setting: Setting, path: str, value: Any, folder: Path) -> Setting:
+    """Return ``setting`` with a value at a dotted path."""
     head, *rest = path.split(".")
     if head not in (TASK, *STAGES):
         raise UsageError(f"{path}: {unknown_word('stage', head, [*STAGES, TASK])}")
@@ -105,12 +97,12 @@ def _changed(setting: Setting, path: str, value: Any, folder: Path) -> Setting:
         return dataclasses.replace(setting, task=_changed_task(setting.task, path, rest, value))
     if not rest:
         return dataclasses.replace(setting, config=_whole_stage(setting.config, head, value, folder))
-    if _is_object(value):
-        return dataclasses.replace(setting, config=_put(setting.config, path, path.split("."), value))
-    table = value
-    for key in reversed(rest):
-        table = {key: table}
-    return dataclasses.replace(setting, config=config_from_tables({head: table}, setting.config))
+    tables = {head: _nested(rest, value)}
+    return dataclasses.replace(setting, config=config_from_tables(tables, setting.config))
+
+
+def _nested(keys: list[str], value: Any) -> Any:
+    return {keys[0]: _nested(keys[1:], value)} if keys else value
 
 
 def _changed_task(task: Any, path: str, rest: list[str], value: Any) -> Any:
@@ -118,12 +110,7 @@ def _changed_task(task: Any, path: str, rest: list[str], value: Any) -> Any:
         raise UsageError(f"{path}: the task of this study is a function and has no parameters")
     if not rest:
         raise UsageError(f"{path}: a change of the task names a parameter, as task.noise_px")
-    if _is_object(value):
-        return _put(task, path, rest, value)
-    table = value
-    for key in reversed(rest[1:]):
-        table = {key: table}
-    return dataclass_from_table(type(task), {rest[0]: table}, TASK, task)
+    return dataclass_from_table(type(task), _nested(rest, value), TASK, task)
 
 
 def _whole_stage(config: PipelineConfig, stage: str, value: Any, folder: Path) -> PipelineConfig:
@@ -168,26 +155,12 @@ def _is_object(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def _put(whole: Any, path: str, keys: list[str], value: Any) -> Any:
-    """``whole`` with an object in the place of a field however deep."""
-    key, *rest = keys
-    names = [f.name for f in dataclasses.fields(whole)] if _is_object(whole) else []
-    if key not in names:
-        raise UsageError(f"{path}: {unknown_word('setting', key, names)}")
-    inner = _put(getattr(whole, key), path, rest, value) if rest else value
-    try:
-        return dataclasses.replace(whole, **{key: inner})
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"{path}: {error}") from None
-
-
 def level_name(path: str, value: Any) -> str:
     """Return the name of an axis value in tables: the kind of a variant, a number with its field."""
     field = path.rpartition(".")[2]
     if isinstance(value, Mapping):
         fields = [f"{k} = {_text(v)}" for k, v in value.items() if k not in ("kind", "preset")]
-        head = value.get("kind", value.get("preset", ""))
-        head = str(head).rpartition(":")[2]
+        head = str(value.get("kind", value.get("preset", ""))).rpartition(":")[2]
         return ", ".join([head, *fields] if head else fields) or field
     if _is_object(value):
         fields = [f"{k} = {_text(v)}" for k, v in _non_default_fields(value).items()]
@@ -198,12 +171,12 @@ def level_name(path: str, value: Any) -> str:
 
 
 def _non_default_fields(value: Any) -> dict[str, Any]:
+    found = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
     try:
         usual = type(value)()
     except TypeError:
-        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-    names = [f.name for f in dataclasses.fields(value)]
-    return {n: getattr(value, n) for n in names if getattr(value, n) != getattr(usual, n)}
+        return found
+    return {name: own for name, own in found.items() if own != getattr(usual, name)}
 
 
 def _text(value: Any) -> str:

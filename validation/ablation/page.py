@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import join_claim
@@ -17,22 +15,23 @@ from validation.ablation.analysis import (
     Cell,
     Comparison,
     as_reported,
-    comparison_text,
     failures_of,
-    mean_text,
+    measure_table,
     text_of,
 )
 from validation.ablation.plan import Plan
 from validation.ablation.study import Measure
 from validation.runs.page import plot_at, write_page
-from validation.runs.records import Plot, plot, scatter, slug
-from validation.runs.tables import commit, number, stamp, write_csv
+from validation.runs.tables import Plot, commit, plot, scatter, slug, stamp, write_csv
 
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
-SYMBOLS = ("circle", "square", "diamond")
 LOGARITHMIC = {"type": "log"}
 GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
+ABOUT = {
+    "scenes": "The intervals generalise to similar scenes: the scenes are the sample.",
+    "draws": "The intervals apply to these scenes only: the draws of data by the seed are the sample.",
+}
 
 
 def write_analysis(analysis: Analysis, out: str | Path) -> Path:
@@ -72,8 +71,7 @@ def _facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 def _findings(analysis: Analysis) -> list[str]:
     """Summarise each measure: variants better and worse than the baseline."""
-    count = len(analysis.plan.conditions)
-    found = []
+    count, found = len(analysis.plan.conditions), []
     for measure in analysis.plan.measures:
         sentences = []
         for verdict in ("better", "worse"):
@@ -81,84 +79,32 @@ def _findings(analysis: Analysis) -> list[str]:
                 c.variant for c in analysis.comparisons if (c.measure, c.verdict) == (measure, verdict)
             )
             names = [v if count == 1 else f"{v} (under {n} of {count} conditions)" for v, n in where.items()]
-            if count == 1 and len(names) > 2 and len(names) == len(analysis.plan.variants) - 1:
-                names = ["all others"]
             sentences += [f"{verdict}: {'; '.join(names)}"] if names else []
         summary = ". ".join(sentences) or "no difference from the baseline is shown"
         found.append(f"{measure.name} {summary}.")
     return found
 
 
-def _who(found: Any) -> str:
-    return f"{found.variant} ({found.condition})" if found.condition else found.variant
-
-
-# ---------------------------------------------------------------- a measure
-
-
 def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
-    plan = analysis.plan
+    plan, name = analysis.plan, slug(measure.name.lower())
     cells = [c for c in analysis.cells if c.measure == measure]
     comparisons = [c for c in analysis.comparisons if c.measure == measure]
-    steps = [c for c in analysis.steps if c.measure == measure]
-    name = slug(measure.name.lower())
     plots = {
         "over": _over_conditions(plan, measure, cells),
         "forest": _forest(measure, comparisons, plan.baseline),
         "cost": _cost(measure, cells),
     }
+    head, rows = measure_table(analysis, measure)
+    drawn = {c.interval.sample for c in comparisons if c.interval.pairs}
     return {
         "id": name,
         "measure": measure,
-        "table": _table(plan, cells, comparisons, steps),
-        "conditions": [c.name for c in plan.conditions],
+        "head": head,
+        "table": rows,
         "baseline": plan.baseline,
-        "steps": bool(steps),
-        "about": _about({c.interval.sample for c in comparisons if c.interval.pairs}),
+        "about": " ".join(ABOUT[sample] for sample in sorted(drawn)),
         "plots": [plot_at(f"{name}-{kind}", p) for kind, p in plots.items() if p is not None],
     }
-
-
-def _about(drawn: Collection[str]) -> str:
-    if drawn == {"scenes"}:
-        return "The intervals generalise to similar scenes: the scenes are the sample."
-    if drawn == {"draws"}:
-        return "The intervals apply to these scenes only: the draws of data by the seed are the sample."
-    return ""
-
-
-def _table(
-    plan: Plan, cells: Sequence[Cell], comparisons: Sequence[Comparison], steps: Sequence[Comparison]
-) -> list[dict[str, Any]]:
-    at = {(c.variant, c.condition): c for c in cells}
-    against = {(c.variant, c.condition): c for c in comparisons}
-    step = {(c.variant, c.condition): c for c in steps}
-    found = []
-    for name in (v.name for v in plan.variants):
-        places = [(name, condition.name) for condition in plan.conditions]
-        columns = [
-            {
-                "mean": mean_text(at[place]),
-                "rank": number(at[place].rank),
-                "against": _comparison_cells(against.get(place)),
-                "step": _comparison_cells(step.get(place)),
-                "on_front": at[place].on_front,
-            }
-            for place in places
-        ]
-        cost = number(float(np.mean([at[place].cost_s for place in places])))
-        found.append({"name": name, "columns": columns, "cost": cost, "base": name == plan.baseline})
-    return found
-
-
-def _comparison_cells(found: Comparison | None) -> dict[str, str]:
-    if found is None:
-        return {"text": "", "verdict": "", "more": ""}
-    effect, p = found.interval.effect, found.p
-    sample = f"{found.interval.count} {found.interval.sample}, {found.interval.pairs} pairs"
-    more = f"{sample}; effect size {number(effect)}; p {number(p)} after Holm"
-    state = {"better": "good", "worse": "bad"}.get(found.verdict, "")
-    return {"text": comparison_text(found).strip("*"), "verdict": state, "more": f"{found.verdict}; {more}"}
 
 
 # ---------------------------------------------------------------- plots
@@ -179,9 +125,9 @@ def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell]) -> Plo
         traces.append(scatter(variant.name, values, y, "lines+markers", line=line))
     log = measure.ratio and all(v is None or v > 0 for t in traces for v in t["y"])
     title, x = f"{measure.name} over {axes[0]}", axes[0].rpartition(".")[2]
-    legend = {"orientation": "h", "y": -0.25}
+    layout: dict[str, Any] = {"legend": {"orientation": "h", "y": -0.25}, "height": 420}
     yaxis = LOGARITHMIC if log else {}
-    return plot(title, traces, x, _with_unit(measure.name, measure), yaxis=yaxis, legend=legend, height=420)
+    return plot(title, traces, x, _with_unit(measure.name, measure), yaxis=yaxis, **layout)
 
 
 def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) -> Plot | None:
@@ -199,7 +145,8 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
         "color": "#55636f",
     }
     marker = {"color": [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown], "size": 9}
-    means, names = [_finite(mean) for mean, _, _ in values], [_who(c) for c in shown]
+    names = [f"{c.variant} ({c.condition})" if c.condition else c.variant for c in shown]
+    means = [_finite(mean) for mean, _, _ in values]
     trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
     line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
@@ -221,7 +168,7 @@ def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     dots, hidden = {"color": "#9fabb5", "dash": "dot"}, {"hoverinfo": "skip", "showlegend": False}
     traces = [scatter("", [c.cost_s for c in front], [c.mean for c in front], "lines", line=dots, **hidden)]
     for k, c in enumerate(known):
-        symbol = SYMBOLS[k // len(COLOURS) % len(SYMBOLS)] + ("" if c.on_front else "-open")
+        symbol = "circle" if c.on_front else "circle-open"
         marker = {"size": 11, "color": COLOURS[k % len(COLOURS)], "symbol": symbol}
         traces.append(scatter(c.variant, [c.cost_s], [c.mean], marker=marker))
     layout: dict[str, Any] = {
@@ -243,20 +190,20 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-Record = Mapping[str, Any]
+# ---------------------------------------------------------------- tables
 
 
-def _row_records(analysis: Analysis) -> list[Record]:
+def _row_records(analysis: Analysis) -> list[Mapping[str, Any]]:
     """One flat table: a row each, with a column for every axis, condition and measure."""
     plan = analysis.plan
     levels = {v.name: v.levels for v in (*plan.variants, *plan.conditions)}
     axes = list(dict.fromkeys(axis for level in levels.values() for axis in level))
-    other_names = (name for row in analysis.rows for name in row.metrics)
-    names = list(dict.fromkeys([*(m.name for m in plan.measures), *other_names]))
-    found: list[Record] = []
+    names = list(
+        dict.fromkeys([*(m.name for m in plan.measures), *(n for r in analysis.rows for n in r.metrics)])
+    )
+    found: list[Mapping[str, Any]] = []
     for row in analysis.rows:
-        stored = vars(row)
-        entries = {**levels[row.variant], **levels[row.condition]}
+        stored, entries = vars(row), {**levels[row.variant], **levels[row.condition]}
         found.append(
             {name: stored[name] for name in ("variant", "condition", "scene", "seed")}
             | {f"axis:{axis}": entries.get(axis) for axis in axes}
@@ -266,41 +213,21 @@ def _row_records(analysis: Analysis) -> list[Record]:
     return found
 
 
-def _comparison_record(c: Comparison) -> Record:
+def _comparison_record(c: Comparison) -> Mapping[str, Any]:
     mean, low, high = as_reported(c)
-    return {
-        "metric": c.measure.name,
-        "unit": c.measure.unit,
-        "variant": c.variant,
-        "against": c.against,
-        "condition": c.condition,
-        "of": "quotients" if c.ratio else "differences",
-        "mean": mean,
-        "low": low,
-        "high": high,
-        "p": c.interval.p,
-        "p_holm": c.p,
-        "effect_size": c.interval.effect,
-        "pairs": c.interval.pairs,
-        "sample": c.interval.sample,
-        "sample_size": c.interval.count,
-        "verdict": c.verdict,
-    }
-
-
-def _cell_record(c: Cell) -> Record:
-    own = {name: value for name, value in vars(c).items() if name != "measure"}
-    return {"metric": c.measure.name, "unit": c.measure.unit, **own}
+    head = {"metric": c.measure.name, "unit": c.measure.unit, "variant": c.variant, "against": c.against}
+    head |= {"condition": c.condition, "of": "quotients" if c.ratio else "differences"}
+    reported = {"mean": mean, "low": low, "high": high, "p_holm": c.p, "verdict": c.verdict}
+    return {**head, **vars(c.interval), **reported}
 
 
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
     """Write ``rows``, ``comparisons`` and ``means`` as CSV, and the tables for people as ``tables.md``."""
     write_text(out / "tables.md", f"{stamp()}\n\n{text_of(analysis)}\n")
-    comparisons = [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)]
     tables = {
         "rows": _row_records(analysis),
-        "comparisons": comparisons,
-        "means": [_cell_record(c) for c in analysis.cells],
+        "comparisons": [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)],
+        "means": [{**vars(c), "measure": c.measure.name, "unit": c.measure.unit} for c in analysis.cells],
     }
     for name, records in tables.items():
         write_csv(out / f"{name}.csv", records)

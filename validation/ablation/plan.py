@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import itertools
 import platform
 import tomllib
 import typing
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import thesisrecon
 from thesisrecon._numba import code_digest
-from thesisrecon.config import KINDS, PipelineConfig, preset
+from thesisrecon.config import KINDS, preset
 from thesisrecon.config.text import (
     config_from_tables,
     dataclass_from_table,
@@ -28,27 +26,18 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.io._files import read_bytes
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
-from validation.ablation.changes import (
-    PREFIX,
-    STAGES,
-    TASK,
-    Setting,
-    apply_changes,
-    is_own,
-    level_name,
-    load_own,
-)
-from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study
+from validation.ablation.changes import PREFIX, STAGES, TASK, Setting, changed, is_own, level_name, load_own
+from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study, Task
 from validation.ablation.tasks import TASKS, Reconstruction
 
 ROOT = Path(__file__).resolve().parents[1]
+STUDIES = ROOT / "ablation" / "studies"
 RUN_BY_ROWS = ("scenes", "metrics", "references", "runs", "stages", "studies", "ablation/tasks")
 """Folders of the code that the rows run, without that of the library."""
 Levels = Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class Variant:
+class Variant(NamedTuple):
     """A variant or a condition: the level of every axis, and its changes of configuration and task."""
 
     name: str
@@ -56,8 +45,7 @@ class Variant:
     changes: Changes
 
 
-@dataclass(frozen=True)
-class PlannedRow:
+class PlannedRow(NamedTuple):
     """A planned row; ``key`` identifies the setting, scene, seed and versions."""
 
     key: str
@@ -68,8 +56,7 @@ class PlannedRow:
     setting: Setting
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """Plan of a study; its rows in execution order, seed by seed."""
 
     study: Study
@@ -83,60 +70,42 @@ class Plan:
 
     def wanted(self, row: PlannedRow) -> list[str]:
         """Return the measures of a row."""
-        missing = unavailable(row.setting.task, row.scene)
+        missing = row.setting.task.unavailable(row.scene)
         return [m.name for m in self.measures if m.name not in missing]
 
 
 def plan_study(study: Study) -> Plan:
     """Return the plan of a study."""
-    task = _task_of(study)
-    start = Setting(study.config, task)
-    variants = _variants(study)
+    task, variants = _task_of(study), _variants(study)
+    start, installed = Setting(study.config, task), versions()
     conditions = tuple(_combined(_axes(study.conditions, "condition"))) or (Variant("", {}, {}),)
     settings = {
         (v.name, c.name): _applied(start, v, c, study.folder)
         for v, c in itertools.product(variants, conditions)
     }
-    variants = _different(variants, conditions, settings)
+    identities = {at: identity(setting) for at, setting in settings.items()}
+    variants = _different(variants, conditions, identities)
     scenes, seeds = _scenes(study, task), _seeds(study)
     baseline = study.baseline or variants[0].name
     if baseline not in [v.name for v in variants]:
         raise UsageError(unknown_word("baseline", baseline, [v.name for v in variants]))
-    installed = versions()
-    scene_keys = {scene: task.scene_key(scene) for scene in scenes}
-    identities = {at: identity(setting) for at, setting in settings.items()}
-    rows = tuple(
-        PlannedRow(
-            key_of("row", identities[v.name, c.name], scene_keys[scene], seed, installed),
-            v.name,
-            c.name,
-            scene,
-            seed,
-            settings[v.name, c.name],
-        )
-        for seed, scene, c, v in itertools.product(seeds, scenes, conditions, variants)
-    )
+    scene_keys, rows = {scene: task.scene_key(scene) for scene in scenes}, list[PlannedRow]()
+    for seed, scene, c, v in itertools.product(seeds, scenes, conditions, variants):
+        at = v.name, c.name
+        key = key_of("row", identities[at], scene_keys[scene], seed, installed)
+        rows.append(PlannedRow(key, *at, scene, seed, settings[at]))
     measures = _available_measures(study, _measures(study, task), rows)
-    return Plan(study, measures, variants, conditions, seeds, baseline, rows, installed)
-
-
-def unavailable(task: Any, scene: str) -> Collection[str]:
-    """Return the measures that a task cannot compute on a scene."""
-    found: Collection[str] = task.unavailable(scene) if hasattr(task, "unavailable") else ()
-    return found
+    return Plan(study, measures, variants, conditions, seeds, baseline, tuple(rows), installed)
 
 
 def _available_measures(
     study: Study, measures: tuple[Measure, ...], rows: Sequence[PlannedRow]
 ) -> tuple[Measure, ...]:
     """Return the measures available in some row; reject requested unavailable ones."""
-    missing = [set(unavailable(row.setting.task, row.scene)) for row in rows]
-    never = set.intersection(*missing)
+    never = set.intersection(*(set(row.setting.task.unavailable(row.scene)) for row in rows))
     if study.metrics and (wrong := [m.name for m in measures if m.name in never]):
-        raise UsageError(
-            f"no scene of this study has the metric {wrong[0]}: "
-            "it has no ground truth, or the task ends before that step"
-        )
+        why = "it has no ground truth, or the task ends before that step"
+        raise UsageError(f"no scene of this study has the metric {wrong[0]}: {why}")
     return tuple(m for m in measures if m.name not in never)
 
 
@@ -144,22 +113,23 @@ def _applied(start: Setting, variant: Variant, condition: Variant, folder: Path)
     """Return the setting of a variant under a condition; errors name both."""
     for part in (variant, condition):
         try:
-            start = apply_changes(start, part.changes, folder)
+            for path, value in part.changes.items():
+                start = changed(start, path, value, folder)
         except UsageError as error:
             raise UsageError(f"{part.name}: {error}") from None
     return start
 
 
-def _task_of(study: Study) -> Any:
+def _task_of(study: Study) -> Task:
     task = Reconstruction() if study.task is None else study.task
-    if hasattr(task, "run") and hasattr(task, "measures"):
+    if isinstance(task, Task):
         return task
     if not callable(task):
         raise UsageError(f"a task is a Task or a function (config, scene, seed); got {task!r}")
     return FunctionTask(task)
 
 
-def _measures(study: Study, task: Any) -> tuple[Measure, ...]:
+def _measures(study: Study, task: Task) -> tuple[Measure, ...]:
     known = {m.name: m for m in task.measures}
     asked: Sequence[str | Measure] = study.metrics or tuple(known.values())
     if isinstance(asked, str):
@@ -173,19 +143,15 @@ def _measures(study: Study, task: Any) -> tuple[Measure, ...]:
 
 
 def _seeds(study: Study) -> tuple[int, ...]:
-    count = study.seeds
-    if isinstance(count, int) and not isinstance(count, bool):
-        seeds: list[Any] = list(range(count))
-    else:
-        seeds = list(count) if isinstance(count, list | tuple | range) else []
+    count: Any = range(study.seeds) if type(study.seeds) is int else study.seeds
+    seeds: list[Any] = list(count) if isinstance(count, list | tuple | range) else []
     if not seeds or any(type(s) is not int or s < 0 for s in seeds) or len(set(seeds)) < len(seeds):
-        raise UsageError(
-            f"seeds are different whole numbers of at least 0, or how many (at least 1); got {count!r}"
-        )
+        wanted = "seeds are different whole numbers of at least 0, or how many (at least 1)"
+        raise UsageError(f"{wanted}; got {study.seeds!r}")
     return tuple(seeds)
 
 
-def _scenes(study: Study, task: Any) -> tuple[str, ...]:
+def _scenes(study: Study, task: Task) -> tuple[str, ...]:
     scenes = study.scenes
     if isinstance(scenes, str) or not scenes or not all(isinstance(s, str) for s in scenes):
         raise UsageError(f"scenes are a list of at least one name; got {scenes!r}")
@@ -212,40 +178,30 @@ def _levels(name: str, axis: Axis, what: str) -> list[Variant]:
         raise UsageError(f"the {what} {name} takes a list of values or a table of levels; got {axis!r}")
     if not axis:
         raise UsageError(f"the {what} {name} has no values; give it at least one")
-    if not isinstance(axis, Mapping):
-        _check_path(name, what)
-        levels = [(level_name(name, value), {name: value}) for value in axis]
-    else:
-        levels = []
+    if isinstance(axis, Mapping):
         for level, changes in axis.items():
             if not isinstance(changes, Mapping):
                 raise UsageError(
                     f"the level {level!r} of the {what} {name} takes a table of changes, path -> value; "
                     f"got {changes!r} (to vary one path, give the {what} that path and a list of values)"
                 )
-            levels.append((level, dict(changes)))
-    doubled = [level for n, (level, _) in enumerate(levels) if level in [x for x, _ in levels[:n]]]
-    if doubled:
-        raise UsageError(f"the {what} {name} has the level {doubled[0]!r} twice")
-    return [Variant(level, {name: level}, changes) for level, changes in levels]
-
-
-def _check_path(path: str, what: str) -> None:
-    head = path.partition(".")[0]
-    if head not in (TASK, *STAGES):
+        return [Variant(level, {name: level}, dict(changes)) for level, changes in axis.items()]
+    if (head := name.partition(".")[0]) not in (TASK, *STAGES):
         known = unknown_word("stage", head, [*STAGES, TASK])
-        raise UsageError(f"the {what} {path} names no path of the configuration: {known}")
+        raise UsageError(f"the {what} {name} names no path of the configuration: {known}")
+    found = {level: Variant(level, {name: level}, {name: v}) for v in axis for level in [level_name(name, v)]}
+    if len(found) < len(axis):
+        names = [level_name(name, value) for value in axis]
+        doubled = next(level for n, level in enumerate(names) if level in names[:n])
+        raise UsageError(f"the {what} {name} has the level {doubled!r} twice")
+    return list(found.values())
 
 
 def _combined(axes: Sequence[Sequence[Variant]]) -> Iterator[Variant]:
-    for levels in itertools.product(*axes) if axes else ():
-        yield _joined(levels, ", ".join(v.name for v in levels))
-
-
-def _joined(parts: Sequence[Variant], name: str) -> Variant:
-    levels = {axis: level for part in parts for axis, level in part.levels.items()}
-    changes = {path: value for part in parts for path, value in part.changes.items()}
-    return Variant(name, levels, changes)
+    for parts in itertools.product(*axes) if axes else ():
+        levels = {axis: level for part in parts for axis, level in part.levels.items()}
+        changes = {path: value for part in parts for path, value in part.changes.items()}
+        yield Variant(", ".join(part.name for part in parts), levels, changes)
 
 
 def _variants(study: Study) -> tuple[Variant, ...]:
@@ -256,34 +212,26 @@ def _variants(study: Study) -> tuple[Variant, ...]:
         if not axes:
             raise UsageError("a study has at least one axis")
         return tuple(_combined(axes))
-    start = Variant(study.start, {}, {})
-    levels = [level for axis in axes for level in axis]
-    if study.mode == "one-at-a-time":
-        return (start, *levels)
-    steps = [_laid(levels[: n + 1], level.name) for n, level in enumerate(levels)]
-    return (start, *steps)
-
-
-def _laid(parts: Sequence[Variant], name: str) -> Variant:
-    """Return the changes of a ladder in step order; later changes of a path win."""
-    changes: dict[str, Any] = {}
-    for part in parts:
-        for path, value in part.changes.items():
-            changes.pop(path, None)
-            # Replacing a stage discards earlier changes inside it.
-            changes = {k: v for k, v in changes.items() if not k.startswith(f"{path}.")}
-            changes[path] = value
-    return Variant(name, {"step": name}, changes)
+    found = [Variant(study.start, {}, {})]
+    for level in itertools.chain.from_iterable(axes):
+        if study.mode == "one-at-a-time":
+            found.append(level)
+            continue
+        # A ladder keeps earlier changes; replacing a stage discards those inside it.
+        new = tuple(f"{path}." for path in level.changes)
+        kept = {path: v for path, v in found[-1].changes.items() if not f"{path}.".startswith(new)}
+        found.append(Variant(level.name, {"step": level.name}, {**kept, **level.changes}))
+    return tuple(found)
 
 
 def _different(
-    variants: Sequence[Variant], conditions: Sequence[Variant], settings: Mapping[tuple[str, str], Setting]
+    variants: Sequence[Variant], conditions: Sequence[Variant], identities: Mapping[tuple[str, str], Any]
 ) -> tuple[Variant, ...]:
     """Remove repeated variants; reject one name for two settings."""
     kept: dict[str, Variant] = {}
-    seen: list[list[Any]] = []
+    seen = list[Any]()
     for variant in variants:
-        found = [identity(settings[variant.name, c.name]) for c in conditions]
+        found = [identities[variant.name, c.name] for c in conditions]
         if variant.name in kept:
             raise UsageError(f"two variants are called {variant.name!r}; name the levels in a table")
         if found not in seen:
@@ -297,28 +245,18 @@ def _different(
 
 def identity(setting: Setting) -> list[Any]:
     """Return plain values that identify a setting."""
-    return [_config_identity(setting.config), _task_identity(setting.task)]
-
-
-def _config_identity(config: PipelineConfig) -> dict[str, Any]:
-    tables: dict[str, Any] = tables_from_config(config)
-    for stage in KINDS:
-        kind = type(getattr(config, stage))
-        tables[stage] = [kind.__module__, kind.__qualname__, _own_code(getattr(config, stage)), tables[stage]]
-    return tables
-
-
-def _task_identity(task: Any) -> list[Any]:
+    config, task = setting.config, setting.task
     subject = task.function if isinstance(task, FunctionTask) else type(task)
-    table = table_from_dataclass(task) if dataclasses.is_dataclass(task) and subject is type(task) else {}
+    table = table_from_dataclass(task) if subject is type(task) else {}
+    kinds = [type(getattr(config, stage)) for stage in KINDS]
+    return [tables_from_config(config), table, *map(_code_of, [*kinds, subject])]
+
+
+def _code_of(subject: Any) -> list[str]:
+    """Return its name, and a digest of code that :func:`versions` does not hold."""
+    known = subject.__module__.startswith(("thesisrecon.", "validation.", PREFIX))
     name = getattr(subject, "__qualname__", type(subject).__qualname__)
-    return [subject.__module__, name, _own_code(subject), table]
-
-
-def _own_code(subject: Any) -> str:
-    module = getattr(subject, "__module__", type(subject).__module__)
-    ours = module.split(".")[0] in ("thesisrecon", "validation")
-    return "" if ours or module.startswith(PREFIX) else code_digest(subject)
+    return [subject.__module__, name, "" if known else code_digest(subject)]
 
 
 @cache
@@ -338,6 +276,7 @@ def versions() -> dict[str, str]:
 
 _TEXTS = ("title", "words", "mode", "baseline", "start")
 _TABLES = ("axes", "conditions", "config")
+_MADE = ("config", "preset", "task", "metrics")
 _KEYS = (*_TEXTS, *_TABLES, "task", "preset", "scenes", "seeds", "subsets", "metrics")
 
 
@@ -368,11 +307,7 @@ def study_from_table(table: Mapping[str, Any], folder: Path = Path()) -> Study:
     for key in ("scenes", "axes"):
         if key not in table:
             raise UsageError(f"a study needs {key}")
-    plain = {
-        key: table[key]
-        for key in (*_TEXTS, "axes", "conditions", "scenes", "seeds", "subsets")
-        if key in table
-    }
+    plain = {key: table[key] for key in _KEYS if key in table and key not in _MADE}
     return Study(
         **plain,
         metrics=_metrics(table.get("metrics", [])),

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+import math
+import os
+import pickle
 import shutil
+import time
+import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
-from thesisrecon.io._files import write_json
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, unknown_word
+from thesisrecon.io._files import read_json, write_json
 from thesisrecon.io._outputs import join_claim
+from thesisrecon.runtime._executors import ProcessPool, available_threads
+from validation.ablation.changes import Setting, Source, loaded_sources
 from validation.ablation.plan import Plan, PlannedRow, plan_study
-from validation.ablation.study import FunctionTask, Study
-from validation.ablation.workers import STEPS, WORK, Job, Outcome, Store, Workers, finite, pack, workers_of
+from validation.ablation.study import FunctionTask, Place, Study
 from validation.runs.processes import run_jobs
 
 LOST = "the worker process of this row was killed or ran out of memory"
+ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
+EXECUTORS = ("local", "processes")
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Row:
-    """A finished row: its place in the study and its outcome.
-
-    ``cost_s`` is the processor time (s) of the row including shared steps.
-    """
+    """A finished row; ``cost_s`` is its processor time (s) including shared steps."""
 
     key: str
     variant: str
@@ -54,57 +62,28 @@ class Rows(Sequence[Row]):
         return len(self.rows)
 
 
-@dataclass
-class State:
-    """Number of all rows, of those that ended (in earlier runs too) and that failed, and of shared steps."""
-
-    total: int
-    done: int
-    failed: int = 0
-    steps: int = 0
-    steps_done: int = 0
-
-
-ProgressCallback = Callable[[State], None]
-"""Called with the state whenever a row or a step has ended."""
-
-
 def ablate(
     study: Study,
     out: str | Path,
     *,
     executor: str = "local",
     threads: int | None = None,
-    on_progress: ProgressCallback = lambda _: None,
+    on_progress: Callable[[str], None] = lambda _: None,
 ) -> Rows:
     """Compute the rows of a study that are not in ``out`` yet, and return all of them.
 
-    Parameters
-    ----------
-    study : the study to run.
-    out : the folder of the study. It may be used again, after a kill or for a study that has grown: rows that
-        are there under the same setting, scene, seed and versions are not computed again.
-    executor : "local" (this process) or "processes", for which a script needs ``if __name__ == "__main__":``.
-    threads : processes; as many as processors where None.
-    on_progress : called with the state after each row.
-
-    Raises
-    ------
-    UsageError : an invalid study (see :func:`plan_study`) or a folder that cannot be written. Errors of a row
-        are stored in the row.
+    ``out`` may be used again, after a kill or for a study that has grown: rows that are there under the same
+    setting, scene, seed and versions are not computed again. ``executor`` is "local" (this process) or
+    "processes", for which a script needs ``if __name__ == "__main__":``; ``threads`` is their number.
+    ``on_progress`` gets a sentence when a row or a shared step has ended. Errors of a row are stored in it.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
     with join_claim(store.path) as outputs:
         outputs.clear(store.path / WORK)
         store.prepare()
-        write_json(store.path / "study.json", _study_record(plan))
         todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
-        total = len({row.key for row in plan.rows})
-        lost: dict[str, Outcome] = {}
-        if todo:
-            with workers_of(executor, threads) as workers:
-                session = _Session(plan, store, workers, State(total, total - len(todo)), on_progress)
-                lost = session.run(list(todo.values()))
+        with _workers(executor, threads) as workers:
+            lost = _compute(plan, store, workers, list(todo.values()), on_progress)
         shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
 
@@ -124,17 +103,74 @@ def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
         cost = outcome.cpu_s + sum(s.cpu_s for s in shared)
         metrics, failure = dict(outcome.metrics), outcome.failure
         if not failure:
-            metrics, failure = finite(metrics, plan.wanted(p))
+            metrics, failure = _finite(metrics, plan.wanted(p))
         place = (p.key, p.variant, p.condition, p.scene, p.seed)
         rows.append(Row(*place, metrics, failure, outcome.seconds, cost))
     return Rows(plan, tuple(rows))
 
 
-# ---------------------------------------------------------------- shared steps
+def _finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict[str, float], str]:
+    """Return the finite numbers of ``metrics`` and a message about missing ``wanted`` ones."""
+    good = {name: value for name, value in metrics.items() if math.isfinite(value)}
+    missing = [name for name in wanted if name not in metrics]
+    broken = [f"{name} is {metrics[name]}" for name in wanted if name in metrics and name not in good]
+    absent = [f"the task returned no {', no '.join(missing)}"] if missing else []
+    return good, "; ".join([*broken, *absent])
+
+
+# ---------------------------------------------------------------- stored outcomes
 
 
 @dataclass(frozen=True)
-class _Part:
+class Outcome:
+    """Result of a row: its numbers, or the error message ``failure``; wall and processor seconds; the keys of
+    the shared ``steps`` it reused. ``lost``: the process ended before the row.
+    """
+
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    failure: str = ""
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    steps: tuple[str, ...] = ()
+    lost: bool = False
+
+
+@dataclass(frozen=True)
+class Store:
+    """The folder of a study."""
+
+    path: Path
+
+    def prepare(self) -> None:
+        """Create the folder; :class:`OutputError` if it cannot be written."""
+        try:
+            for name in (ROWS, STEPS, SHARED, WORK):
+                (self.path / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"the output folder {self.path}", error) from None
+
+    def load(self, key: str, kind: str = ROWS) -> Outcome | None:
+        """Return the outcome of this key, or None if absent or damaged."""
+        record = read_json(self.path / kind / f"{key}.json")
+        try:
+            metrics = {str(name): float(value) for name, value in record["metrics"].items()}
+            seconds, cpu_s = float(record["seconds"]), float(record["cpu_s"])
+            return Outcome(metrics, str(record["failure"]), seconds, cpu_s, tuple(record["steps"]))
+        except (TypeError, KeyError, ValueError, AttributeError):
+            return None
+
+    def save(self, key: str, outcome: Outcome, record: Mapping[str, Any], kind: str = ROWS) -> None:
+        """Store an outcome with the ``record`` of its row."""
+        # JSON has no NaN and no infinity; store them as words.
+        metrics = {k: v if math.isfinite(v) else str(v) for k, v in outcome.metrics.items()}
+        found = {**record, **asdict(outcome), "metrics": metrics}
+        write_json(self.path / kind / f"{key}.json", found, cached=True)
+
+
+# ---------------------------------------------------------------- shared steps
+
+
+class Part(NamedTuple):
     """A row or a shared step to be carried out, once the steps ``after`` have ended."""
 
     row: PlannedRow
@@ -147,104 +183,72 @@ class _Part:
         return self.key or self.row.key
 
 
-def parts_of(rows: Sequence[PlannedRow]) -> list[_Part]:
-    """Return the rows, preceded by their shared first steps.
-
-    A step is a part only if its rows differ in the next step.
+def parts_of(rows: Sequence[PlannedRow]) -> list[Part]:
+    """Return the rows, preceded by their shared first steps. A step is a part only if its rows differ in the
+    next step.
     """
-    chains = {row.key: _chain(row) for row in rows}
+    chains = {r.key: r.setting.task.steps(r.setting.config, r.scene, r.seed) for r in rows}
     users = Counter(key for chain in chains.values() for _, key in chain)
-    parts: dict[str, _Part] = {}
+    parts: dict[str, Part] = {}
     for row in rows:
         before: tuple[str, ...] = ()
         chain = chains[row.key]
         for (step, key), following in zip(chain, [*chain, None][1:], strict=True):
-            goes_on = 0 if following is None else users[following[1]]
-            if users[key] > max(1, goes_on):
-                parts.setdefault(key, _Part(row, before, step, key))
+            if users[key] > max(1, users[following[1]] if following else 0):
+                parts.setdefault(key, Part(row, before, step, key))
                 before = (*before, key)
-        parts[row.key] = _Part(row, before)
+        parts[row.key] = Part(row, before)
     return list(parts.values())
 
 
-def _chain(row: PlannedRow) -> Sequence[tuple[str, str]]:
-    """Return the steps of a row with keys, empty for a task without steps."""
-    steps = getattr(row.setting.task, "steps", None)
-    return [] if steps is None else list(steps(row.setting.config, row.scene, row.seed))
+def _compute(
+    plan: Plan,
+    store: Store,
+    workers: _Workers,
+    rows: Sequence[PlannedRow],
+    on_progress: Callable[[str], None],
+) -> dict[str, Outcome]:
+    """Carry out all rows; return the outcomes of those that were lost, which are not stored."""
+    parts = parts_of(rows)
+    ended = {p.name for p in parts if p.step and store.load(p.name, STEPS) is not None}
+    waiting = [p for p in parts if p.name not in ended]
+    packed = {p.row.key: _pack(p.row.setting) for p in waiting}
+    suspects, lost, count, total = set[str](), dict[str, Outcome](), 0, len(waiting)
 
+    def is_ready(part: Part, running: Collection[Part]) -> bool:
+        # A part whose process died runs alone, so that it is known which one kills processes.
+        alone = not suspects or (part.name in suspects and not running)
+        return alone and set(part.after) <= ended
 
-# ---------------------------------------------------------------- one call
+    def submit(part: Part) -> Future[Outcome]:
+        row = part.row
+        return workers.submit(Job(part.name, *packed[row.key], row.scene, row.seed, store.path, part.step))
 
-
-@dataclass
-class _Session:
-    """The state of one call of :func:`ablate`."""
-
-    plan: Plan
-    store: Store
-    workers: Workers
-    state: State
-    on_progress: ProgressCallback
-    suspects: set[str] = field(default_factory=set)
-    lost: dict[str, Outcome] = field(default_factory=dict)
-
-    def run(self, rows: Sequence[PlannedRow]) -> dict[str, Outcome]:
-        """Carry out all rows; return the outcomes of those that were lost, which are not stored."""
-        parts = parts_of(rows)
-        ended = {p.key for p in parts if p.step and self.store.load(p.key, STEPS) is not None}
-        waiting = [p for p in parts if p.name not in ended]
-        self.state.steps = sum(bool(p.step) for p in waiting)
-        packed = {p.row.key: pack(p.row.setting) for p in waiting}
-
-        def is_ready(part: _Part, running: Collection[_Part]) -> bool:
-            # A part whose process died runs alone, so that it is known which one kills processes.
-            alone = not self.suspects or (part.name in self.suspects and not running)
-            return alone and set(part.after) <= ended
-
-        def submit(part: _Part) -> Future[Outcome]:
-            row = part.row
-            job = Job(part.name, *packed[row.key], row.scene, row.seed, self.store.path, part.step)
-            return self.workers.submit(job)
-
-        self.on_progress(self.state)
-        for done in run_jobs(waiting, submit, is_ready, self.workers.most):
-            for part, future in done:
-                outcome = self._outcome(future)
-                if outcome.lost and part.name not in self.suspects:
-                    self.suspects.add(part.name)
-                    waiting.insert(0, part)
-                else:
-                    self.suspects.discard(part.name)
-                    ended.add(part.name)
-                    self._keep(part, outcome)
-        return self.lost
-
-    def _outcome(self, future: Future[Outcome]) -> Outcome:
-        try:
-            return future.result()
-        except BrokenProcessPool:
-            self.workers.renew(future)
-            return Outcome(failure=LOST, lost=True)
-
-    def _keep(self, part: _Part, outcome: Outcome) -> None:
-        row, state = part.row, self.state
-        if part.step:
-            state.steps_done += 1
-            record = {"step": part.step, "scene": row.scene, "seed": row.seed}
-            self.store.save(part.key, outcome, record, STEPS)
-        else:
-            outcome = replace(outcome, steps=part.after)
-            if outcome.lost:
-                self.lost[row.key] = outcome
+    for done in run_jobs(waiting, submit, is_ready, workers.most):
+        for part, future in done:
+            broken = isinstance(future.exception(), BrokenProcessPool)
+            outcome = Outcome(failure=LOST, lost=True) if broken else future.result()
+            if outcome.lost and part.name not in suspects:
+                suspects.add(part.name)
+                waiting.insert(0, part)
+                continue
+            suspects.discard(part.name)
+            ended.add(part.name)
+            if outcome.lost and not part.step:
+                lost[part.name] = outcome
             else:
-                self.store.save(row.key, outcome, _row_record(self.plan, row))
-            state.done += 1
-            state.failed += bool(outcome.failure or finite(outcome.metrics, self.plan.wanted(row))[1])
-        self.on_progress(state)
+                outcome = replace(outcome, steps=() if part.step else part.after)
+                store.save(part.name, outcome, _record(plan, part), STEPS if part.step else ROWS)
+            count += 1
+            name = f"{part.row.scene}, seed {part.row.seed}, {part.step or part.row.variant}"
+            on_progress(f"[{count}/{total}] {name}: {outcome.failure or f'{outcome.seconds:.1f} s'}")
+    return lost
 
 
-def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
-    task = row.setting.task
+def _record(plan: Plan, part: Part) -> dict[str, Any]:
+    row, task = part.row, part.row.setting.task
+    if part.step:
+        return {"step": part.step, "scene": row.scene, "seed": row.seed}
     return {
         **{name: getattr(row, name) for name in ("variant", "condition", "scene", "seed")},
         "config": tables_from_config(row.setting.config),
@@ -253,16 +257,102 @@ def _row_record(plan: Plan, row: PlannedRow) -> dict[str, Any]:
     }
 
 
-def _study_record(plan: Plan) -> dict[str, Any]:
-    """Describe the study for ``study.json``."""
-    return {
-        "title": plan.study.title,
-        "mode": plan.study.mode,
-        "baseline": plan.baseline,
-        "variants": {v.name: dict(v.levels) for v in plan.variants},
-        "conditions": {c.name: dict(c.levels) for c in plan.conditions},
-        "scenes": list(dict.fromkeys(r.scene for r in plan.rows)),
-        "seeds": list(plan.seeds),
-        "metrics": [vars(m) for m in plan.measures],
-        "versions": dict(plan.versions),
-    }
+# ---------------------------------------------------------------- workers
+
+
+class Job(NamedTuple):
+    """Input of a worker: ``setting`` as bytes; ``step`` is the shared step, empty for the row itself."""
+
+    key: str
+    setting: bytes
+    sources: tuple[Source, ...]
+    scene: str
+    seed: int
+    out: Path
+    step: str = ""
+
+
+def _pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
+    """Serialise a setting; :class:`UsageError` if impossible."""
+    try:
+        return pickle.dumps(setting), loaded_sources()
+    except Exception as error:
+        raise UsageError(f"this variant cannot be sent to a worker: {error}") from None
+
+
+def carry_out(job: Job) -> Outcome:
+    """Compute the row or the step. Errors are recorded; a full disk raises :class:`OutputError`."""
+    for source in job.sources:
+        source.install()
+    setting: Setting = pickle.loads(job.setting)
+    own = job.out / WORK / job.key
+    shutil.rmtree(own, ignore_errors=True)
+    place, given = Place(own, job.out / SHARED), (setting.config, job.scene, job.seed)
+    start, cpu = time.perf_counter(), time.process_time()
+    metrics, failure = dict[str, float](), ""
+    try:
+        own.mkdir(parents=True, exist_ok=True)
+        if job.step:
+            setting.task.prepare(*given, place, step=job.step)
+        else:
+            found = setting.task.run(*given, place)
+            metrics = {str(name): float(value) for name, value in found.items()}
+    except OutputError:
+        raise
+    except (StageFailure, UsageError) as error:
+        failure = str(error)
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in WRITE_ERRNOS:
+            raise OutputError(error.filename or own, error) from None
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}, line {last.lineno}"
+        failure = f"{type(error).__name__}: {error} ({where})"
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    shutil.rmtree(own, ignore_errors=True)
+    return Outcome(metrics, failure, seconds, cpu_s)
+
+
+@dataclass
+class _Workers:
+    """Processes (``count``), or this process if 0; they get ``most`` jobs, a spare one each."""
+
+    count: int
+    pool: ProcessPool | None = None
+
+    @property
+    def most(self) -> int:
+        return max(1, 2 * self.count)
+
+    def submit(self, job: Job) -> Future[Outcome]:
+        if not self.count:
+            future: Future[Outcome] = Future()
+            future.set_result(carry_out(job))
+            return future
+        try:
+            self.pool = self.pool or ProcessPool(self.count)
+            return self.pool.submit(carry_out, job)
+        except BrokenProcessPool:
+            # One of its processes was killed.
+            self.pool = ProcessPool(self.count)
+            return self.pool.submit(carry_out, job)
+
+
+@contextmanager
+def _workers(executor: str, threads: int | None) -> Iterator[_Workers]:
+    """Yield the workers of "local" or "processes"; :class:`UsageError` for another name or no thread."""
+    if threads is not None and threads < 1:
+        raise UsageError(f"threads must be at least 1; got {threads}")
+    if executor not in EXECUTORS:
+        raise UsageError(unknown_word("executor", executor, EXECUTORS))
+    workers = _Workers(0 if executor == "local" else threads or available_threads())
+    if workers.count:
+        for name in ONE_THREAD:
+            # One process per core: NumPy's own threads would compete for them.
+            os.environ.setdefault(name, "1")
+    try:
+        yield workers
+        if workers.pool is not None:
+            workers.pool.shutdown(wait=True)
+    finally:
+        if workers.pool is not None:
+            workers.pool.abandon()

@@ -1,12 +1,12 @@
 """Statistics of paired differences: intervals, p-values and effect sizes.
 
-What is sampled decides what an interval says. Where the seed draws the data (noise, points, cameras), the
-draws are the sample and the interval is one for these very scenes. Elsewhere the seed moves only random steps
-of a method, and the scenes are the sample: a scene counts once, by the mean over its subsets and seeds.
+Where the seed draws the data (noise, points, cameras), the draws are the sample and the interval is one for
+these very scenes. Elsewhere the scenes are the sample: a scene counts once, by the mean over its subsets and
+seeds.
 
 Few values use Student's interval. From :data:`STUDENTISED_FROM` on it is the symmetric studentised bootstrap
-(Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5): |t| of resamples replaces Student's quantile, which
-keeps the level for skewed differences. Scenes are resampled first, then the subsets inside them.
+(Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5), which keeps the level for skewed differences. Scenes
+are resampled first, then the subsets inside them.
 """
 
 from __future__ import annotations
@@ -22,22 +22,18 @@ from scipy import stats
 from thesisrecon.arrays import F64
 
 Sample = Literal["draws", "scenes"]
-
-STUDENTISED_FROM = 12
-"""With fewer values too many resamples have almost no spread."""
-MIN_SCENES = 3
-"""Fewer scenes are no sample of scenes."""
+STUDENTISED_FROM = 12  # With fewer values too many resamples have almost no spread
+MIN_SCENES = 3  # Fewer scenes are no sample of scenes
 RESAMPLES = 4999
 
 
 @dataclass(frozen=True)
 class Interval:
     """The mean of paired differences, its 95 % interval and two-sided p, and the effect size: the mean over
-    the standard deviation of a sampled value, with Hedges' correction for few.
-
-    ``count`` values of ``sample`` ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts
-    the differences. All but the mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES``
-    scenes, or draws that change nothing.
+    the standard deviation of a sampled value, with Hedges' correction for few. ``count`` values of ``sample``
+    ("draws" of these very scenes, or "scenes") are behind it, ``pairs`` counts the differences. All but the
+    mean are NaN where there is no sample: one value, fewer than ``MIN_SCENES`` scenes, or draws that change
+    nothing.
     """
 
     mean: float
@@ -51,11 +47,9 @@ class Interval:
 
 
 def paired_interval(groups: Sequence[F64], sample: Sample, *, level: float = 0.95) -> Interval:
-    """Return the interval of the mean of paired differences, grouped by scene.
-
-    All scenes have equal weight, however many differences they have. Draws are a stratified sample, with the
-    degrees of freedom of Welch and Satterthwaite. Resampling is deterministic. Raises ``ValueError`` for a
-    difference that is not finite.
+    """Return the interval of the mean of paired differences, grouped by scene. All scenes have equal weight,
+    however many differences they have. Draws are a stratified sample, with the degrees of freedom of Welch
+    and Satterthwaite. Resampling is deterministic. Raises ``ValueError`` for a difference that is not finite.
     """
     groups = [np.asarray(g, dtype=np.float64) for g in groups if len(g)]
     if any(not np.isfinite(g).all() for g in groups):
@@ -148,12 +142,6 @@ def holm(p: Sequence[float]) -> list[float]:
         largest = max(largest, min(1.0, (len(order) - rank) * values[k]))
         adjusted[k] = largest
     return [float(v) for v in adjusted]
-
-
-def mean_ranks(blocks: F64) -> F64:
-    """Mean rank (V,) of each column of (B, V), 1 the least of its row; ties share ranks, NaN come last."""
-    filled = np.where(np.isnan(blocks), np.inf, blocks)
-    return np.asarray(stats.rankdata(filled, axis=1).mean(axis=0))
 
 
 def on_front(cost: F64, loss: F64) -> NDArray[np.bool_]:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import UsageError, unknown_word
 from validation.ablation.statistics import Sample
 
 Mode = Literal["one-at-a-time", "grid", "ladder"]
@@ -21,10 +21,9 @@ Axis = Sequence[Any] | Mapping[str, Changes]
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that rows report.
-
-    ``better`` is "less" or "more". With ``ratio`` values are compared by quotients, for errors of different
-    magnitude above zero; a quotient within ``negligible`` of 1 is called negligible.
+    """A number that rows report. ``better`` is "less" or "more". With ``ratio`` values are compared by
+    quotients, for errors of different magnitude above zero; a quotient within ``negligible`` of 1 is called
+    negligible.
     """
 
     name: str
@@ -35,21 +34,18 @@ class Measure:
     negligible: float = 0.005
 
 
-class Task(Protocol):
-    """Work of a row: a frozen dataclass whose fields are the parameters ``task.…``.
-
-    ``measures`` are its numbers. ``check`` raises ``UsageError`` for an unknown or missing scene;
-    ``scene_key`` identifies the content of a scene; ``unavailable`` names the measures that a scene cannot
-    have. ``run`` works with a random seed in an empty folder ``place``, which is removed afterwards, and
-    returns numbers by measure name. ``StageFailure`` means that the data could not be processed.
-
-    A task whose first steps may be shared by many rows also has ``steps(config, scene, seed)``, which names
-    the steps in order with a key each (equal keys mean equal results), and ``prepare(config, scene, seed,
-    place, *, step)``, which runs a row up to and including that step and stores the result in
+class Task:
+    """Work of a row: a frozen dataclass whose fields are the parameters ``task.…``. ``measures`` are its
+    numbers. ``check`` raises ``UsageError`` for a scene that is not one of ``scenes`` or is missing;
+    ``scene_key`` identifies its content; ``unavailable`` names the measures that it cannot have. ``run``
+    works with a random seed in an empty folder ``place``, which is removed afterwards, and returns numbers by
+    measure name. ``steps`` names the first steps that rows may share, in order, with a key each (equal keys
+    mean equal results); ``prepare`` runs a row up to and including a step and stores the result in
     ``place.shared``.
     """
 
-    measures: ClassVar[Sequence[Measure]]
+    measures: ClassVar[Sequence[Measure]] = ()
+    scenes: ClassVar[Sequence[str]] = ()
     sample: ClassVar[Sample] = "scenes"
     """What is sampled: "draws" if the seed draws the data (noise, points, cameras), else the scenes."""
 
@@ -61,7 +57,9 @@ class Task(Protocol):
         """Names of subsets of a scene, which ``run`` accepts as scenes."""
         raise UsageError(f"the task {type(self).__name__} has no subsets of scenes; leave subsets out")
 
-    def check(self, scene: str) -> None: ...
+    def check(self, scene: str) -> None:
+        if self.scenes and scene not in self.scenes:
+            raise UsageError(unknown_word("scene", scene, self.scenes))
 
     def scene_key(self, scene: str) -> str:
         return scene
@@ -69,11 +67,16 @@ class Task(Protocol):
     def unavailable(self, scene: str) -> Collection[str]:
         return ()
 
-    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]: ...
+    def steps(self, config: PipelineConfig, scene: str, seed: int) -> Sequence[tuple[str, str]]:
+        return ()
+
+    def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None: ...
+
+    def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
+        raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Folders of a row: ``own`` is empty at the beginning, ``shared`` is common to all rows."""
 
     own: Path
@@ -88,9 +91,6 @@ class FunctionTask(Task):
     """A task of a plain ``function(config, scene, seed)`` that returns numbers by name."""
 
     function: TaskFunction
-    measures: ClassVar[Sequence[Measure]] = ()
-
-    def check(self, scene: str) -> None: ...
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         return self.function(config, scene, seed)
@@ -98,28 +98,17 @@ class FunctionTask(Task):
 
 @dataclass(frozen=True)
 class Study:
-    """A question to the library and its experimental design.
-
-    Parameters
-    ----------
-    axes : compared settings: dotted path -> values, or any name -> {level -> changes}. A path begins with a
-        stage of :class:`PipelineConfig` or with ``task``. A value is a number, a word (the kind of a variant,
-        or ``file.py:Class`` for one of your own), a table (``kind`` and fields; ``preset`` for what that
-        preset has there), or the object itself.
-    scenes : the names of the scenes; a task may also take folders.
-    seeds : of the random steps, or how many (then 0, 1, ...); a sample only where the task draws its data.
-    subsets : how many subsets of the images of each scene are run in addition to the whole scene.
-    conditions : axes that are not compared, such as the noise of all variants.
-    mode : "one-at-a-time" changes one setting of the start at a time, "ladder" keeps each change and adds the
-        next, "grid" takes every combination.
-    baseline : the name of the variant that the others are compared with; the first where empty.
-    start : the name of the unchanged configuration in the modes that begin with it.
-    metrics : the task's numbers to analyse, all if empty. A plain function as a task lists its numbers here.
-    title, words : the heading of the page and a sentence below it.
-    folder : the folder of files that values name.
-    task : what a row runs, a :class:`Task` or a function (config, scene, seed) -> {metric: number}; the
-        reconstruction of images if None.
-    config : the configuration to change.
+    """A question to the library and its experimental design. ``axes``: compared settings, dotted path ->
+    values, or any name -> {level -> changes}. A path begins with a stage of :class:`PipelineConfig` or with
+    ``task``. A value is a number, a word (a kind, or ``file.py:Class`` for one of your own), a table
+    (``kind`` and fields; ``preset`` for what that preset has there), or the object itself. ``conditions``:
+    axes that are not compared. ``scenes``: names, or folders if the task takes them. ``seeds``: of the random
+    steps, or how many. ``subsets``: how many of each scene are run in addition. ``mode``: "one-at-a-time",
+    "ladder" (each change is kept) or "grid" (all combinations). ``baseline``: name of the variant that the
+    others are compared with; the first if empty. ``start``: name of the unchanged configuration. ``metrics``:
+    the numbers to analyse, all if empty; a function as a task lists its numbers here. ``task``: a
+    :class:`Task` or a function (config, scene, seed) -> {metric: number}; the reconstruction of images if
+    None. ``folder``: of the files that values name.
     """
 
     axes: Mapping[str, Axis]
@@ -136,7 +125,6 @@ class Study:
     title: str = "Ablation"
     words: str = ""
     folder: Path = Path()
-    """Folder of files named in values."""
 
 
 SHARE = 2 / 3

@@ -1,34 +1,32 @@
-"""Errors of cameras against the truth, and of points against their observations."""
+"""Errors of cameras against the truth, of points against observations, and in stated standard deviations."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import project_camera
 from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
-from thesisrecon.records import Reconstruction
+from thesisrecon.optimize.bundle.covariance import gauge_directions
+from thesisrecon.records import MetricResult, Reconstruction
 
-
-@dataclass(frozen=True)
-class TrueCameras:
-    """The truth: ``K, R`` (V, 3, 3), R world-to-camera, and centres ``C`` (V, 3) in some unit of length."""
-
-    K: F64
-    R: F64
-    C: F64
+TrueCameras = tuple[F64, F64, F64]
+"""K, R (V, 3, 3), R world-to-camera, and centres C (V, 3) in some unit of length."""
 
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Errors of the registered cameras; None if they are too few to be aligned.
-
-    ``focal_error_pct``: median over views of |f / f_true - 1|, f the geometric mean of fx and fy.
-    ``principal_point_error_px``: median distance. ``centre_error``: mean distance after the least-squares
-    similarity, in the truth's unit. ``rotation_error_deg``: median angle after the common rotation is off.
+    """Errors of the registered cameras: the median over views of |f / f_true - 1|, f the geometric mean of fx
+    and fy; median distance of principal points; mean distance of centres after the least-squares similarity,
+    in the truth's unit, None if they are too few; median angle after the common rotation is off.
     """
 
     focal_error_pct: float
@@ -42,8 +40,7 @@ class CameraErrors:
         return None if self.centre_error is None else 1000.0 * self.centre_error
 
 
-@dataclass(frozen=True)
-class Reprojection:
+class Reprojection(NamedTuple):
     """Distances of inlier observations from their projected points, recomputed from cameras and points."""
 
     median_px: float
@@ -57,19 +54,22 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     views = np.flatnonzero(reconstruction.registered)
     if reconstruction.stratum != "metric" or reconstruction.K is None or len(views) == 0:
         raise ValueError("measure_cameras needs a metric reconstruction with at least one registered camera")
-    if len(truth.K) != len(reconstruction.P):
-        counts = f"{len(truth.K)} for {len(reconstruction.P)}"
+    if len(truth[0]) != len(reconstruction.P):
+        counts = f"{len(truth[0])} for {len(reconstruction.P)}"
         raise ValueError(f"measure_cameras needs one truth per view; got {counts}")
-    K, K_true = reconstruction.K[views], truth.K[views]
+    K, (K_true, R_true, C_true) = reconstruction.K[views], (part[views] for part in truth)
     focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1] / (K_true[:, 0, 0] * K_true[:, 1, 1]))
     principal_point = np.linalg.norm(K[:, :2, 2] - K_true[:, :2, 2], axis=1)
-    R, centres = _poses(reconstruction)
-    return CameraErrors(
-        focal_error_pct=100.0 * float(np.median(np.abs(focal - 1.0))),
-        principal_point_error_px=float(np.median(principal_point)),
-        centre_error=_centre_error(centres, truth.C[views]),
-        rotation_error_deg=float(np.median(rotation_errors_deg(R, truth.R[views]))),
-    )
+    R, _ = _rotations_translations(reconstruction)
+    try:
+        centres = dehomogenize(camera_centre(reconstruction.P[views]))
+        moved = estimate_similarity(centres, C_true).apply(centres)
+        centre_error = float(np.mean(np.linalg.norm(moved - C_true, axis=1)))
+    except ValueError:
+        centre_error = None
+    turn = float(np.median(rotation_errors_deg(R, R_true)))
+    focal_pct = 100.0 * float(np.median(np.abs(focal - 1.0)))
+    return CameraErrors(focal_pct, float(np.median(principal_point)), centre_error, turn)
 
 
 def relative_centre_error(errors: CameraErrors, C: F64) -> float:
@@ -106,15 +106,69 @@ def _rotations_translations(reconstruction: Reconstruction) -> tuple[F64, F64]:
     return pose[:, :, :3], pose[:, :, 3]
 
 
-def _poses(reconstruction: Reconstruction) -> tuple[F64, F64]:
-    R, _ = _rotations_translations(reconstruction)
-    centres = camera_centre(reconstruction.P[reconstruction.registered])
-    return R, centres[:, :3] / centres[:, 3:]
+NAMES = ("focal_px", "principal_x_px", "principal_y_px")
+LEVEL = 1.96  # Half width of a 95 % interval in standard deviations
 
 
-def _centre_error(centres: F64, true_centres: F64) -> float | None:
-    try:
-        similarity = estimate_similarity(centres, true_centres)
-    except ValueError:
-        return None
-    return float(np.mean(np.linalg.norm(similarity.apply(centres) - true_centres, axis=1)))
+def interval_scores(metric: MetricResult, K: F64) -> F64:
+    """Stated intervals against the true K (V, 3, 3), whose focal length is the geometric mean of fx and fy:
+    (V, 4) errors of :data:`NAMES` in their standard deviations, or NaN, and the relative one of the focal
+    length.
+    """
+    truth = np.column_stack([np.sqrt(K[:, 0, 0] * K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]])
+    found = np.full((len(K), 4), np.nan)
+    for view, intervals in enumerate(metric.intrinsics):
+        for column, name in enumerate(NAMES):
+            interval = intervals.get(name)
+            if interval is not None and interval.std > 0.0:
+                found[view, column] = (interval.value - truth[view, column]) / interval.std
+        if "focal_px" in intervals:
+            found[view, 3] = intervals["focal_px"].std / intervals["focal_px"].value
+    return found
+
+
+def pose_scores(metric: MetricResult, R: F64, C: F64) -> F64:
+    """Errors (V, 6) of rotations and centres in stated standard deviations; NaN where not registered. The
+    true poses R (V, 3, 3), C (V, 3) are first moved by the similarity that aligns them best.
+    """
+    model = metric.reconstruction
+    assert model.K is not None
+    assert metric.pose_std is not None
+    views = np.flatnonzero(model.registered)
+    Rt = np.linalg.solve(model.K[views], model.P[views])
+    X = model.X[model.valid]
+    origin, scale = scene_frame(X[:, :3] / X[:, 3:])
+    found, t = Rt[:, :, :3], scale * (Rt[:, :, 3] + Rt[:, :, :3] @ origin)
+    centres = -np.einsum("vba,vb->va", found, t)
+    U, _, Vt = np.linalg.svd(np.einsum("vab,vac->bc", R[views], found))
+    Q = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    true = C[views] @ Q
+    true = true - true.mean(axis=0)
+    middle = centres.mean(axis=0)
+    true = middle + true * (np.sum(true * (centres - middle)) / np.sum(true**2))
+    turned = Rotation.from_matrix(R[views] @ Q @ np.swapaxes(found, 1, 2)).as_rotvec()
+    shift = -np.einsum("vab,vb->va", found, true - centres)
+    error = np.concatenate([turned, shift], axis=1)
+    N = gauge_directions(np.asarray(found, dtype=np.float64), t)
+    error -= (N @ (N.T @ error.ravel())).reshape(error.shape)
+    error[:, 3:] = -np.einsum("vba,vb->va", found, error[:, 3:]) / scale
+    z = np.full((len(model.registered), 6), np.nan)
+    z[views] = error / metric.pose_std[views]
+    return z
+
+
+def holding_std(scores: Sequence[F64]) -> float:
+    """Standard deviation of the share of intervals that hold the truth, from the errors of each scene: the
+    cameras of one scene err together, so that it is scenes that count (Cochran 1977, ratio of clusters).
+    """
+    held = [np.abs(z[np.isfinite(z)]) <= LEVEL for z in scores]
+    total, share, n = sum(map(len, held)), float(np.mean(np.concatenate(held))), len(scores)
+    deviations = np.array([h.sum() - share * len(h) for h in held])
+    return float(np.sqrt(np.sum(deviations**2) * n / max(n - 1, 1))) / max(total, 1)
+
+
+def focal_errors_pct(K: F64, K_true: F64) -> F64:
+    """|f / f_true - 1| (V,) in percent, f the geometric mean of fx and fy; NaN where K is zero."""
+    f = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    truth = np.sqrt(K_true[:, 0, 0] * K_true[:, 1, 1])
+    return np.where(f > 0, 100.0 * np.abs(f / truth - 1.0), np.nan)

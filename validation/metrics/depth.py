@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,12 +13,10 @@ from thesisrecon.records import DepthMap, DisparityMap, Reconstruction, Similari
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.stereo import StereoPair
 
-SAME = 0.01
-"""Maximum relative depth error of a correct depth, and between views of the same point."""
+SAME = 0.01  # Maximum relative depth error of a correct depth, and between views of the same point
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """Relative ``error`` (N,) of known depths, and in ``deviations``; shares ``known`` and ``right``."""
 
     error: F64
@@ -27,33 +25,25 @@ class Judged:
     right: float
 
 
-@dataclass(frozen=True)
-class JudgedMaps:
-    """Scores of all maps: median error, mean shares, worst share right, median of ``deviations``."""
-
-    median: float
-    right: float
-    worst: float
-    known: float
-    right_of_known: float
-    deviations: float
+Scores = dict[str, float]
+"""Numbers of all maps of a scene by their names in the report, shares in per cent."""
 
 
-def together(judged: Sequence[Judged]) -> JudgedMaps:
+def together(judged: Sequence[Judged]) -> Scores:
     """Combine the scores of the maps of a scene; ``ValueError`` without maps."""
     if not judged:
         raise ValueError("there is no depth map to judge")
-    error = np.concatenate([one.error for one in judged])
+    error, right = np.concatenate([one.error for one in judged]), [one.right for one in judged]
     # Median absolute value of a standard normal variable.
     off = [float(np.median(one.deviations)) / 0.6745 for one in judged if len(one.deviations)]
-    return JudgedMaps(
-        float(np.median(error)) if len(error) else float("nan"),
-        float(np.mean([one.right for one in judged])),
-        min(one.right for one in judged),
-        float(np.mean([one.known for one in judged])),
-        float(np.mean(error < SAME)) if len(error) else 0.0,
-        float(np.median(off)) if off else float("nan"),
-    )
+    return {
+        "depth error, median": 100.0 * float(np.median(error)) if len(error) else float("nan"),
+        "within 1 %": 100.0 * float(np.mean(right)),
+        "within 1 %, worst view": 100.0 * min(right),
+        "known": 100.0 * float(np.mean([one.known for one in judged])),
+        "within 1 % of the known": 100.0 * float(np.mean(error < SAME)) if len(error) else 0.0,
+        "error in deviations": float(np.median(off)) if off else float("nan"),
+    }
 
 
 TrueDepth = tuple[F64, int, B8]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -22,10 +22,8 @@ from thesisrecon.records import FundamentalFit
 
 
 def _degrees_of_freedom(fit: FundamentalFit) -> float:
-    """Number of inliers minus the seven parameters of F, at least 1.
-
-    With few degrees of freedom intervals need Student's and Fisher's quantiles: for 30 matches normal
-    quantiles contain the truth in 93.6 % (epipoles 92.7 %) instead of 95 %.
+    """Number of inliers minus the seven parameters of F, at least 1: with few, intervals need the quantiles
+    of Student and Fisher.
     """
     return max(float(np.sum(fit.inliers)) - 7, 1.0)
 
@@ -47,8 +45,7 @@ def epipolar_distance_interval(fit: FundamentalFit, xy1: F64, xy2: F64) -> F64:
     return _student_95(_degrees_of_freedom(fit)) * std
 
 
-@dataclass(frozen=True)
-class Epipole:
+class Epipole(NamedTuple):
     """Unit ``direction`` (3,) of an epipole and its ``covariance`` (3, 3) of rank 2, first order."""
 
     direction: F64
@@ -62,11 +59,8 @@ class Epipole:
         return bool(np.sum(z**2 / values[1:]) <= _ellipse_95(self.degrees_of_freedom))
 
     def contains_xy(self, xy: F64) -> NDArray[np.bool_]:
-        """Return (2,) whether x and y, px, lie in their 95 % intervals (Fieller, J. R. Stat. Soc. B 16,
-        1954).
-
-        The interval of x holds all x for which e1 - x e3 is within Student's quantile of 0. It may run
-        through infinity.
+        """Return (2,) whether x and y, px, lie in their 95 % intervals, which may run through infinity: all x
+        with e1 - x e3 within Student's quantile of 0 (Fieller, J. R. Stat. Soc. B 16, 1954).
         """
         e, C = self.direction, self.covariance
         variance = np.diag(C)[:2] - 2.0 * xy * C[:2, 2] + xy**2 * C[2, 2]
@@ -75,9 +69,8 @@ class Epipole:
 
 
 def epipoles_of(fit: FundamentalFit) -> tuple[Epipole, Epipole]:
-    """Return the epipoles of both images with their covariances.
-
-    F e1 = 0 gives de1 = -F^+ dF e1, and likewise e2 with F'.
+    """Return the epipoles of both images with their covariances. F e1 = 0 gives de1 = -F^+ dF e1, and
+    likewise e2 with F'.
     """
     e1, e2 = epipoles(fit.F)
     inverse, nu = np.linalg.pinv(fit.F, rcond=1e-12), _degrees_of_freedom(fit)
@@ -86,8 +79,7 @@ def epipoles_of(fit: FundamentalFit) -> tuple[Epipole, Epipole]:
     return Epipole(e1, D1 @ fit.covariance @ D1.T, nu), Epipole(e2, D2 @ fit.covariance @ D2.T, nu)
 
 
-@dataclass(frozen=True)
-class PrecisionBound:
+class PrecisionBound(NamedTuple):
     """Least ``covariance`` (9, 9) of the true unit ``F``, and the RMS epipolar distance it implies."""
 
     F: F64
@@ -96,12 +88,9 @@ class PrecisionBound:
 
 
 def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> PrecisionBound:
-    """Return the KCR (Cramer-Rao) lower bound of the covariance of F for known cameras (3, 4) and at least 8
-    points X (N, 3), every coordinate with Gaussian noise of ``sigma_px`` (Kanatani, Statistical Optimization
-    for Geometric Computation, 1996).
-
-    sigma^2 B (J'J)^-1 B' with J the derivatives of the distances to the manifold of exact matches, at the
-    truth. Raises ``ValueError`` if the camera centres coincide.
+    """Return the KCR (Cramer-Rao) lower bound of the covariance of F for known cameras and at least 8 points,
+    coordinates with noise of ``sigma_px`` (Kanatani, Statistical Optimization for Geometric Computation,
+    1996): sigma^2 B (J'J)^-1 B' with J the derivatives of the distances to the manifold of exact matches.
     """
     F = fundamental_from_cameras(P1, P2)
     xy1, xy2 = check_matches(project(P1, X), project(P2, X), needed=8)
@@ -115,16 +104,13 @@ def fundamental_bound(P1: F64, P2: F64, X: F64, *, sigma_px: float) -> Precision
     return PrecisionBound(F, covariance, float(np.sqrt(0.5 * np.mean(forth**2 + back**2))))
 
 
-NONE_PX = 99.0
-"""Error of a missing F, and the maximum reported error."""
-RIGHT_PX = 1.0
-"""An F with a smaller error is right."""
+NONE_PX = 99.0  # Error of a missing F, and the maximum reported error
+RIGHT_PX = 1.0  # An F with a smaller error is right
 
 
 def rms_epipolar_distance(F: F64 | None, truth: F64) -> float:
-    """RMS distance, px, of right correspondences (M, 4) to their epipolar lines over both images (5.6).
-
-    At most ``NONE_PX``, which stands for no F too: None, zeros or numbers that are not finite.
+    """RMS distance, px, of right correspondences (M, 4) to their epipolar lines over both images (5.6). At
+    most ``NONE_PX``, which stands for no F too: None, zeros or numbers that are not finite.
     """
     if F is None or not (np.isfinite(F).all() and F.any()):
         return NONE_PX

@@ -1,13 +1,11 @@
 """Bundle adjustment and covariances by Ceres through pycolmap: the same problem, start and loss as ours.
 
-COLMAP's pixels have their origin at the corner of the first one, ours in its centre; its poses are
-world-to-camera as ours; views, rows of intrinsics and points count from 1 in it.
+COLMAP's pixels have their origin at the corner of the first one; its poses are world-to-camera as ours.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,24 +25,17 @@ def colmap_model(
     """A COLMAP model with SIMPLE_RADIAL cameras; views, rows of intrinsics and points count from 1 in it."""
     model = pycolmap.Reconstruction()
     for g, (f, _, _, cx, cy, k1) in enumerate(cameras.intrinsics):
+        params, (width, height) = [f, cx + 0.5, cy + 0.5, k1], size
         camera = pycolmap.Camera(
-            model="SIMPLE_RADIAL",
-            width=size[0],
-            height=size[1],
-            params=[f, cx + 0.5, cy + 0.5, k1],
-            camera_id=g + 1,
+            model="SIMPLE_RADIAL", width=width, height=height, params=params, camera_id=g + 1
         )
         model.add_camera_with_trivial_rig(camera)
     order = np.lexsort((seen.point_index, seen.view_index))
     view, point, xy = seen.view_index[order], seen.point_index[order], seen.xy[order] + 0.5
     first = np.searchsorted(view, np.arange(len(cameras.R) + 1))
     for v in range(len(cameras.R)):
-        image = pycolmap.Image(
-            name=f"{v}.png",
-            keypoints=xy[first[v] : first[v + 1]],
-            camera_id=int(cameras.group[v]) + 1,
-            image_id=v + 1,
-        )
+        keypoints, camera_id = xy[first[v] : first[v + 1]], int(cameras.group[v]) + 1
+        image = pycolmap.Image(name=f"{v}.png", keypoints=keypoints, camera_id=camera_id, image_id=v + 1)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(cameras.R[v]), cameras.t[v])
         model.add_image_with_trivial_frame(image, pose)
     place = np.arange(len(view)) - first[view]
@@ -71,8 +62,7 @@ def cameras_from_colmap(model: pycolmap.Reconstruction, like: MetricCameras) -> 
     return MetricCameras(R, t, np.array(rows), like.group, like.shared), X
 
 
-@dataclass(frozen=True)
-class CeresOptions:
+class CeresOptions(NamedTuple):
     """Huber's loss turns at ``loss_px``; ``function_tolerance`` 0 is COLMAP's default, 1e-6 Ceres'."""
 
     loss_px: float = np.inf
@@ -129,11 +119,10 @@ def bundle_adjuster(model: pycolmap.Reconstruction, options: CeresOptions) -> py
 def ceres_covariances(
     cameras: MetricCameras, X: F64, seen: Observations, size: tuple[int, int]
 ) -> tuple[F64, F64]:
-    """Covariances (V, 6, 6) of poses and (4, 4) of (f, cx, cy, k1) for noise of 1 px, by COLMAP.
-
-    One camera. Poses as ours: (w, d) of x -> exp(w) x + d, in the inner gauge. COLMAP's own coordinates are
-    half the angle (Ceres' quaternions) and a translation that the rotation leaves alone; it fixes the first
-    pose and the largest coordinate of the translation to the second.
+    """Covariances (V, 6, 6) of poses and (4, 4) of (f, cx, cy, k1) for noise of 1 px, by COLMAP. One camera.
+    Poses as ours: (w, d) of x -> exp(w) x + d, in the inner gauge. COLMAP's own coordinates are half the
+    angle (Ceres' quaternions) and a translation that the rotation leaves alone; it fixes the first pose and
+    the largest coordinate of the translation to the second.
     """
     model = colmap_model(cameras, X, seen, size)
     adjuster = bundle_adjuster(model, CeresOptions(principal_point=True, function_tolerance=0.0))
@@ -151,9 +140,10 @@ def ceres_covariances(
     joint = np.zeros((V, 6, V, 6))
     for a in range(1, V):
         for b in range(1, V):
+            same = a == b
             C = (
                 found.get_cam_cov_from_world(a + 1)
-                if a == b
+                if same
                 else found.get_cam_cross_cov_from_world(a + 1, b + 1)
             )
             J, K = ours_from_theirs[a][:, moving[a]], ours_from_theirs[b][:, moving[b]]

@@ -1,8 +1,8 @@
 """COLMAP from images to cameras: ``python -m validation.references.colmap IMAGES OUT``.
 
-SIFT, exhaustive matching and mapping (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024). Prior-free:
-EXIF focal lengths are replaced by COLMAP's default, 1.2 times the long side, and refined. Models come back in
-our types and pixels.
+SIFT, exhaustive matching and mapping (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024) without
+priors: EXIF focal lengths are replaced by COLMAP's default, 1.2 times the long side. Models come back in our
+types.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ import argparse
 import json
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,12 +26,10 @@ from validation.references.libraries import pycolmap
 
 
 def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
-    """Read a COLMAP model as a metric reconstruction in the pixels of its images.
-
-    ``names`` number the views; those without an image are not registered. All points are valid and all
-    observations inliers. ``sigma_px`` is 1.4826 times the median absolute coordinate residual. UsageError
-    for missing or damaged files and for cameras other than pinholes with three radial coefficients,
-    ``ValueError`` for an image not in ``names``.
+    """Read a COLMAP model as a metric reconstruction in the pixels of its images, which ``names`` number. All
+    points are valid and all observations inliers. ``sigma_px`` is 1.4826 times the median absolute coordinate
+    residual. UsageError for missing or damaged files and for other cameras than pinholes with three radial
+    coefficients.
     """
     model = read_model(folder)
     unknown = sorted(set(model.names) - set(names))
@@ -57,20 +54,12 @@ def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
     residual = residual[np.isfinite(residual)]
     order = np.lexsort((index[model.view_index], model.point_index))
     view_index, point_index = index[model.view_index][order], model.point_index[order]
-    return Reconstruction(
-        stratum="metric",
-        P=P,
-        X=np.column_stack([model.X, np.ones(N)]),
-        registered=registered,
-        valid=np.ones(N, dtype=np.bool_),
-        inlier=np.ones(len(order), dtype=np.bool_),
-        tracks=Tracks(view_index, point_index, model.xy[order], V, N),
-        sizes=sizes,
-        sigma_px=1.4826 * float(np.median(residual)) if len(residual) else 0.0,
-        reasons=tuple("" if there else "not in the COLMAP model" for there in registered),
-        K=K,
-        distortion=distortion,
-    )
+    sigma_px = 1.4826 * float(np.median(residual)) if len(residual) else 0.0
+    reasons = tuple("" if there else "not in the COLMAP model" for there in registered)
+    tracks, X = Tracks(view_index, point_index, model.xy[order], V, N), np.column_stack([model.X, np.ones(N)])
+    valid, inlier = np.ones(N, dtype=np.bool_), np.ones(len(order), dtype=np.bool_)
+    given = (P, X, registered, valid, inlier, tracks, sizes, sigma_px, reasons)
+    return Reconstruction("metric", *given, K=K, distortion=distortion)
 
 
 def match_with_pycolmap(
@@ -119,15 +108,6 @@ def _guess_focals(database: Path) -> None:
     store.close()
 
 
-@dataclass(frozen=True)
-class ReferenceRun:
-    """``names[i]`` is view i of the largest model; ``seconds`` of "extract", "match" and "map"."""
-
-    names: tuple[str, ...]
-    reconstruction: Reconstruction
-    seconds: Mapping[str, float]
-
-
 def map_with_pycolmap(
     images: Path,
     out: Path,
@@ -137,10 +117,8 @@ def map_with_pycolmap(
     threads: int = 2,
     mapper: Literal["incremental", "global"] = "incremental",
 ) -> None:
-    """Map the matches of ``match_with_pycolmap`` in ``out``, or in ``matched``, for :func:`read_run`.
-
-    The global mapper (GLOMAP) refines what it refines by default. The models are not read: that is our work,
-    which would count as COLMAP's. Raises :class:`StageFailure` if COLMAP makes no model.
+    """Map the matches of ``match_with_pycolmap`` in ``out``, or in ``matched``, for :func:`read_run`. The
+    models are not read: that would count as COLMAP's work. :class:`StageFailure` if there is no model.
     """
     if matched is not None:
         if not (matched / "seconds.json").is_file():
@@ -164,12 +142,14 @@ def map_with_pycolmap(
     _model_folders(out)
 
 
-def read_run(images: Path, out: Path) -> ReferenceRun:
-    """Return the mapping in ``out``; :class:`StageFailure` without a model."""
-    names = tuple(sorted(path.name for path in images.iterdir() if path.is_file()))
+def read_run(images: Path, out: Path) -> tuple[Reconstruction, dict[str, float]]:
+    """Return the largest model in ``out``, its views in the order of the images, and the seconds of
+    "extract", "match" and "map"; :class:`StageFailure` without a model.
+    """
+    names = sorted(path.name for path in images.iterdir() if path.is_file())
     models = [read_colmap_model(path, names) for path in _model_folders(out)]
-    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    return ReferenceRun(names, max(models, key=lambda model: model.registered.sum()), seconds)
+    seconds: dict[str, float] = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
+    return max(models, key=lambda model: model.registered.sum()), seconds
 
 
 def _model_folders(out: Path) -> list[Path]:
@@ -180,16 +160,11 @@ def _model_folders(out: Path) -> list[Path]:
 
 
 def reconstruct_with_pycolmap(
-    images: Path,
-    out: Path,
-    *,
-    refine_principal_point: bool = False,
-    threads: int = 2,
-    pairs: Path | None = None,
+    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None, **options: Any
 ) -> None:
     """Match (all pairs or a list) and map a folder of images on the CPU; ``out`` is emptied first."""
     match_with_pycolmap(images, out, threads=threads, pairs=pairs)
-    map_with_pycolmap(images, out, refine_principal_point=refine_principal_point, threads=threads)
+    map_with_pycolmap(images, out, threads=threads, **options)
 
 
 def main() -> None:

@@ -1,13 +1,11 @@
-"""F of matches by OpenCV, COLMAP and PoseLib and by ours, with one signature.
+"""F and triangulation by OpenCV, COLMAP and PoseLib and by ours, each with one signature.
 
-Every method is given the matches in an order that the seed draws: OpenCV's generators start from a fixed
-state, so only the order makes its runs differ. Libraries with a seed get it too.
+Every method gets the matches in an order that the seed draws: OpenCV's generators start from a fixed state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,25 +17,14 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 from validation.references.libraries import cv2, poselib, pycolmap
 
 BoolArray = NDArray[np.bool_]
 Answer = tuple[Any, Any]
-
 OURS, THESIS = "ours", "ours (thesis)"
 LINEAR, MINIMAL = "ours (eight points)", "ours (seven points)"
-CONFIDENCE, ITERATIONS = 0.9999, 20000
-"""Settings of OpenCV instead of its defaults (0.99 and 1000)."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """``F`` (3, 3), None if the method gave none, ``inliers`` (N,) as the method reports them."""
-
-    F: F64 | None
-    inliers: BoolArray
-
-
+CONFIDENCE, ITERATIONS = 0.9999, 20000  # Settings of OpenCV instead of its defaults (0.99 and 1000)
 Solver = Callable[[F64, F64, float, int], Answer]
 
 
@@ -85,12 +72,6 @@ def opencv_eight_point(xy1: F64, xy2: F64) -> F64 | None:
     return None if F is None else np.asarray(F, dtype=np.float64)
 
 
-def opencv_seven_point(xy1: F64, xy2: F64) -> F64:
-    """``cv2.findFundamentalMat`` of seven matches (7, 2) px: all its answers (M, 3, 3)."""
-    F = cv2.findFundamentalMat(xy1, xy2, cv2.FM_7POINT)[0]
-    return np.zeros((0, 3, 3)) if F is None else np.asarray(F, dtype=np.float64).reshape(-1, 3, 3)
-
-
 def _colmap(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     settings = pycolmap.RANSACOptions(max_error=threshold_px, random_seed=seed)
     found = pycolmap.estimate_fundamental_matrix(xy1, xy2, settings)
@@ -110,12 +91,15 @@ SOLVERS: dict[str, Solver] = {
     **{name: _opencv(name) for name in ("USAC_ACCURATE", "USAC_MAGSAC", "FM_RANSAC", "FM_LMEDS")},
     "COLMAP": _colmap,
     "PoseLib": _poselib,
-}
-"""All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, COLMAP and PoseLib as they come."""
+}  # All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, COLMAP and PoseLib as they come
 
 
-def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> Estimate:
-    """F and inliers of matches (N, 2) px by one of ``SOLVERS``; never raises for hard data."""
+def estimate_with(
+    method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed: int
+) -> tuple[F64 | None, BoolArray]:
+    """F (3, 3), None if the method gave none, and inliers (N,) as the method reports them, of matches (N, 2)
+    px by one of ``SOLVERS``; never raises for hard data.
+    """
     order = np.random.default_rng(seed).permutation(len(xy1))
     some1, some2 = np.ascontiguousarray(xy1[order]), np.ascontiguousarray(xy2[order])
     F, mask = SOLVERS[method](some1, some2, threshold_px, seed)
@@ -123,6 +107,43 @@ def estimate_with(method: str, xy1: F64, xy2: F64, *, threshold_px: float, seed:
     F = None if F is None else np.asarray(F, dtype=np.float64)
     # OpenCV returns nothing, zeros or three stacked matrices on failure.
     if F is None or F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
-        return Estimate(None, inliers)
+        return None, inliers
     inliers[order] = np.asarray(mask).ravel() > 0
-    return Estimate(F, inliers)
+    return F, inliers
+
+
+def opencv_linear(P: F64, xy: F64) -> F64:
+    """``cv2.triangulatePoints``: the linear method of two views, its rows as they come."""
+    found = cv2.triangulatePoints(P[0], P[1], xy[0].T.copy(), xy[1].T.copy())
+    return np.asarray(found.T, dtype=np.float64)
+
+
+def opencv_polynomial(P: F64, xy: F64) -> F64:
+    """``cv2.correctMatches`` (Hartley and Sturm's polynomial), then ``cv2.triangulatePoints``."""
+    F = fundamental_from_cameras(P[0], P[1])
+    x1, x2 = cv2.correctMatches(F, xy[0][None], xy[1][None])
+    return opencv_linear(P, np.stack([np.asarray(x1)[0], np.asarray(x2)[0]]).astype(np.float64))
+
+
+def colmap_points(P: F64, xy: F64) -> F64:
+    """``pycolmap.triangulate_point`` of two views, ``triangulate_multi_view_point`` of more, point by point.
+    COLMAP needs normalised image points, so pixels and cameras are normalised together. Points that it
+    refuses come out as zeros.
+    """
+    scale, middle = 1e-3, xy.mean(axis=1)
+    T = np.zeros((len(P), 3, 3))
+    T[:, 0, 0] = T[:, 1, 1] = scale
+    T[:, :2, 2], T[:, 2, 2] = -scale * middle, 1.0
+    cameras, moved = T @ P, (xy - middle[:, None]) * scale
+    rays = np.concatenate([moved, np.ones((*moved.shape[:2], 1))], axis=2)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    X = np.zeros((xy.shape[1], 4))
+    of_two, of_many = pycolmap.triangulate_point, pycolmap.triangulate_multi_view_point
+    for n in range(xy.shape[1]):
+        if len(P) == 2:
+            found = of_two(cameras[0], cameras[1], moved[0, n], moved[1, n])
+        else:
+            found = of_many(list(cameras), rays[:, n])
+        if found is not None:
+            X[n] = [*np.asarray(found), 1.0]
+    return X

@@ -10,13 +10,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __all__ = ["Library", "NoReference", "cv2", "load", "one_thread", "open3d", "poselib", "pycolmap"]
-
-PACKAGES = {
-    "cv2": "opencv-contrib-python-headless",
-    "pycolmap": "pycolmap",
-    "poselib": "poselib",
-    "open3d": "open3d",
-}
+PACKAGES = {"cv2": "opencv-contrib-python-headless", "pycolmap": "pycolmap", "poselib": "poselib"}
+PACKAGES |= {"open3d": "open3d"}
 """Reference libraries: module names and pip names."""
 NAMES = {"cv2": "OpenCV", "pycolmap": "pycolmap", "poselib": "PoseLib", "open3d": "Open3D"}
 
@@ -26,10 +21,7 @@ class NoReference(ImportError):
 
 
 class Library:
-    """The library ``module``, imported when something of it is first used.
-
-    Every use raises :class:`NoReference` if it cannot be had.
-    """
+    """The library ``module``, imported when something of it is first used."""
 
     def __init__(self, module: str) -> None:
         self._module = module

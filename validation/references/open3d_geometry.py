@@ -1,15 +1,13 @@
 """Open3D with our types: motions by ICP, distances to meshes, images of them, and surfaces of depth maps.
 
-Its voxel grids take the pixel that the truncated coordinates name, so the centre of the top-left pixel is
-(0.5, 0.5) there; its points of a depth image have it at (0, 0) as ours. (``ScalableTSDFVolume`` of 0.20.0
-gives empty meshes; the grid of blocks is its successor.)
+Its voxel grids have the centre of the top-left pixel at (0.5, 0.5), its points of a depth image at (0, 0) as
+ours. (``ScalableTSDFVolume`` of 0.20.0 gives empty meshes; the grid of blocks is its successor.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,9 +38,8 @@ def median_footprint(depth_maps: Sequence[DepthMap]) -> float:
 
 
 def refine_by_icp(moving: F64, fixed: F64, reach: float) -> F64:
-    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3).
-
-    Pairs are no farther apart than ``reach``.
+    """The motion (4, 4) by which point-to-point ICP, without scale, brings (N, 3) onto (M, 3). Pairs are no
+    farther apart than ``reach``.
     """
     clouds = [
         o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(X, dtype=np.float64)))
@@ -76,9 +73,8 @@ def _triangles(mesh: TexturedMesh) -> Any:
 
 
 def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
-    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit.
-
-    Raises ``RuntimeError`` if the machine has no graphics that it can use.
+    """(H, W, 3): the colours of the vertices as Open3D's own off-screen renderer draws them, unlit. Raises
+    ``RuntimeError`` if the machine has no graphics that it can use.
     """
     width, height = camera.size
     renderer = o3d.visualization.rendering.OffscreenRenderer(width, height)
@@ -95,16 +91,8 @@ def render_open3d(mesh: TexturedMesh, camera: Camera) -> U8:
     return np.asarray(renderer.render_to_image()).copy()
 
 
-def decimate_open3d(mesh: TexturedMesh, faces: int) -> TexturedMesh:
-    """Reduce a mesh to a number of faces by quadric decimation (Garland and Heckbert 1997)."""
-    fewer = _triangles(mesh).simplify_quadric_decimation(faces)
-    return TexturedMesh(np.asarray(fewer.vertices), np.asarray(fewer.triangles).astype(np.int64))
-
-
-@dataclass(frozen=True)
-class OpenTsdf:
+class OpenTsdf(NamedTuple):
     """Truncated signed distances in a grid of blocks (``VoxelBlockGrid``), surface by marching cubes.
-
     ``voxel_px``: side of a voxel in pixels at the median depth, as ``VolumetricFusion`` has it.
     """
 
@@ -112,16 +100,10 @@ class OpenTsdf:
 
     def fuse(self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView]) -> TexturedMesh:
         """The surface with colours of its vertices, means over the images ``views`` of the maps."""
-        kinds = (o3d.core.float32,) * 3
-        grid = o3d.t.geometry.VoxelBlockGrid(
-            ("tsdf", "weight", "color"),
-            kinds,
-            ((1,), (1,), (3,)),
-            median_footprint(depth_maps) * self.voxel_px,
-            8,
-            50_000,
-            o3d.core.Device("CPU:0"),
-        )
+        kinds, channels = (o3d.core.float32,) * 3, ((1,), (1,), (3,))
+        side = median_footprint(depth_maps) * self.voxel_px
+        where = (8, 50_000, o3d.core.Device("CPU:0"))
+        grid = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), kinds, channels, side, *where)
         for depth_map, view in zip(depth_maps, views, strict=True):
             self._integrate(grid, depth_map, view)
         found = grid.extract_triangle_mesh(0.5)
@@ -145,10 +127,8 @@ class OpenTsdf:
 def poisson_mesh(
     depth_maps: Sequence[DepthMap], *, depth: int = 9, least_density: float = 0.05
 ) -> TexturedMesh:
-    """Screened Poisson surface of the points of all maps, with normals of each map's own neighbourhoods.
-
-    ``depth`` of the octree; ``least_density``: the share of vertices with the fewest points that is cut off,
-    since the surface is closed where there is nothing.
+    """Screened Poisson surface of the points of all maps, with normals of each map's own neighbourhoods;
+    ``least_density``: the share of vertices with the fewest points that is cut off.
     """
     cloud = o3d.geometry.PointCloud()
     for one in depth_maps:
@@ -165,8 +145,5 @@ def poisson_mesh(
     mesh, density = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     values = np.asarray(density)
     mesh.remove_vertices_by_mask(values < np.quantile(values, least_density))
-    return TexturedMesh(
-        np.asarray(mesh.vertices).copy(),
-        # Faces are oriented like the normals, towards the cameras: anticlockwise outside, as ours.
-        np.asarray(mesh.triangles).astype(np.int64),
-    )
+    # Faces are oriented like the normals, towards the cameras: anticlockwise outside, as ours.
+    return TexturedMesh(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))

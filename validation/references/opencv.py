@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,10 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import Image
-from thesisrecon.stereo._frames import PlanarRectification
 from validation.references.libraries import cv2
 from validation.references.sift import detect_sift, grey_of
 
-BLOCK, APERTURE, K = 3, 3, 0.04
-"""Window, Sobel aperture and k as OpenCV's tutorial has them."""
+BLOCK, APERTURE, K = 3, 3, 0.04  # Window, Sobel aperture and k as OpenCV's tutorial has them
 
 
 def harris_corners(image: Image, count: int) -> F64:
@@ -41,37 +38,13 @@ def sift_corners(image: Image, count: int) -> F64:
     return np.asarray(found.xy[order][np.sort(first)[:count]], dtype=np.float64)
 
 
-Size = tuple[int, int]
-
-
-def opencv_uncalibrated(F: F64, xy1: F64, xy2: F64, size: Size) -> PlanarRectification | None:
-    """``cv2.stereoRectifyUncalibrated`` (Hartley) into the image's frame; None if it refuses."""
-    done, H1, H2 = cv2.stereoRectifyUncalibrated(xy1.copy(), xy2.copy(), F, size)
-    if not done:
-        return None
-    return PlanarRectification(np.stack([_positive(np.asarray(H), size) for H in (H1, H2)]), size)
-
-
-def warp_perspective(image: NDArray[Any], H: F64, size: Size) -> NDArray[Any]:
-    """The image (H, W, C) whose pixel x goes to H x, H (3, 3), by cubic interpolation."""
-    return np.asarray(cv2.warpPerspective(image, H, size, flags=cv2.INTER_CUBIC))
-
-
-def _positive(H: F64, size: Size) -> F64:
-    """H scaled such that the third coordinate is positive at the image's centre."""
-    third = float(H[2] @ [0.5 * (size[0] - 1.0), 0.5 * (size[1] - 1.0), 1.0])
-    return np.asarray(H * np.sign(third), dtype=np.float64)
-
-
 MODES = {"SGBM 3-way": "STEREO_SGBM_MODE_SGBM_3WAY", "SGBM HH": "STEREO_SGBM_MODE_HH"}
 
 
-@dataclass(frozen=True)
-class OpenCVSemiGlobal:
+class OpenCVSemiGlobal(NamedTuple):
     """``cv2.StereoSGBM`` on colour, block 3, P1 = 216, P2 = 864, with its checks; ``mode`` one of ``MODES``.
-
-    It has no disparities for the left columns that a disparity of the range would take out of the image.
-    With ``widened`` the images are repeated to the left so that it has them.
+    It has no disparities for the left columns that a disparity of the range would take out of the image. With
+    ``widened`` the images are repeated to the left so that it has them.
     """
 
     mode: str
@@ -94,16 +67,6 @@ class OpenCVSemiGlobal:
 HALF_WINDOW_PX = 5
 
 
-@dataclass(frozen=True)
-class BoardCalibration:
-    """``K`` (3, 3), ``k1``, ``std`` (5,) of fx, fy, cx, cy, k1 as OpenCV states them, and ``rms_px``."""
-
-    K: F64
-    k1: float
-    std: F64
-    rms_px: float
-
-
 def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
     """(N, 2) inner corners, row by row from the corner that comes first on the image's diagonal."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
@@ -118,16 +81,13 @@ def board_corners(picture: NDArray[np.uint8], size: tuple[int, int]) -> F64:
     return xy if xy[0].sum() <= xy[-1].sum() else xy[::-1].copy()
 
 
-def calibrate_from_corners(X: F64, corners: Sequence[F64], size: tuple[int, int]) -> BoardCalibration:
-    """``cv2.calibrateCamera`` of board points X (N, 3) and their images; free are fx, fy, cx, cy and k1."""
+def calibrate_from_corners(X: F64, corners: Sequence[F64], size: tuple[int, int]) -> tuple[F64, float, F64]:
+    """K, k1 and the standard deviations (5,) of fx, fy, cx, cy, k1 that ``cv2.calibrateCamera`` states for
+    board points X (N, 3) and their images.
+    """
     points = [X.astype(np.float32)] * len(corners)
     places = [np.ascontiguousarray(xy, dtype=np.float32) for xy in corners]
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     found = cv2.calibrateCameraExtended(points, places, size, np.eye(3), np.zeros(5), flags=flags)
-    rms, K, distortion, std = found[0], found[1], found[2], found[5]
-    return BoardCalibration(
-        np.asarray(K, dtype=np.float64),
-        float(np.ravel(distortion)[0]),
-        np.asarray(np.ravel(std)[:5], dtype=np.float64),
-        float(rms),
-    )
+    K, distortion, std = (np.asarray(found[k], dtype=np.float64) for k in (1, 2, 5))
+    return K, float(np.ravel(distortion)[0]), np.ravel(std)[:5]

@@ -16,8 +16,7 @@ from validation.references.libraries import cv2
 
 SETTINGS = {"enable_precise_upscale": True}
 """OpenCV's defaults otherwise. Without this one, positions are shifted by a quarter of a pixel."""
-ROWS = 512
-"""Descriptors whose distances to all others are held at once."""
+ROWS = 512  # Descriptors whose distances to all others are held at once
 
 
 @dataclass(frozen=True)
@@ -52,19 +51,11 @@ def compute_sift(grey: U8) -> SiftKeypoints:
     )
 
 
-def nearest_two(first: F32, second: F32) -> tuple[I64, F32]:
-    """For each descriptor (N, D) the nearest two of (M, D) by brute force, and their distances; (N, 2)."""
-    found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
-    index = np.array([[m.trainIdx for m in pair] for pair in found], dtype=np.int64)
-    return index, np.array([[m.distance for m in pair] for pair in found], dtype=np.float32)
-
-
 def match_sift(first: SiftKeypoints, second: SiftKeypoints, *, ratio: float, mutual: bool) -> I64:
     """Pairs of indices (M, 2) whose nearest descriptor is below ``ratio`` times the second nearest; with
-    ``mutual`` each must be the other's nearest.
-
-    All distances by matrix products, four times as fast as OpenCV's brute force. SIFT's descriptors are whole
-    numbers whose squares sum to less than 2^24, so that the distances are exact and the matches the same.
+    ``mutual`` each must be the other's nearest. All distances by matrix products, four times as fast as
+    OpenCV's brute force. SIFT's descriptors are whole numbers whose squares sum to less than 2^24, so that
+    the distances are exact and the matches the same.
     """
     if len(first.xy) == 0 or len(second.xy) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -109,15 +100,6 @@ class SiftCorners:
         return Features(found.xy[order], found.size[order], found.response[order])
 
 
-def _alike_matches(
-    view1: SiftKeypoints, view2: SiftKeypoints, pair: tuple[int, int], one: I64, two: I64
-) -> Matches:
-    """Matches of keypoints without scores and local maps."""
-    affine = np.broadcast_to(np.eye(2), (len(one), 2, 2)).copy()
-    score = np.ones(len(one), np.float32)
-    return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
-
-
 @dataclass(frozen=True)
 class SiftRatioTest:
     """Matches of SIFT descriptors, each the other's nearest, that pass the ratio test."""
@@ -137,9 +119,10 @@ class SiftRatioTest:
         estimate_fundamental: EstimateFundamental,  # noqa: ARG002
         rng: np.random.Generator,  # noqa: ARG002
     ) -> Matches:
-        """Matches by descriptors alone."""
+        """Matches by descriptors alone, without scores and local maps."""
         one, two = match_sift(view1, view2, ratio=self.ratio, mutual=True).T
-        return _alike_matches(view1, view2, pair, one, two)
+        affine, score = np.tile(np.eye(2), (len(one), 1, 1)), np.ones(len(one), np.float32)
+        return Matches(*pair, one, two, view1.xy[one], view2.xy[two], score, affine)
 
 
 def sift_front_end(config: PipelineConfig) -> PipelineConfig:

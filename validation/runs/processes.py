@@ -14,12 +14,11 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from threading import Event
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from thesisrecon.io._files import write_text
 from thesisrecon.runtime._signals import kill_on_exit
@@ -54,8 +53,7 @@ _PIN = (
 )
 
 
-@dataclass(frozen=True)
-class Process:
+class Process(NamedTuple):
     """How a child ended: exit ``code`` (negative: signal), seconds, memory, and whether it timed out."""
 
     code: int
@@ -81,10 +79,9 @@ def run_process(
     stop: Event | None = None,
     loaded: Path | None = None,
 ) -> Process:
-    """Run ``command`` in the folder ``cwd`` on these cores and wait; its output goes to the file ``log``.
-
-    After ``limit_s``, or if ``stop`` is set, the child and its children are killed. If a file ``loaded`` is
-    given, the time counts from when the child writes it, after its imports.
+    """Run ``command`` on these cores and wait; its output goes to the file ``log``. After ``limit_s``, which
+    counts from when the child writes the file ``loaded`` if there is one, or if ``stop`` is set, the child
+    and its children are killed.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start, timed_out = time.perf_counter(), False

@@ -1,28 +1,24 @@
-"""Records of a report: options, tasks, outcomes and judgements."""
+"""Records of a report: options, tasks, outcomes and judgements; its scenes."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 
-from validation.runs.tables import Metric
+from validation.runs.tables import Metric, Plot, slug
+from validation.scenes.real import SUFFIXES, Scene, data_root, load_scene, read_scene, real_folder, with_truth
+from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Options of a report.
-
-    ``out``: output folder. ``scenes``, ``stages``: names in order. ``folders``: folder of each user scene.
-    ``quick``: reduced scenes and repetitions. ``gates_only``: skip slow references and pictures that no gate
-    needs. ``seed``: random seed. ``threads``: number of cores. ``limit_s``: time limit of a task (s).
-    ``side_px``: long side of depth maps, 0 for the default. ``resume``: folder of an earlier run whose
-    references are reused, or empty.
-    ``stages_from``: module of ``STAGES``.
+    """Options of a report: folders of user scenes; ``gates_only`` skips slow references and pictures that no
+    gate needs; ``limit_s`` of a task; ``resume``: folder of an earlier run whose references are reused, or
+    empty; ``side_px``: long side of depth maps, 0 for the default; ``stages_from``: module of ``STAGES``.
     """
 
     out: Path
@@ -86,15 +82,6 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Plot:
-    """An interactive plot on a page: ``figure`` for plotly.js (data, layout)."""
-
-    title: str
-    figure: Mapping[str, Any]
-    caption: str = ""
-
-
-@dataclass(frozen=True)
 class Judgement:
     """Evaluation of a stage on a scene: numbers first, then plots and figures."""
 
@@ -105,74 +92,33 @@ class Judgement:
 
 
 class Stage(Protocol):
-    """A stage of the library and its references.
-
-    ``definition`` states the comparison in one sentence. ``takes`` returns whether the stage can work on a
-    scene; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the
-    judgement (empty ``method``), reads. ``run`` computes a task and saves its result; ``judge`` reads all
-    results and recomputes every number.
+    """A stage of the library and its references. ``definition`` states the comparison in one sentence.
+    ``takes`` returns whether the stage works on a scene: one of ``scenes``, or with ``own`` a folder of the
+    user; ``methods`` the methods there; ``needs`` the (stage, method) results that a method, or the judgement
+    (empty ``method``), reads; by default ``always`` and ``required``. ``run`` computes a task and saves its
+    result in its ``folder``; ``judge`` reads all results and recomputes every number.
     """
 
     name: str
     title: str
     definition: str
     scenes: tuple[str, ...] = ()
+    own: bool = False
+    always: tuple[str, ...] = ()
+    required: tuple[tuple[str, str], ...] = ()
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene in self.scenes
+        return scene in self.scenes or (self.own and scene in options.folders)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]: ...
+    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
+        return self.always
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return ()
+        return self.required
 
-    def run(self, task: Task, options: ReportOptions) -> None: ...
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None: ...
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement: ...
-
-
-def slug(text: str) -> str:
-    """Return a name for files and keys: letters, digits, dots and single dashes."""
-    return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
-
-
-def key_of(stage: str, metric: Metric) -> str:
-    """Return the gate key of a number."""
-    return f"{stage}/{metric.scene}/{slug(metric.name)}"
-
-
-Result = TypeVar("Result")
-Values = dict[str, float | None]
-OURS = "ours"
-
-
-def row(
-    scene: str,
-    name: str,
-    unit: str,
-    values: Mapping[str, float | None] | float | None,
-    definition: str = "",
-    *,
-    more: bool = False,
-    ranked: bool = True,
-    judged: str = OURS,
-) -> Metric:
-    """Return a number by method, or of ``judged`` alone.
-
-    A smaller one is better, with ``more`` a larger one, and neither if it is not ``ranked``.
-    """
-    table = values if isinstance(values, Mapping) else {judged: values}
-    return Metric(scene, name, unit, table, judged, at_most=not more, definition=definition, ranked=ranked)
-
-
-def each(results: Mapping[str, Result | None], read: Callable[[Result], Any]) -> Values:
-    """Return a number of each result, None for a method without one."""
-    return {name: None if result is None else float(read(result)) for name, result in results.items()}
-
-
-def ratio(a: float | None, b: float | None) -> float | None:
-    """Return a / b if both are known."""
-    return a / b if a is not None and b else None
 
 
 def read_arrays(outcome: Outcome | None, file: str) -> dict[str, Any] | None:
@@ -183,16 +129,45 @@ def read_arrays(outcome: Outcome | None, file: str) -> dict[str, Any] | None:
         return dict(stored)
 
 
-def scatter(
-    name: str, x: Iterable[Any], y: Iterable[Any], mode: str = "markers", **more: Any
-) -> dict[str, Any]:
-    """Return a trace for plotly.js."""
-    return {"type": "scatter", "mode": mode, "name": name, "x": list(x), "y": list(y), **more}
+IMAGE_SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
+QUICK = ("courtyard", "boards", "cloud", "street", "Tsukuba")
+SYNTHETIC = ("boards", "cloud", "street")
+"""Synthetic scenes: images of a chessboard, points seen by a few cameras, a walk of cameras."""
 
 
-def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, caption: str = "", **layout: Any) -> Plot:
-    """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js."""
-    for axis, text in (("xaxis", x), ("yaxis", y)):
-        layout[axis] = {"title": {"text": text}} | layout.get(axis, {})
-    layout["margin"] = {"l": 70, "r": 10, "t": 10, "b": 50}
-    return Plot(title, {"data": traces, "layout": layout}, caption)
+def available_scenes(*, quick: bool) -> tuple[str, ...]:
+    """Return the scenes whose files are on this machine."""
+    root = data_root()
+    found = [name for name in IMAGE_SCENES if name == "courtyard" or real_folder(name) is not None]
+    found += [name for name in STEREO_PAIRS if stereo_folder(name) is not None]
+    found += SYNTHETIC
+    if root is not None and (root / "kusvod2").is_dir():
+        found.append("kusvod2")
+    return tuple(name for name in found if not quick or name in QUICK)
+
+
+def load_images(name: str, options: ReportOptions) -> Scene:
+    """Return the images of a scene with their truth, if known. A folder of the user holds images, or images/
+    with them; its truth is ``cameras.json`` in the folder (as in fixtures) or a COLMAP model in ``sparse/0``.
+    Raises ``ValueError`` if a scene has no images.
+    """
+    if name in options.folders:
+        return _own_scene(Path(options.folders[name]), name)
+    scene = load_scene(name)
+    if scene is None:
+        raise ValueError(f"the images of {name} are not on this machine")
+    return scene
+
+
+def _own_scene(folder: Path, name: str) -> Scene:
+    if (folder / "images").is_dir():
+        scene = read_scene(folder, name)
+    else:
+        paths = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES))
+        if not paths:
+            raise ValueError(f"there are no images in {folder}")
+        scene = Scene(name, paths)
+        if (folder / "cameras.json").is_file():
+            scene = with_truth(scene, folder / "cameras.json")
+    model = folder / "sparse" / "0"
+    return scene if scene.has_truth or not model.is_dir() else with_truth(scene, model, complete=False)

@@ -3,12 +3,10 @@
 The first own task of a stage compiles its kernels. No other task of that stage, nor a first task of another
 stage, starts before it ends; references use the other cores.
 
-A run may resume another one: references are reused, and our results where settings and code are unchanged.
-Own methods have names that begin with "ours". Only numbered folders of a library run are copied; the library
-itself checks whether settings and code of a stage have changed.
+A run may resume another one: references are reused, and our results where the library finds settings and code
+of a stage unchanged in the numbered folders of its run. Own methods have names that begin with "ours".
 
-As a program it runs one task: OPTIONS STAGE SCENE [METHOD]; without a method, the
-judgement on the outcomes in ``outcomes.json``.
+As a program it runs one task: OPTIONS STAGE SCENE [METHOD]; without a method, the judgement.
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from operator import methodcaller
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
@@ -33,18 +32,16 @@ from thesisrecon.io._outputs import clear_folder
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
 from validation.runs.processes import failure_of, last_line, own_cores, run_jobs, run_process
-from validation.runs.records import OURS, Judgement, Outcome, Picture, Plot, ReportOptions, Stage, Task
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.runs.tables import OURS, Metric, Plot
 
 Judged = Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]]
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
-JUDGE = ""
-"""Method name of the judgement task."""
+JUDGE = ""  # Method name of the judgement task
 JUDGEMENT, OUTCOMES = "judgement.json", "outcomes.json"
 REFERENCES_USE_OURS = ("boards", "surface", "view-interpolation", "views")
 """Stages whose references use our code and run again."""
-SAME_OPTIONS = ("quick", "gates_only", "seed", "side_px")
-"""Options that affect the results of a task."""
+SAME_OPTIONS = ("quick", "gates_only", "seed", "side_px")  # Options that affect the results of a task
 
 
 def tasks_of(options: ReportOptions, stages: Mapping[str, Stage]) -> list[Task]:
@@ -124,16 +121,13 @@ def _run_task(
 ) -> Outcome:
     folder = options.folder(task.stage, task.scene, task.method)
     folder.mkdir(parents=True, exist_ok=True)
-    arguments = [str(options.out / "options.json"), task.stage, task.scene]
+    command = [sys.executable, "-m", "validation.runs.report", str(options.out / "options.json")]
+    command += [task.stage, task.scene, *([] if task.method == JUDGE else [task.method])]
     if task.method == JUDGE:
         record = {name: asdict(o) | {"folder": str(o.folder)} for name, o in _outcomes(task, ended).items()}
         write_text(folder / OUTCOMES, json.dumps(record))
-    else:
-        arguments.append(task.method)
     # Outside the task folder, which the task may empty.
-    log = folder.with_name(f"{folder.name}.log")
-    command, core = [sys.executable, "-m", "validation.runs.report", *arguments], idle.get()
-    loaded = _loaded_file(folder)
+    log, loaded, core = folder.with_name(f"{folder.name}.log"), _loaded_file(folder), idle.get()
     limits: dict[str, Any] = {"limit_s": options.limit_s, "stop": stop, "loaded": loaded}
     try:
         process = run_process(command, log=log, cores=[core], environment=ENVIRONMENT, **limits)
@@ -179,8 +173,9 @@ def main(arguments: list[str]) -> int:
     write_text(_loaded_file(options.folder(stage, scene, *method)), f"{time.process_time()}")
     try:
         if method:
-            options.folder(stage, scene, method[0]).mkdir(parents=True, exist_ok=True)
-            stages[stage].run(Task(stage, scene, method[0]), options)
+            folder = options.folder(stage, scene, method[0])
+            folder.mkdir(parents=True, exist_ok=True)
+            stages[stage].run(Task(stage, scene, method[0]), folder, options)
         else:
             _judge(options, stages[stage], scene)
     except (StageFailure, ImportError, ValueError) as error:
@@ -195,19 +190,13 @@ def _judge(options: ReportOptions, stage: Stage, scene: str) -> None:
     judgement = stage.judge(scene, outcomes, options)
     failures = [f"{name}: {outcome.failure}." for name, outcome in outcomes.items() if not outcome.ok]
     judgement = replace(judgement, notes=[*judgement.notes, *failures])
-    write_text(folder / JUDGEMENT, json.dumps(asdict(judgement), default=_plain_number))
+    write_text(folder / JUDGEMENT, json.dumps(asdict(judgement), default=methodcaller("tolist")))
 
 
 def read_outcomes(folder: Path) -> dict[str, Outcome]:
     """Return the outcomes of a stage on a scene by method, those of its folder."""
     record = json.loads((folder / OUTCOMES).read_text(encoding="utf-8"))
     return {name: Outcome(**{**o, "folder": Path(o["folder"])}) for name, o in record.items()}
-
-
-def _plain_number(value: Any) -> Any:
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value)} cannot be stored in a judgement")
 
 
 # ---------------------------------------------------------------- resume another run
@@ -217,13 +206,18 @@ def earlier_run(options: ReportOptions) -> ReportOptions | None:
     """Return the options of the run to start from, None if there is none to start from."""
     if not options.resume:
         return None
-    other = _options_of(Path(options.resume))
+    folder = Path(options.resume)
+    try:
+        record = json.loads((folder / "options.json").read_text(encoding="utf-8"))
+        other = replace(ReportOptions.from_json(record), out=folder)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
     different = [name for name in SAME_OPTIONS if getattr(other, name) != getattr(options, name)]
-    moved = [s for s, folder in options.folders.items() if other.folders.get(s, folder) != folder]
+    moved = [s for s, place in options.folders.items() if other.folders.get(s, place) != place]
     different += [f"folder of the scene {scene}" for scene in moved]
     if different:
         raise ValueError(
-            f"{options.resume} is a run with another {', '.join(different)}: use a run with the same options"
+            f"{folder} is a run with another {', '.join(different)}: use a run with the same options"
         )
     return other
 
@@ -234,7 +228,7 @@ def reuse_results(
     """Return the outcomes of tasks that need not run again; their files are copied from the ``other`` run."""
     known = {}
     for task in tasks:
-        if _runs_again(task):
+        if task.method and (_is_ours(task) or task.stage in REFERENCES_USE_OURS):
             _copy_stage_folders(other.folder(task.stage, task.scene, task.method) / "run", options, task)
         elif task.method:
             folder = other.folder(task.stage, task.scene)
@@ -245,18 +239,6 @@ def reuse_results(
                 known[task] = replace(outcome, folder=kept)
         _copy_inputs(other, options, task, stages)
     return known
-
-
-def _runs_again(task: Task) -> bool:
-    return bool(task.method) and (_is_ours(task) or task.stage in REFERENCES_USE_OURS)
-
-
-def _options_of(folder: Path) -> ReportOptions:
-    try:
-        record = json.loads((folder / "options.json").read_text(encoding="utf-8"))
-        return replace(ReportOptions.from_json(record), out=folder)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{folder} holds no run to start from (options.json): {error}") from None
 
 
 def _copy_stage_folders(run: Path, options: ReportOptions, task: Task) -> None:

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.io._files import read_bytes, write_text
+from thesisrecon.io._files import write_text
 from validation.references.libraries import PACKAGES
-from validation.runs.records import Judgement, Outcome, ReportOptions, key_of
-from validation.runs.tables import Metric, commit, machine, write_csv
+from validation.runs.records import Judgement, Outcome, ReportOptions
+from validation.runs.tables import Metric, commit, key_of, machine, write_csv
 
 GATES_FILE = Path(__file__).resolve().parents[1] / "gates.toml"
 
@@ -38,15 +38,11 @@ class Gate:
         return value <= self.limit if self.at_most else value >= self.limit
 
 
+@cache
 def camera_limit(scene: str, name: str) -> float | None:
     """Return the limit of a number of the stage "cameras", None where nothing is promised."""
-    gate = _shipped_gates().get(f"cameras/{scene}/{name}")
+    gate = read_gates().get(f"cameras/{scene}/{name}")
     return None if gate is None else gate.limit
-
-
-@cache
-def _shipped_gates() -> dict[str, Gate]:
-    return read_gates()
 
 
 def read_gates(path: Path = GATES_FILE) -> dict[str, Gate]:
@@ -68,15 +64,34 @@ class Row:
     """A number of ours (``value``) and the references; ``direction`` is the good side of the ``limit``."""
 
     key: str
+    scene: str
+    name: str
     value: float | None
     unit: str
     direction: str
     limit: float | None
     reference: Mapping[str, float | None]
-    source: str
+    definition: str
     verdict: str
     reason: str = ""
     ranked: bool = True
+
+    @property
+    def best(self) -> float | None:
+        """The number of the best reference, None without one or where neither side is better."""
+        others = [v for name, v in self.reference.items() if v is not None and not name.startswith("ours")]
+        if not others or not self.ranked:
+            return None
+        return max(others) if self.direction == "at least" else min(others)
+
+    @property
+    def ratio(self) -> float | None:
+        """Ours over the best reference, inverted where more is better."""
+        if self.value is None or self.best is None:
+            return None
+        pair = (self.value, self.best)
+        over, under = pair[::-1] if self.direction == "at least" else pair
+        return over / under if over > 0.0 and under > 0.0 else None
 
 
 @dataclass(frozen=True)
@@ -100,18 +115,10 @@ def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
     at_most = metric.at_most if gate is None else gate.at_most
     value = _finite(metric.values.get(metric.judged))
     verdict = "reported" if gate is None else "reached" if gate.holds(value) else "missed"
-    return Row(
-        key_of(stage, metric),
-        value,
-        metric.unit,
-        "at most" if at_most else "at least",
-        None if gate is None else gate.limit,
-        others,
-        metric.definition,
-        verdict,
-        "" if gate is None else gate.reason,
-        metric.ranked,
-    )
+    direction, limit = "at most" if at_most else "at least", None if gate is None else gate.limit
+    reason = "" if gate is None else gate.reason
+    given = (metric.unit, direction, limit, others, metric.definition, verdict, reason, metric.ranked)
+    return Row(key_of(stage, metric), metric.scene, metric.name, value, *given)
 
 
 def collect(
@@ -136,24 +143,15 @@ def collect(
 
 def environment(options: ReportOptions) -> dict[str, Any]:
     """Return the environment of the run."""
-    versions = {
-        name: _version(name) for name in (*("thesisrecon", "numpy", "scipy", "numba"), *PACKAGES.values())
-    }
-    return {
-        "commit": commit(),
-        "machine": machine(),
-        "python": platform.python_version(),
-        **versions,
-        "threads": f"{options.threads} parallel tasks, one thread each",
-        "seed": options.seed,
-    }
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "missing"
+    versions = {}
+    for name in ("thesisrecon", "numpy", "scipy", "numba", *PACKAGES.values()):
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "missing"
+    head = {"commit": commit(), "machine": machine(), "python": platform.python_version()}
+    threads = f"{options.threads} parallel tasks, one thread each"
+    return {**head, **versions, "threads": threads, "seed": options.seed}
 
 
 def write_results(out: Path, results: Results) -> None:
@@ -166,19 +164,10 @@ def write_results(out: Path, results: Results) -> None:
             {"key": row.key, "unit": row.unit, "ours": row.value}
             | {name: row.reference.get(name) for name in references}
             | {"direction": row.direction, "limit": row.limit, "verdict": row.verdict}
-            | {"definition": row.source, "reason": row.reason}
+            | {"definition": row.definition, "reason": row.reason}
             for row in rows
         ]
         write_csv(out / "tables" / f"{stage}.csv", records)
-
-
-def read_results(out: Path) -> Results:
-    """Read the run in this folder."""
-    try:
-        record = json.loads(read_bytes(out / "results.json").decode("utf-8"))
-        return Results(**{**record, "rows": [Row(**row) for row in record["rows"]]})
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{out} holds no results.json of a report: {error}") from None
 
 
 def _finite(value: float | None) -> float | None:

@@ -3,17 +3,15 @@
 
 A study is a generator function ``NAME_study`` in ``validation/studies``. Its keyword parameters with their
 defaults and annotations are the options of the command, which ``studies.toml`` explains. It yields parts: a
-list of :class:`Metric` rows (one table under the scene of the first row) or a string (printed as it is). The
-exit code is 1 if a bound is missed, 2 if an option or the data are missing.
-
-A parameter ``out : Path`` is a folder that keeps what the study makes; without ``--out`` it is temporary.
+list of :class:`Metric` rows (one table under the scene of the first row) or a string. A parameter ``out`` is
+a folder that keeps what the study makes. The exit code is 1 if a bound is missed, 2 for missing data or
+options.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
-import os
 import re
 import sys
 import tempfile
@@ -68,11 +66,7 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
     """Run one study with its options: print its parts, write them if asked, return the exit code."""
     function = load_study(name)
     options = vars(study_parser(name, function).parse_args(list(arguments)))
-    out, json_file, texts = options.pop("out"), options.pop("json"), list[str]()
-    metrics: list[Metric] = []
-    if json_file is not None and os.path.lexists(json_file):
-        print(f"study {name}: {json_file} exists already; move it, or choose another name", file=sys.stderr)
-        return 2
+    out, texts, metrics = options.pop("out"), list[str](), list[Metric]()
     try:
         with output_folder(out, [f"{name}.md", f"{name}.json"]) as folder:
             if "out" in inspect.signature(function).parameters:
@@ -81,14 +75,13 @@ def run_study(name: str, arguments: Sequence[str] = ()) -> int:
                 if not part:
                     continue
                 metrics += [] if isinstance(part, str) else part
-                texts.append(part_text(part))
+                text = part if isinstance(part, str) else f"## {part[0].scene}\n\n{markdown_table(part)}"
+                texts.append(text)
                 print(texts[-1], end="\n\n", flush=True)
                 # Written after each part, so that an interrupted study keeps what it has.
                 if out is not None:
                     write_text(folder / f"{name}.md", "\n\n".join((stamp(), *texts)) + "\n")
                     write_metrics(folder / f"{name}.json", metrics)
-                if json_file is not None:
-                    write_metrics(json_file, metrics)
     except (UsageError, StageFailure) as error:
         print(f"study {name}: {error}", file=sys.stderr)
         return 2
@@ -115,7 +108,6 @@ def study_parser(name: str, function: StudyFunction) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-o", "--out", type=Path, help="folder for the tables and for what the study makes")
-    parser.add_argument("--json", type=Path, help="file for the metric rows")
     hints = typing.get_type_hints(function)
     for parameter in inspect.signature(function).parameters.values():
         if parameter.name != "out":
@@ -149,17 +141,13 @@ def _summary(function: StudyFunction) -> str:
 @contextmanager
 def output_folder(folder: Path | None, names: Sequence[str]) -> Iterator[Path]:
     """The folder of a study that writes these tables, else a temporary one."""
-    if folder is not None:
+    if folder is None:
+        with tempfile.TemporaryDirectory() as temporary:
+            yield Path(temporary)
+    else:
         with join_claim(folder.resolve()) as outputs:
             outputs.require(names)
             yield folder.resolve()
-        return
-    with tempfile.TemporaryDirectory() as temporary:
-        yield Path(temporary)
-
-
-def part_text(part: Part) -> str:
-    return part if isinstance(part, str) else f"## {part[0].scene}\n\n{markdown_table(list(part))}"
 
 
 # ---------------------------------------------------------------- helpers of the studies
@@ -168,6 +156,12 @@ def part_text(part: Part) -> str:
 def report_progress(text: object) -> None:
     """Print a line on the error stream at once."""
     print(text, file=sys.stderr, flush=True)
+
+
+def report_at_terminal(text: str) -> None:
+    """The same, if the error stream is a terminal."""
+    if sys.stderr.isatty():
+        report_progress(text)
 
 
 def pick(names: Sequence[str] | None, known: Iterable[str]) -> list[str]:

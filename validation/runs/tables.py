@@ -1,4 +1,4 @@
-"""Measured numbers with references, targets and verdicts, and their tables as Markdown, CSV and JSON."""
+"""Measured numbers with references, targets and verdicts; their tables (Markdown, CSV, JSON) and plots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import math
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,11 +23,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Metric:
-    """One row of a table: a number on a scene, by ours and the references, with its target.
-
-    ``values`` maps methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper
-    one with ``at_most``; without it the row is only reported. ``definition`` states the number in one line.
-    Neither side of a number that is not ``ranked`` is better, such as a count of faces.
+    """One row of a table: a number on a scene, by ours and the references, with its target. ``values`` maps
+    methods to numbers or None. ``target`` is the bound for the method ``judged``, an upper one with
+    ``at_most``; without it the row is only reported. ``definition`` states the number in one line. Neither
+    side of a number that is not ``ranked`` is better, such as a count of faces.
     """
 
     scene: str
@@ -48,6 +48,15 @@ class Metric:
         if value is None:
             return "missed"
         return "reached" if (value <= self.target if self.at_most else value >= self.target) else "missed"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """An interactive plot on a page: ``figure`` for plotly.js (data, layout)."""
+
+    title: str
+    figure: Mapping[str, Any]
+    caption: str = ""
 
 
 def markdown_table(metrics: Sequence[Metric]) -> str:
@@ -92,18 +101,63 @@ class Rows(list[Metric]):
         bound = at_most if at_least is None else at_least
         self.append(Metric(self.scene, name, unit, given, self.judged, bound, at_least is None))
 
-    def each(
-        self,
-        name: str,
-        items: Mapping[str, T | None],
-        read: Callable[[T], float | None],
-        unit: str = "",
-        at_most: float | None = None,
-        at_least: float | None = None,
-    ) -> None:
-        """Append a row with a number of each method's item; methods without an item have none."""
-        values = {method: None if item is None else read(item) for method, item in items.items()}
-        self.add(name, values, unit, at_most, at_least)
+
+def slug(text: str) -> str:
+    """Return a name for files and keys: letters, digits, dots and single dashes."""
+    return re.sub(r"[^A-Za-z0-9.]+", "-", text).strip("-")
+
+
+def key_of(stage: str, metric: Metric) -> str:
+    """Return the gate key of a number."""
+    return f"{stage}/{metric.scene}/{slug(metric.name)}"
+
+
+Values = dict[str, float | None]
+OURS = "ours"
+
+
+def row(
+    scene: str,
+    name: str,
+    unit: str,
+    values: Mapping[str, float | None] | float | None,
+    definition: str = "",
+    *,
+    more: bool = False,
+    ranked: bool = True,
+    judged: str = OURS,
+) -> Metric:
+    """Return a number by method, or of ``judged`` alone. A smaller one is better, with ``more`` a larger one,
+    and neither if it is not ``ranked``.
+    """
+    table = values if isinstance(values, Mapping) else {judged: values}
+    return Metric(scene, name, unit, table, judged, at_most=not more, definition=definition, ranked=ranked)
+
+
+def each(results: Mapping[str, T | None], read: Callable[[T], Any]) -> Values:
+    """Return a number of each result, None for a method without one."""
+    found = {name: None if result is None else read(result) for name, result in results.items()}
+    return {name: None if value is None else float(value) for name, value in found.items()}
+
+
+def ratio(a: float | None, b: float | None) -> float | None:
+    """Return a / b if both are known."""
+    return a / b if a is not None and b else None
+
+
+def scatter(
+    name: str, x: Iterable[Any], y: Iterable[Any], mode: str = "markers", **more: Any
+) -> dict[str, Any]:
+    """Return a trace for plotly.js."""
+    return {"type": "scatter", "mode": mode, "name": name, "x": list(x), "y": list(y), **more}
+
+
+def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, caption: str = "", **layout: Any) -> Plot:
+    """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js."""
+    for axis, text in (("xaxis", x), ("yaxis", y)):
+        layout[axis] = {"title": {"text": text}} | layout.get(axis, {})
+    layout["margin"] = {"l": 70, "r": 10, "t": 10, "b": 50}
+    return Plot(title, {"data": traces, "layout": layout}, caption)
 
 
 def text_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

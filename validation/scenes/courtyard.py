@@ -189,38 +189,22 @@ def _box(
         (c + 0.5 * w * x - 0.5 * d * y, -x, y, (w, d)),
     ]
     faces = faces if centre[2] > 0 else faces[:5]
+    stone = material == STONE
     return [
-        Surface(
-            o,
-            u,
-            v,
-            s,
-            material,
-            flat=True,
-            offset=(0.21 * k + at[0] * (material == STONE), 0.13 * k + at[1] * 0.3),
-        )
+        Surface(o, u, v, s, material, flat=True, offset=(0.21 * k + at[0] * stone, 0.13 * k + at[1] * 0.3))
         for k, (o, u, v, s) in enumerate(faces)
     ]
 
 
 def _drum(x: float, y: float, z: float, radius: float, size: tuple[float, float], material: int) -> Surface:
-    axes = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    return Surface(np.array([x, y, z]), axes[0], axes[1], size, material, radius=radius)
+    along_x, _, along_z = np.eye(3)
+    return Surface(np.array([x, y, z]), along_x, along_z, size, material, radius=radius)
 
 
 def _lid(x: float, y: float, z: float, radius: float, material: int) -> Surface:
-    origin = np.array([x - radius, y - radius, z])
-    axes = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    return Surface(
-        origin,
-        axes[0],
-        axes[1],
-        (2 * radius, 2 * radius),
-        material,
-        disc=radius,
-        flat=True,
-        offset=(0.4, 0.2),
-    )
+    (along_x, along_y, _), size = np.eye(3), (2 * radius, 2 * radius)
+    origin, options = np.array([x - radius, y - radius, z]), {"disc": radius, "offset": (0.4, 0.2)}
+    return Surface(origin, along_x, along_y, size, material, flat=True, **options)  # type: ignore[arg-type]
 
 
 def build_objects() -> list[list[Surface]]:

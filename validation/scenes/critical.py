@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,7 @@ class Sequence:
         return compose_camera(self.K, self.R, -np.einsum("vab,vb->va", self.R, self.C))
 
 
-@dataclass(frozen=True)
-class _Path:
+class _Path(NamedTuple):
     """``distance`` in units of the scene's radius; ``spread`` of the path in units of the distance."""
 
     views: int
@@ -133,7 +133,6 @@ def make_sequence(
     motion: Motion, rng: np.random.Generator, *, by_hand: bool = False, zoom: float = 0.0
 ) -> Sequence:
     """5 to 15 cameras and 150 to 400 points in a box, 0.5 to 1 px noise, a focal of 0.7 to 2 long sides.
-
     ``by_hand`` adds the unavoidable errors of a hand-held camera; ``zoom``: focals vary by factors e^+-zoom.
     The principal point is off by 0.5 % of the long side (rms), and a tenth of what is in the image is not
     matched.

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from math import cos, pi, sin
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ HALF_SIDE = 1.0
 AZIMUTHS_DEG, ELEVATIONS_DEG, DISTANCES = (-6.0, 45.0, 96.0), (4.0, 32.0, 58.0), (4.6, 6.0, 7.4)
 
 
-@dataclass(frozen=True)
-class CubeSequence:
+class CubeSequence(NamedTuple):
     """``face`` (N,): 0 1 2 for x y z; ``xy`` (27, N, 2) px, NaN where a point is turned away or outside."""
 
     K: F64
@@ -74,10 +73,8 @@ def project_exactly(K: F64, R: F64, C: F64, X: F64) -> F64:
 
 
 def make_cube() -> CubeSequence:
-    """The sequence; always the same numbers.
-
-    The cameras stand on a perturbed 3 x 3 x 3 grid of azimuth, elevation and distance. Most see two or three
-    faces, and six (low, at either side) a single one.
+    """The sequence; always the same numbers. The cameras stand on a perturbed 3 x 3 x 3 grid of azimuth,
+    elevation and distance. Most see two or three faces, and six (low, at either side) a single one.
     """
     rng = np.random.Generator(np.random.PCG64(1900))
     X, face = _points(rng)
@@ -89,8 +86,7 @@ def make_cube() -> CubeSequence:
     return CubeSequence(K, R, C, X, face, xy)
 
 
-OFF_FACE = 20
-"""Minimum number of common points off the face that holds most of them."""
+OFF_FACE = 20  # Minimum number of common points off the face that holds most of them
 
 
 def cube_pairs(cube: CubeSequence) -> list[TwoViews]:

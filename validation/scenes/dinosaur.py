@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ SIZE = (720, 576)
 MIN_COMMON = 16
 
 
-@dataclass(frozen=True)
-class Dinosaur:
+class Dinosaur(NamedTuple):
     """The tracks, published cameras ``P`` (36, 3, 4) up to a projective transform, ``sizes`` (36, 2)."""
 
     tracks: Tracks
@@ -42,7 +41,6 @@ def load_dinosaur() -> Dinosaur | None:
 
 def pairs_from_tracks(tracks: Tracks, *, seed: int = 0) -> list[TwoView]:
     """The pairs of views with ``MIN_COMMON`` points in common, their F estimated and verified as matches are.
-
     Degeneracy of F is not tested.
     """
     table = np.full((tracks.n_views, tracks.n_points), -1)

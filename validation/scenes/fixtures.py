@@ -99,18 +99,9 @@ def courtyard_cameras(made_with: dict[str, str]) -> str:
     """Content of ``cameras.json``: the cameras as a run writes them, and the scale of the depth maps."""
     cameras = []
     for k, pose in enumerate(courtyard_poses()):
-        cameras.append(
-            {
-                "name": f"{k:04d}.jpg",
-                "width": SIZE[0],
-                "height": SIZE[1],
-                "K": pose.K.tolist(),
-                "distortion": [0.0, 0.0, 0.0],
-                "R": pose.R.tolist(),
-                "t": (-pose.R @ pose.C).tolist(),
-                "centre": pose.C.tolist(),
-            }
-        )
+        camera = {"name": f"{k:04d}.jpg", "width": SIZE[0], "height": SIZE[1], "K": pose.K.tolist()}
+        camera |= {"distortion": [0.0, 0.0, 0.0], "R": pose.R.tolist(), "t": (-pose.R @ pose.C).tolist()}
+        cameras.append(camera | {"centre": pose.C.tolist()})
     content = {
         "scene": "courtyard",
         "convention": "x ~ K (R X + t); (0, 0) is the centre of the top-left pixel; metres",

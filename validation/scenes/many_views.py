@@ -1,7 +1,8 @@
-"""Arbitrarily many rendered images of the courtyard.
+"""Arbitrarily many rendered images of the courtyard and of a street.
 
 They are rendered, not cropped: images with a common centre would have no parallax and another cost. The first
-n of a longer set are the set of n, spread over the same arc.
+n of a longer set are the set of n. Of the street only the houses near a camera are built, so that memory does
+not grow with its length.
 """
 
 from __future__ import annotations
@@ -10,28 +11,45 @@ import io
 import re
 import tempfile
 from dataclasses import replace
+from functools import lru_cache
 from math import cos, pi, sin, tan
 from pathlib import Path
 
 import numpy as np
 
-from thesisrecon.arrays import F32
+from thesisrecon.arrays import F32, F64
 from thesisrecon.io._files import write_atomically, write_json
-from validation.scenes.courtyard import build_courtyard, build_yard
+from validation.scenes.courtyard import SUN, WALL_HEIGHT, build_courtyard, build_yard
+from validation.scenes.materials import (
+    Material,
+    add_window,
+    bricks,
+    cut_stone,
+    grid,
+    over,
+    planks,
+    plaster,
+    rubble,
+    smooth,
+)
 from validation.scenes.pose import Pose, look_at
-from validation.scenes.raycast import trace
+from validation.scenes.procedural import fractal
+from validation.scenes.raycast import Surface, World, build_world, trace
 from validation.scenes.real import Scene, read_scene, write_png
 from validation.scenes.sensor import take_image, write_images
 
-FOCAL_REL = 0.9
-"""Focal length as a share of the long side."""
+FOCAL_REL = 0.9  # Focal length as a share of the long side
+
+
+def walk_calibration(size: tuple[int, int]) -> F64:
+    """K (3, 3) for images of ``size`` (width, height), the principal point off their middle."""
+    focal = FOCAL_REL * max(size)
+    return np.array([[focal, 0.0, 0.51 * size[0]], [0.0, focal, 0.48 * size[1]], [0.0, 0.0, 1.0]])
 
 
 def walk(count: int, size: tuple[int, int], *, seed: int = 0) -> list[Pose]:
     """``count`` true cameras about the yard, of one calibration, for images of ``size`` (width, height)."""
-    width, height = size
-    focal = FOCAL_REL * max(size)
-    K = np.array([[focal, 0.0, 0.51 * width], [0.0, focal, 0.48 * height], [0.0, 0.0, 1.0]])
+    K = walk_calibration(size)
     poses = []
     for k in range(count):
         rng = np.random.Generator(np.random.PCG64([seed, k]))
@@ -73,41 +91,33 @@ def yard_number(name: str) -> int | None:
 
 
 def load_yard(number: int) -> Scene:
-    """Images and true cameras of a yard, rendered on first use (a minute)."""
-    folder = YARDS / f"yard-{number}-{YARD_IMAGES}"
-    if not (folder / "cameras.json").is_file():
-        write_yard(folder, number)
-    return read_scene(folder, f"yard-{number}")
-
-
-def write_yard(folder: Path, seed: int) -> None:
-    """Images and ``cameras.json`` of another yard (:func:`build_yard`) and other cameras for each seed."""
-    poses = walk(YARD_IMAGES, YARD_SIZE, seed=1000 + seed)
-    zoom = float(np.random.default_rng([72, seed]).uniform(0.85, 1.25))
-    cameras = []
+    """Images and true cameras of a yard (:func:`build_yard`), rendered on first use (a minute)."""
+    folder, cameras = YARDS / f"yard-{number}-{YARD_IMAGES}", list[dict[str, object]]()
+    if (folder / "cameras.json").is_file():
+        return read_scene(folder, f"yard-{number}")
+    poses = walk(YARD_IMAGES, YARD_SIZE, seed=1000 + number)
+    zoom = float(np.random.default_rng([72, number]).uniform(0.85, 1.25))
     for k, pose in enumerate(poses):
         K = pose.K * np.array([[zoom], [zoom], [1.0]])
         K[:2, 2] = pose.K[:2, 2]
         poses[k] = replace(pose, K=K)
         place = {"K": K, "R": pose.R, "t": -pose.R @ pose.C, "distortion": [0.0, 0.0, 0.0]}
         cameras.append({"name": f"{k:04d}.png", "width": YARD_SIZE[0], "height": YARD_SIZE[1], **place})
-    write_images(folder / "images", build_yard(seed), dict(enumerate(poses)), YARD_SIZE, [2003, seed])
+    write_images(folder / "images", build_yard(number), dict(enumerate(poses)), YARD_SIZE, [2003, number])
     write_json(folder / "cameras.json", {"cameras": cameras})
+    return read_scene(folder, f"yard-{number}")
 
 
 STEREO_SIZE, STEREO_BASELINE_M = (480, 360), 0.3
 
 
 def stereo_yard_folder(seed: int) -> Path:
-    """The folder of a rectified pair of a yard and its true disparities, rendered on first use."""
+    """The folder of a rectified pair of a yard, rendered on first use: ``left.png``, ``right.png`` and
+    ``disparity.npy`` (2, H, W), the true disparities of both images, NaN for the sky.
+    """
     folder = YARDS / f"stereo-{seed}"
-    if not (folder / "disparity.npy").is_file():
-        write_stereo_yard(folder, seed)
-    return folder
-
-
-def write_stereo_yard(folder: Path, seed: int) -> None:
-    """``left.png``, ``right.png`` and ``disparity.npy`` (2, H, W) of both images, NaN for the sky."""
+    if (folder / "disparity.npy").is_file():
+        return folder
     world, pose = build_yard(seed), replace(walk(1, STEREO_SIZE, seed=1000 + seed)[0], exposure=1.0)
     poses = (pose, replace(pose, C=pose.C + STEREO_BASELINE_M * pose.R[0]))
     disparities = list[F32]()
@@ -120,3 +130,126 @@ def write_stereo_yard(folder: Path, seed: int) -> None:
     whole = io.BytesIO()
     np.save(whole, np.stack(disparities))
     write_atomically(folder / "disparity.npy", whole.getvalue())
+    return folder
+
+
+TEXEL, WIDTH, DISTANCE = 0.01, 8.0, 5.5
+"""Side of a texel, width of a house and distance of the camera from the walls, in metres."""
+STEP = 0.5  # Metres between consecutive cameras: a wall point stays in view for some twelve of them
+NEAR = 2  # Houses to each side of the nearest one that a camera may see
+
+
+def _front(house: int) -> Material:
+    """The wall of a house: bricks, stone or peeling plaster, and windows where chance puts them."""
+    rng = np.random.default_rng([81, house])
+    shape, seed = grid((WIDTH, WALL_HEIGHT), TEXEL), 1000 * (house + 1)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        wall = bricks(shape, TEXEL, seed)
+    elif kind == 1:
+        wall = cut_stone(shape, TEXEL, seed, (float(rng.uniform(0.4, 0.8)), float(rng.uniform(0.2, 0.35))))
+    elif kind == 2:
+        wall = rubble(shape, TEXEL, seed, cell_m=float(rng.uniform(0.2, 0.35)), relief_m=0.05)
+    else:
+        peel = smooth(fractal(shape, TEXEL, seed + 40, wavelengths_m=(1.9, 0.05), ratio=0.62), -0.02, 0.02)
+        wall = over(bricks(shape, TEXEL, seed), plaster(shape, TEXEL, seed + 20), peel)
+    across = np.sort(rng.uniform(0.7, WIDTH - 0.7, 3))
+    for k, x in enumerate(across[np.diff(across, prepend=-9.0) > 1.4]):
+        for low in (1.0, 3.0):
+            low = low + float(rng.uniform(-0.15, 0.15))
+            half = float(rng.uniform(0.3, 0.45))
+            add_window(wall, (x - half, low, x + half, low + 1.2), seed + 60 + 7 * k + int(low))
+    return wall
+
+
+@lru_cache(maxsize=2 * (2 * NEAR + 1))
+def _house(house: int) -> tuple[list[Material], float]:
+    """Materials of a house (wall, ground before it, crates, stones) and how far it stands back, in metres."""
+    seed, side = 1000 * (house + 1), grid((2.0, 2.0), TEXEL)
+    ground = rubble(grid((WIDTH, 8.0), TEXEL), TEXEL, seed + 500, cell_m=0.14, relief_m=0.015)
+    wood = planks(side, TEXEL, seed + 600, 0.155)
+    stone = cut_stone(side, TEXEL, seed + 700, (0.45, 0.3))
+    return [_front(house), ground, wood, stone], float(np.random.default_rng([82, house]).uniform(0.0, 1.2))
+
+
+def build_near(house: int) -> World:
+    """Build a house and its neighbours as one world; x runs along the street, y into the walls."""
+    x, y, z = np.eye(3)
+    materials, walls, objects = list[Material](), list[list[Surface]](), list[list[Surface]]()
+    for h in range(house - NEAR, house + NEAR + 1):
+        rng, first = np.random.default_rng([83, h]), len(materials)
+        own, back = _house(h)
+        materials += own
+        at = WIDTH * h * x
+        walls.append([Surface(at + back * y, x, z, (WIDTH, WALL_HEIGHT), first)])
+        walls.append([Surface(at - 7.0 * y, x, y, (WIDTH, 8.0), first + 1)])
+        for _ in range(int(rng.integers(2, 5))):
+            u, away = float(rng.uniform(0.5, WIDTH - 0.5)), float(rng.uniform(0.6, 1.8))
+            size = rng.uniform([0.4, 0.4, 0.4], [0.8, 0.8, 1.5])
+            angle, material = float(rng.uniform(-0.4, 0.4)), first + 2 + int(rng.integers(2))
+            objects.append(_crate(at + u * x - away * y, size, angle, material))
+    return build_world(objects + walls, materials, SUN)
+
+
+@lru_cache(maxsize=1)
+def _plain_houses(count: int, texel: float = 0.02) -> list[Material]:
+    shape = grid((WIDTH, 8.0), texel)
+    ground = [rubble(shape, texel, 900 + 1000 * h, cell_m=0.14, relief_m=0.015) for h in range(count)]
+    return [_front(h) for h in range(count)] + ground
+
+
+def build_corner(C: F64, ahead: F64) -> World:
+    """Houses on both sides of two streets, along the first and the last direction ``ahead`` of a drive."""
+    z, walls, ground = np.eye(3)[2], list[list[Surface]](), list[list[Surface]]()
+    places = [(k, first + h, side) for k, first in ((0, -1), (-1, -3)) for h in range(9) for side in (1, -1)]
+    for number, (k, h, side) in enumerate(places):
+        u, away = side * ahead[k], side * np.cross(z, ahead[k])
+        at = C[k] * [1.0, 1.0, 0.0] + WIDTH * (h + (side < 0)) * ahead[k]
+        ground.append([Surface(at, u, away, (WIDTH, 8.0), len(places) + number)])
+        at = at + np.random.default_rng([82, number]).uniform(6.5, 7.7) * away
+        near = np.linalg.norm(
+            (at + WIDTH * np.linspace(0.0, 1.0, 9)[:, None] * u - C[:, None])[..., :2], axis=2
+        )
+        if near.min() > 4.0:
+            walls.append([Surface(at, u, z, (WIDTH, WALL_HEIGHT), number)])
+    return build_world(walls + ground, _plain_houses(len(places)), SUN)
+
+
+def _crate(place: np.ndarray, size: np.ndarray, angle: float, material: int) -> list[Surface]:
+    z, (w, d, h) = np.eye(3)[2], size.tolist()
+    u, v = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+    faces = [
+        (place - 0.5 * w * u - 0.5 * d * v, u, z, (w, h)),
+        (place + 0.5 * w * u + 0.5 * d * v, -u, z, (w, h)),
+        (place + 0.5 * w * u - 0.5 * d * v, v, z, (d, h)),
+        (place - 0.5 * w * u + 0.5 * d * v, -v, z, (d, h)),
+        (place - 0.5 * w * u - 0.5 * d * v + h * z, u, v, (w, d)),
+    ]
+    return [
+        Surface(o, a, b, s, material, flat=True, offset=(0.2 * k, 0.1 * k))
+        for k, (o, a, b, s) in enumerate(faces)
+    ]
+
+
+def walk_street(count: int, size: tuple[int, int]) -> list[Pose]:
+    """``count`` true cameras of one calibration along the street; the first n of any walk are the same."""
+    K = walk_calibration(size)
+    poses = []
+    for k in range(count):
+        rng, along = np.random.default_rng([84, k]), (NEAR + 1) * WIDTH + STEP * k
+        C = np.array([along, -DISTANCE, 1.6]) + rng.normal(0.0, [0.05, 0.2, 0.15])
+        heading = 0.35 * np.sin(along / 3.5) + rng.normal(0.0, 0.08)
+        ahead = np.array([np.sin(heading), np.cos(heading), rng.normal(0.06, 0.05)])
+        roll = float(np.tan(0.5 * np.radians(rng.uniform(-4.0, 4.0))))
+        poses.append(Pose(K, look_at(C, C + ahead, roll), C, float(rng.uniform(0.88, 1.12))))
+    return poses
+
+
+def write_street(folder: Path, count: int, *, size: tuple[int, int] = (480, 360), threads: int = 2) -> None:
+    """Images ``0000.png`` and so on of :func:`walk_street`; those that are there stay."""
+    poses = walk_street(count, size)
+    missing = {k: pose for k, pose in enumerate(poses) if not (folder / f"{k:04d}.png").is_file()}
+    houses = {k: int(pose.C[0] // WIDTH) for k, pose in missing.items()}
+    for house in sorted(set(houses.values())):
+        here = {k: pose for k, pose in missing.items() if houses[k] == house}
+        write_images(folder, build_near(house), here, size, [2006], threads)

@@ -5,7 +5,7 @@ A :class:`Material` holds linear RGB in [0, 1] and height in metres above the su
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,7 @@ Colour = tuple[float, float, float]
 Box = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True)
-class Material:
+class Material(NamedTuple):
     """Linear ``rgb`` (H, W, 3), ``height`` (H, W) in metres; sample (row, col) at (col, row) texel_m."""
 
     rgb: F32

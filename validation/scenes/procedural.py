@@ -1,9 +1,7 @@
-"""Procedural noise and patterns on a plane: band-limited, seeded by integers, the same numbers on every
-machine.
+"""Procedural noise and patterns on a plane: band-limited, seeded by integers, the same on every machine.
 
 Everything is integer hashing and elementwise arithmetic, so no library's random stream or summation order
-enters. Coordinates are metres on the surface; a map of shape (H, W) has its sample (row, column) at (column,
-row) * texel_m.
+enters. Coordinates are metres; a map of shape (H, W) has its sample (row, column) at (column, row) * texel_m.
 """
 
 from __future__ import annotations
@@ -80,15 +78,9 @@ def fractal(
     ratio: float = 0.6,
     wrap: bool = False,
 ) -> F32:
-    """Multi-octave noise (H, W), zero mean, about 0.5 RMS, between two wavelengths; ``wrap`` closes it along
-    x.
-
-    Raises ``ValueError`` if the shortest wavelength is under two texels (the map would be aliased).
+    """Multi-octave noise (H, W), zero mean, about 0.5 RMS, between two wavelengths, the shortest at least two
+    texels; ``wrap`` closes it along x.
     """
-    if wavelengths_m[1] < 2.0 * texel_m:
-        raise ValueError(
-            f"fractal needs wavelengths of at least two texels; got {wavelengths_m[1]} on {texel_m}"
-        )
     out = np.empty(shape, np.float32)
     steps = np.array([texel_m, *wavelengths_m, ratio])
     _fill_fractal(out, steps, seed, shape[1] * texel_m if wrap else 0.0)

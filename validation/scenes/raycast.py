@@ -1,16 +1,13 @@
-"""A small ray caster for surfaces with true relief: displaced planes and cylinders, sun, sky and cast
-shadows.
+"""A small ray caster for surfaces with true relief: displaced planes and cylinders, sun, sky, cast shadows.
 
 A surface is a chart: a point is (u, v, h), h metres above the base plane or base cylinder, and the solid is
-where h is below the surface's height map. A ray is marched through the slab that the map occupies, in steps
-no longer than the map's slope allows or half a texel, and the crossing is then refined: depth is that of the
-bilinear height map to a few micrometres. Shading is Lambertian, so a scene point has one colour from
-everywhere.
+where h is below the surface's height map. A ray is marched through the slab of the map, in steps no longer
+than the map's slope allows or half a texel, and the crossing is then refined: depth is that of the bilinear
+height map to a few micrometres. Shading is Lambertian, so a scene point has one colour from everywhere.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,15 +18,11 @@ from validation.scenes.materials import Material, smooth
 from validation.scenes.pose import Pose
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A chart in the world: ``origin`` (3,), unit ``u_axis`` and ``v_axis``, ``size`` (u, v) metres, its
-    ``material``.
-
-    A plane's normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs around it once
-    over the whole width of the map. ``disc`` > 0 keeps of a plane only what lies within that radius of its
-    middle. ``flat`` takes the relief for shading only (faces of boxes, so that their edges close). ``offset``
-    is where on the map (0, 0) lies.
+class Surface(NamedTuple):
+    """A chart in the world: ``origin`` (3,), unit axes, ``size`` (u, v) metres, its ``material``. A plane's
+    normal is u x v. A cylinder's axis is v, its ``radius`` that of the base; u runs around it once. ``disc``
+    > 0 keeps of a plane only what lies within that radius of its middle. ``flat`` takes the relief for
+    shading only (faces of boxes, so that their edges close). ``offset``: where on the map (0, 0) lies.
     """
 
     origin: F64
@@ -126,10 +119,8 @@ def _pack(materials: list[Material]) -> tuple[I64, F32, F32, F32]:
 
 def build_world(objects: list[list[Surface]], materials: list[Material], sun: F64) -> World:
     """Pack a scene: surfaces that stand together form an object; ``sun`` is the direction to the light, any
-    length.
-
-    Columns of ``World.numbers``: origin, u, v, normal (12), size (2), radius, disc, lowest and highest height
-    (2), steepest slope, texel, offset (2), bounding sphere (4), flat.
+    length. Columns of ``World.numbers``: origin, u, v, normal (12), size (2), radius, disc, lowest and
+    highest height (2), steepest slope, texel, offset (2), bounding sphere (4), flat.
     """
     layout, colours, heights, highest = _pack(materials)
     surfaces = [surface for group in objects for surface in group]
@@ -149,16 +140,8 @@ def build_world(objects: list[list[Surface]], materials: list[Material], sun: F6
             middle = middle + 0.5 * surface.size[0] * surface.u_axis
             reach = 0.5 * np.sqrt(surface.size[0] ** 2 + surface.size[1] ** 2) + max(high, -low)
         axes = [surface.origin, surface.u_axis, surface.v_axis, normal]
-        shape = [
-            *surface.size,
-            surface.radius,
-            surface.disc,
-            low,
-            high,
-            slope,
-            material.texel_m,
-            *surface.offset,
-        ]
+        relief = [low, high, slope, material.texel_m]
+        shape = [*surface.size, surface.radius, surface.disc, *relief, *surface.offset]
         numbers[s] = np.concatenate([*axes, shape, middle, [reach, float(surface.flat)]])
     kind = np.array([[CYLINDER if s.radius else PLANE, s.material] for s in surfaces], np.int64)
     length = float(np.sqrt(np.sum(np.asarray(sun, float) ** 2)))
@@ -185,10 +168,8 @@ def trace(
     world: World, pose: Pose, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
 ) -> tuple[F32, F64]:
     """Return linear RGB (H n, W n, 3) and depth (H n, W n) of a pinhole camera, z in metres, 0 = sky.
-
-    ``size`` is (width, height) in pixels, n = ``per_pixel`` samples along each axis; sample (r, c) looks at
-    pixel ((c + 0.5) / n - 0.5, ...). Without ``shade`` the colours are zero. The exposure of ``pose`` is not
-    used.
+    ``size`` is (width, height), n = ``per_pixel`` samples along each axis; sample (r, c) looks at pixel ((c +
+    0.5) / n - 0.5, ...). Without ``shade`` the colours are zero. The exposure of ``pose`` is not used.
     """
     out = np.zeros((size[1] * per_pixel, size[0] * per_pixel, 3), np.float32)
     depth = np.zeros(out.shape[:2])

@@ -27,17 +27,14 @@ REAL_SCENES = {
 TURNTABLE_SCENES = {"temple": "truth/temple", "lego": "truth/lego"}
 """Larger sets with truth, which only some studies use."""
 FOLDERS = REAL_SCENES | TURNTABLE_SCENES
-SHIFTED = "Cones9"
-"""Nine views of the Middlebury Cones, by a camera that moves without rotation."""
+SHIFTED = "Cones9"  # Nine views of the Middlebury Cones, by a camera that moves without rotation
 SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A set of images, sorted by name, and its truth where there is one.
-
-    ``K``, ``R`` (world-to-camera) (V, 3, 3) and ``C`` (V, 3) camera centres in metres, all None without
-    truth.
+    """A set of images, sorted by name, and its truth where there is one: ``K``, ``R`` (world-to-camera)
+    (V, 3, 3) and ``C`` (V, 3) camera centres in metres.
     """
 
     name: str
@@ -52,11 +49,17 @@ class Scene:
         return self.C is not None
 
     @property
+    def truth(self) -> tuple[F64, F64, F64] | None:
+        """Return K, R and C, None if they are not known."""
+        known = self.K is not None and self.R is not None and self.C is not None
+        return (self.K, self.R, self.C) if known else None  # type: ignore[return-value]
+
+    @property
     def cameras(self) -> tuple[F64, F64, F64]:
         """Return K, R and C; ``ValueError`` if they are not known."""
-        if self.K is None or self.R is None or self.C is None:
+        if self.truth is None:
             raise ValueError(f"the cameras of {self.name} are not known")
-        return self.K, self.R, self.C
+        return self.truth
 
 
 def data_root() -> Path | None:
@@ -80,10 +83,8 @@ def read_scene(folder: Path, name: str) -> Scene:
 
 
 def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
-    """The scene with the cameras of a model as its truth.
-
-    ``ValueError`` if an image has no camera there; if the truth need not be ``complete``, the scene then has
-    none, unless the model is one of other images.
+    """The scene with the cameras of a model as its truth. ``ValueError`` if an image has no camera there; if
+    the truth need not be ``complete``, the scene then has none, unless the model is one of other images.
     """
     views = {view.name: view for view in read_model(model).views if view.K is not None}
     missing = [path.name for path in scene.image_paths if path.name not in views]
@@ -98,17 +99,9 @@ def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
 
 def real_folder(name: str) -> Path | None:
     """Return the folder of one of ``FOLDERS``, or None if missing."""
-    if name not in FOLDERS:
-        raise ValueError(f"a real scene is one of {sorted(FOLDERS)}; got {name!r}")
     root = data_root()
     folder = None if root is None else root / FOLDERS[name]
     return folder if folder is not None and folder.is_dir() else None
-
-
-def load_real_scene(name: str) -> Scene | None:
-    """Load one of ``FOLDERS``, or return None; as :func:`real_folder`."""
-    folder = real_folder(name)
-    return None if folder is None else read_scene(folder, name)
 
 
 def load_fixture_scene(name: str = "courtyard") -> Scene:
@@ -119,7 +112,8 @@ def load_fixture_scene(name: str = "courtyard") -> Scene:
 def load_scene(name: str) -> Scene | None:
     """Load a fixture, a real scene or the shifted views; None if its images are not on this machine."""
     if name in FOLDERS:
-        return load_real_scene(name)
+        folder = real_folder(name)
+        return None if folder is None else read_scene(folder, name)
     if name != SHIFTED:
         return load_fixture_scene(name)
     root = data_root()
@@ -142,11 +136,8 @@ def scenes_here(names: Iterable[str]) -> list[Scene]:
 @cache
 def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     """True depth (H / stride, W / stride) of one view in metres, NaN where nothing was hit, and the stride.
-
     Sample (r, c) is the depth (z in the camera frame) at pixel (x, y) = (stride c, stride r).
     """
-    from PIL import Image as PillowImage
-
     folder = ROOT / "fixtures" / name
     record = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
     with PillowImage.open(folder / "depth" / f"{view:04d}.png") as image:

@@ -9,9 +9,9 @@ import hashlib
 import io
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -26,17 +26,14 @@ from validation.references.sift import SETTINGS, SiftKeypoints, detect_sift, mat
 from validation.scenes.real import Scene, data_root
 
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
-CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"
-"""Folder that keeps SIFT matches of image pairs."""
+CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"  # Folder that keeps SIFT matches of image pairs
 CONSISTENT_PX = 1.5
 """Sampson distance to the true F within which a match of a scene with cameras counts as right."""
-FARTHEST = 3.0
-"""Depth in medians beyond which such a match counts as wrong."""
+FARTHEST = 3.0  # Depth in medians beyond which such a match counts as wrong
 SCENES_WITH_CAMERAS = ("fountain-P11", "Herz-Jesus-P8")
 
 
-@dataclass(frozen=True)
-class RealPair:
+class RealPair(NamedTuple):
     """Matches (N, 2) px; ``truth`` (M, 4): right correspondences; ``F`` of the true cameras."""
 
     name: str
@@ -96,10 +93,9 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
 
 
 def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:
-    """The matches (N, 2) that agree with the cameras (3, 4), corrected to agree exactly; (M, 4).
-
-    They lie within ``CONSISTENT_PX`` of the epipolar constraint, before both cameras and no farther than
-    ``FARTHEST`` median depths. Both cameras need to be [K R, K t] with det K > 0.
+    """The matches (N, 2) that agree with the cameras (3, 4), corrected to agree exactly; (M, 4). They lie
+    within ``CONSISTENT_PX`` of the epipolar constraint, before both cameras and no farther than ``FARTHEST``
+    median depths. Both cameras need to be [K R, K t] with det K > 0.
     """
     F = fundamental_from_cameras(P1, P2)
     near = np.abs(sampson_residuals(F, xy1, xy2)) < CONSISTENT_PX

@@ -22,10 +22,9 @@ from validation.scenes.pose import look_at
 
 @dataclass(frozen=True)
 class Rig:
-    """``K, R`` (V, 3, 3), R world-to-camera, ``C`` (V, 3), ``X`` (N, 3), ``seen`` (V, N) whether a view may
-    see a point (the border of the image is checked besides), ``size`` of every image; ``flat`` (V,) views
-    whose points lie on one plane, which leaves a projective camera open; ``plane`` (N,) number of the plane
-    that a point lies on, where points lie on planes.
+    """Cameras (V), points ``X`` (N, 3), ``seen`` (V, N) whether a view may see a point (the border of the
+    image is checked besides); ``flat`` (V,) views whose points lie on one plane, which leaves a projective
+    camera open; ``plane`` (N,) number of the plane that a point lies on.
     """
 
     K: F64
@@ -103,13 +102,8 @@ def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) ->
     G = random_transform("projective", rng)
     P = P @ np.linalg.inv(G) * (rng.uniform(0.5, 2.0, n) * rng.choice([-1.0, 1.0], n))[:, None, None]
     X = X @ G.T * rng.choice([-1.0, 1.0], len(X))[:, None]
-    fitted = refine_projective_bundle(
-        P,
-        X,
-        Observations(tracks.view_index[use], tracks.point_index[use], tracks.xy[use]),
-        loss_px=10.0,
-        max_iterations=30,
-    )
+    seen = Observations(tracks.view_index[use], tracks.point_index[use], tracks.xy[use])
+    fitted = refine_projective_bundle(P, X, seen, loss_px=10.0, max_iterations=30)
     valid = np.bincount(tracks.point_index[use], minlength=len(X)) >= 2
     sigma = float(np.sqrt(np.mean(fitted.residual_px**2)))
     reasons = tuple("" if r else "sees a single plane" for r in registered)
@@ -122,13 +116,11 @@ def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) ->
 
 CLOUD_SIZE = (1536, 1024)
 FOCAL_PX = 1500.0
-SEEN = 0.75
-"""Share of the points in a view's sight that it has an observation of."""
+SEEN = 0.75  # Share of the points in a view's sight that it has an observation of
 
 
 def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Rig:
     """``points`` uniform in a box of 4 x 3 x 3.2, ``views`` cameras 6 to 9 off on a cap of 80 by 40 degrees.
-
     The principal point is off the image's middle by a normal deviate of half a percent of the long side.
     """
     X = rng.uniform([-2.0, -1.5, -1.6], [2.0, 1.5, 1.6], (points, 3))
@@ -145,8 +137,7 @@ def make_cloud(views: int, rng: np.random.Generator, *, points: int = 500) -> Ri
     return Rig(np.tile(K, (views, 1, 1)), R, C, X, seen, CLOUD_SIZE)
 
 
-CAP_PX = 1000.0
-"""Image distances are capped here: a point in a focal plane projects to infinity."""
+CAP_PX = 1000.0  # Image distances are capped here: a point in a focal plane projects to infinity
 
 
 def beside(rng: np.random.Generator, views: int, points: int) -> Rig:
@@ -195,11 +186,8 @@ def squared_distances(P: F64, X: F64, xy: F64) -> F64:
 
 @dataclass(frozen=True)
 class DrawnRig:
-    """One draw.
-
-    ``G`` (4, 4): transform of space; ``P`` (V, 3, 4): cameras in the transformed frame; ``xy`` (V, N, 2):
-    noisy pixels; ``X`` (N, 3): true points before the transform; ``centre`` (3,): centre of the first
-    camera.
+    """One draw: transform ``G`` (4, 4) of space, cameras ``P`` in that frame, noisy pixels ``xy`` (V, N, 2);
+    true points ``X`` (N, 3) and the ``centre`` of the first camera before the transform.
     """
 
     G: F64

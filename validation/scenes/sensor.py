@@ -5,8 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,7 @@ from validation.scenes.real import write_png
 PER_PIXEL = 2
 
 
-@dataclass(frozen=True)
-class Sensor:
+class Sensor(NamedTuple):
     """An ordinary camera. ``blur_px`` Gaussian point spread (before the pixel's own square), ``vignetting``
     loss of light at the corner, ``full_well`` electrons at white, ``read_noise`` electrons.
     """

@@ -18,9 +18,8 @@ STEREO_PAIRS = ("Tsukuba", "Teddy", "Cones", "Motorcycle")
 
 @dataclass(frozen=True)
 class StereoPair:
-    """``left, right`` (H, W, 3), ``truth`` (H, W) disparity of the left image, NaN where there is none,
-    ``judged`` (H, W) pixels that have truth and are seen by both cameras; the range is
-    0 .. ``disparities`` - 1.
+    """Images (H, W, 3), ``truth`` (H, W) disparity of the left one, NaN where there is none, ``judged``
+    pixels that have truth and are seen by both cameras; the range is 0 .. ``disparities`` - 1.
     """
 
     name: str
@@ -45,20 +44,25 @@ def stereo_folder(name: str) -> Path | None:
 def load_stereo_pair(name: str) -> StereoPair | None:
     """One of ``STEREO_PAIRS``, None if its files are not on this machine; or a rendered yard, "yard-N"."""
     yard = yard_number(name)
-    if yard is not None:
-        return _yard(stereo_yard_folder(yard), name)
-    folder = stereo_folder(name)
+    folder = stereo_folder(name) if yard is None else stereo_yard_folder(yard)
     if folder is None:
         return None
-    if name == "Motorcycle":
-        return _motorcycle(folder)
-    if name == "Cones":
+    files, other, disparities = ("left.png", "right.png"), None, 64
+    if yard is not None:
+        truth, other = np.load(folder / "disparity.npy")
+        disparities = int(np.ceil(np.nanmax(truth))) + 2
+    elif name == "Motorcycle":
+        files = ("motorcycle_left.png", "motorcycle_right.png")
+        truth = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
+        truth = np.where(np.isfinite(truth), truth, np.float32(np.nan))
+    elif name == "Cones":
+        files = ("im2.png", "im6.png")
         truth, other = (read_disparity(folder / f"disp{k}.png", 4.0) for k in (2, 6))
-        judged = seen_by_both(truth, other)
-        return StereoPair(name, read_rgb(folder / "im2.png"), read_rgb(folder / "im6.png"), truth, judged, 64)
-    truth = read_disparity(folder / "disparity.png", 16.0 if name == "Tsukuba" else 4.0)
-    left, right = read_rgb(folder / "left.png"), read_rgb(folder / "right.png")
-    return StereoPair(name, left, right, truth, seen_by_both(truth, None), 16 if name == "Tsukuba" else 64)
+    else:
+        scale, disparities = (16.0, 16) if name == "Tsukuba" else (4.0, 64)
+        truth = read_disparity(folder / "disparity.png", scale)
+    left, right = (read_rgb(folder / file) for file in files)
+    return StereoPair(name, left, right, truth, seen_by_both(truth, other), disparities)
 
 
 def seen_by_both(truth: F32, other: F32 | None) -> B8:
@@ -75,21 +79,6 @@ def seen_by_both(truth: F32, other: F32 | None) -> B8:
         same = np.abs(other[rows, np.maximum(partner, 0)] - truth) <= 1.0
     judged: B8 = inside & same
     return judged
-
-
-def _motorcycle(folder: Path) -> StereoPair:
-    stored = np.load(folder / "motorcycle_disp.npz")["arr_0"].astype(np.float32)
-    truth = np.where(np.isfinite(stored), stored, np.float32(np.nan)).astype(np.float32)
-    left, right = (read_rgb(folder / f"motorcycle_{side}.png") for side in ("left", "right"))
-    return StereoPair("Motorcycle", left, right, truth, seen_by_both(truth, None), 64)
-
-
-def _yard(folder: Path, name: str) -> StereoPair:
-    left, right = (read_rgb(folder / f"{side}.png") for side in ("left", "right"))
-    truth, other = np.load(folder / "disparity.npy")
-    return StereoPair(
-        name, left, right, truth, seen_by_both(truth, other), int(np.ceil(np.nanmax(truth))) + 2
-    )
 
 
 def read_disparity(path: Path, scale: float) -> F32:

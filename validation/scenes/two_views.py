@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,8 +15,7 @@ from thesisrecon.geometry.camera_matrix import project
 K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
 
 
-@dataclass(frozen=True)
-class TwoViews:
+class TwoViews(NamedTuple):
     """Cameras (3, 4), points X (N, 3) and their exact pixels (N, 2)."""
 
     P1: F64

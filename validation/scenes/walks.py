@@ -5,7 +5,7 @@ One camera observes a facade every half metre; points are seen by 3 to 10 neighb
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ STEP, SHORTEST, LONGEST = 0.5, 3, 10
 INTRINSICS = (1000.0, 1.0, 0.0, 500.0, 375.0, 0.02)
 
 
-@dataclass(frozen=True)
-class Walk:
+class Walk(NamedTuple):
     """True cameras, points and observations."""
 
     cameras: MetricCameras
@@ -35,7 +34,9 @@ class Walk:
 def make_walk(n: int, rng: np.random.Generator, *, sigma_px: float = 0.5, denser: int = 1) -> Walk:
     """n images with noise ``sigma_px`` in each coordinate, some 60 points for each, or ``denser``."""
     R, t = _poses(n, rng)
-    X = _facade(n, denser * (200 * n // 3), rng)
+    points = denser * (200 * n // 3)
+    away, height = rng.uniform(3.0, 8.0, points), rng.uniform(-2.0, 2.0, points)
+    X = np.column_stack([rng.uniform(-3.0, n * STEP + 3.0, points), away, height])
     view, point = _tracks(R, t, X, rng)
     used, point = np.unique(point, return_inverse=True)
     X = X[used]
@@ -62,11 +63,6 @@ def _poses(n: int, rng: np.random.Generator) -> tuple[F64, F64]:
     down = np.tile([0.0, 0.0, -1.0], (n, 1))
     R = np.stack([np.cross(down, forward), down, forward], axis=1)
     return R, -np.einsum("vab,vb->va", R, centres)
-
-
-def _facade(n: int, points: int, rng: np.random.Generator) -> F64:
-    away, height = rng.uniform(3.0, 8.0, points), rng.uniform(-2.0, 2.0, points)
-    return np.column_stack([rng.uniform(-3.0, n * STEP + 3.0, points), away, height])
 
 
 def _tracks(R: F64, t: F64, X: F64, rng: np.random.Generator) -> tuple[I64, I64]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from validation.runs.records import Stage
-from validation.runs.scenes import available_scenes
+import tomllib
+from pathlib import Path
+
+from validation.runs.records import Stage, available_scenes
 from validation.stages.boards import BoardsStage
 from validation.stages.bundle import BundleStage
 from validation.stages.cameras import CamerasStage
@@ -18,21 +20,9 @@ from validation.stages.view_interpolation import ViewInterpolationStage
 from validation.stages.views import ViewsStage
 
 __all__ = ["STAGES", "available_scenes"]
-
-STAGES: dict[str, Stage] = {
-    stage.name: stage
-    for stage in (
-        BoardsStage(),
-        FundamentalStage(),
-        FeaturesStage(),
-        TriangulationStage(),
-        CamerasStage(),
-        CloudsStage(),
-        BundleStage(),
-        DisparityStage(),
-        ViewInterpolationStage(),
-        DepthStage(),
-        SurfaceStage(),
-        ViewsStage(),
-    )
-}
+_PAIRS = (BoardsStage(), FundamentalStage(), FeaturesStage(), TriangulationStage())
+_CAMERAS = (CamerasStage(), CloudsStage(), BundleStage())
+_DENSE = (DisparityStage(), ViewInterpolationStage(), DepthStage(), SurfaceStage(), ViewsStage())
+STAGES: dict[str, Stage] = {stage.name: stage for stage in (*_PAIRS, *_CAMERAS, *_DENSE)}
+for _name, _texts in tomllib.loads(Path(__file__).parent.with_suffix(".toml").read_text("utf-8")).items():
+    STAGES[_name].title, STAGES[_name].definition = _texts["title"], _texts["definition"]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -16,36 +16,20 @@ from thesisrecon.camera import Camera, project_camera, undistort
 from thesisrecon.records import TexturedMesh
 from validation.references.libraries import one_thread
 from validation.references.opencv import board_corners, calibrate_from_corners
-from validation.runs.records import (
-    OURS,
-    Judgement,
-    Outcome,
-    Picture,
-    ReportOptions,
-    Stage,
-    Task,
-    plot,
-    read_arrays,
-    row,
-    scatter,
-    slug,
-)
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task, read_arrays
+from validation.runs.tables import OURS, Metric, Values, plot, row, scatter, slug
 from validation.scenes.materials import Material
 from validation.scenes.pose import Pose, look_at
-from validation.scenes.raycast import Surface, World, build_world, trace
+from validation.scenes.raycast import Surface, build_world, trace
 from validation.scenes.sensor import Sensor, expose, integrate_pixels
 
 SIZE = (640, 480)
 K = np.array([[612.4, 0.0, 327.3], [0.0, 612.4, 233.6], [0.0, 0.0, 1.0]])
 K1 = -0.12
-CORNERS = (9, 6)
-"""Inner corners along and across."""
+CORNERS = (9, 6)  # Inner corners along and across
 SQUARE_M = 0.03
-MARGIN = 2
-"""Squares of white around the board."""
-TEXELS = 12
-"""Side of a square (m)."""
+MARGIN = 2  # Squares of white around the board
+TEXELS = 12  # Side of a square (m)
 DARK, LIGHT = 0.05, 0.62
 PER_PIXEL = 2
 SENSOR = Sensor(vignetting=0.0)
@@ -53,8 +37,7 @@ RAYCAST, RENDERED, LENS = "ray caster", "renderer", "lens"
 WAYS = (RAYCAST, RENDERED, LENS)
 
 
-@dataclass(frozen=True)
-class Board:
+class Board(NamedTuple):
     """Inner corners ``X`` (N, 3) in metres, row by row; cameras R (V, 3, 3), t (V, 3); k1."""
 
     X: F64
@@ -64,12 +47,8 @@ class Board:
 
     def projections(self) -> F64:
         """(V, N, 2) true pixels of the corners."""
-        return np.array(
-            [
-                project_camera(K, R, t, self.X, distortion=self.distortion)
-                for R, t in zip(self.R, self.t, strict=True)
-            ]
-        )
+        poses = zip(self.R, self.t, strict=True)
+        return np.array([project_camera(K, R, t, self.X, distortion=self.distortion) for R, t in poses])
 
 
 def make_board(way: str, views: int) -> Board:
@@ -115,12 +94,6 @@ TEXEL_M = SQUARE_M / TEXELS
 
 
 def _raycast(board: Board) -> Iterator[F32]:
-    world = _world()
-    for R, t in zip(board.R, board.t, strict=True):
-        yield trace(world, Pose(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)[0]
-
-
-def _world() -> World:
     pattern = _pattern()
     # u x v is the normal, which looks at the cameras, along -z: u runs along y, v along x.
     rgb = np.repeat(np.ascontiguousarray(pattern.T)[..., None], 3, axis=2)
@@ -128,7 +101,9 @@ def _world() -> World:
     corner = -FIRST * TEXEL_M * np.array([1.0, 1.0, 0.0])
     size = ((pattern.shape[0] - 1) * TEXEL_M, (pattern.shape[1] - 1) * TEXEL_M)
     plane = Surface(corner, np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), size, 0, flat=True)
-    return build_world([[plane]], [material], np.array([0.0, 0.0, -1.0]))
+    world = build_world([[plane]], [material], np.array([0.0, 0.0, -1.0]))
+    for R, t in zip(board.R, board.t, strict=True):
+        yield trace(world, Pose(K, R, -R.T @ t), SIZE, per_pixel=PER_PIXEL)[0]
 
 
 def _rendered(board: Board) -> Iterator[F32]:
@@ -164,37 +139,26 @@ class BoardsStage(Stage):
     """``cv2.calibrateCamera`` on rendered boards."""
 
     name = "boards"
-    title = "Calibration of rendered boards"
-    definition = (
-        "A chessboard rendered with known cameras by the ray caster of the courtyard, by the library's "
-        "renderer, and through the library's camera with radial distortion; "
-        "lens blur, noise and tone curve are the courtyard's. cv2.findChessboardCorners, cornerSubPix and "
-        "calibrateCamera are independent of them. Differences are OpenCV's result minus truth, beside the "
-        "standard deviation stated by OpenCV."
-    )
+    always = WAYS
 
     scenes = ("boards",)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        return WAYS
-
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         one_thread()
         board = _board(task.method, options)
         pictures = board_images(task.method, board)
-        folder = options.folder(task.stage, task.scene, task.method)
         beside = np.concatenate([picture[::2, ::2] for picture in pictures[:4]], axis=1)
         PIL.Image.fromarray(beside).save(folder / "boards.png")
         corners = [board_corners(picture, CORNERS) for picture in pictures]
-        found = calibrate_from_corners(board.X, corners, SIZE)
-        np.savez(folder / "found.npz", corners=np.array(corners), K=found.K, k1=found.k1, std=found.std)
+        K, k1, std = calibrate_from_corners(board.X, corners, SIZE)
+        np.savez(folder / "found.npz", corners=np.array(corners), K=K, k1=k1, std=std)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         metrics, traces, pictures = list[Metric](), list[dict[str, Any]](), list[Picture]()
         for way, outcome in outcomes.items():
             board, found = _board(way, options), read_arrays(outcome, "found.npz")
-            metrics += _metrics(scene, way, board, found)
             if found is not None:
+                metrics += _metrics(scene, way, board, found)
                 off = np.round((found["corners"] - board.projections()).reshape(-1, 2), 4)
                 traces.append(scatter(way, *off.T.tolist(), marker={"size": 4, "opacity": 0.6}))
                 pictures.append(Picture(f"{slug(way)}/boards.png", f"By the {way}", "Four of the images."))
@@ -208,20 +172,14 @@ def _board(way: str, options: ReportOptions) -> Board:
     return make_board(way, QUICK_VIEWS if options.quick else VIEWS)
 
 
-def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64] | None) -> list[Metric]:
+def _metrics(scene: str, way: str, board: Board, found: Mapping[str, F64]) -> list[Metric]:
     """Return the rows of one renderer: corners, focal length, principal point, distortion."""
 
     def number(name: str, unit: str, ours: Any, own: Any, text: str) -> Metric:
-        values = {
-            OURS: None if found is None else float(ours),
-            "cv2, stated standard deviation": None if found is None else float(own),
-        }
         # An error and a standard deviation, both of OpenCV: neither is ours or better.
+        values: Values = {OURS: float(ours), "cv2, stated standard deviation": float(own)}
         return row(scene, f"{way}: {name}", unit, values, text, ranked=False)
 
-    if found is None:
-        names = (("corners", "px"), ("focal length", "%"), ("principal point", "px"), ("distortion", ""))
-        return [number(name, unit, None, None, "") for name, unit in names]
     off = (found["corners"] - board.projections()).reshape(-1, 2)
     focal = np.sqrt(found["K"][0, 0] * found["K"][1, 1])
     std, centre = found["std"], np.linalg.norm(found["K"][:2, 2] - K[:2, 2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -14,19 +15,16 @@ from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.records import Reconstruction
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.runs.records import (
-    OURS,
+    IMAGE_SCENES,
     Judgement,
     Outcome,
     ReportOptions,
     Stage,
     Task,
-    each,
-    ratio,
+    load_images,
     read_arrays,
-    row,
 )
-from validation.runs.scenes import has_images, load_images
-from validation.runs.tables import Metric
+from validation.runs.tables import OURS, Metric, each, ratio, row
 from validation.scenes.pose import perturb
 from validation.scenes.walks import SIZE, make_walk
 from validation.stages.cameras import our_model
@@ -34,34 +32,18 @@ from validation.stages.cameras import our_model
 CERES = "Ceres"
 STREET = "street"
 FOCAL_K1 = np.array([True, False, False, False, False, True])
-LOSS_PX = 0.2
-"""Scale of the robust losses: about twice the noise of the images, so that they take effect."""
+LOSS_PX = 0.2  # Scale of the robust losses: about twice the noise of the images, so that they take effect
 
 
 class BundleStage(Stage):
     """The same problem, start and loss for all methods."""
 
     name = "bundle"
-    title = "Bundle adjustment"
-    definition = (
-        "The final model of our run, every camera and point moved (focal length by 2 %), adjusted to "
-        "convergence by ours and by COLMAP's Ceres from the same start, Huber's loss. Cost is computed here, "
-        "by one function, from the cameras and points that each leaves. Covariances, ours against COLMAP's "
-        "estimate_ba_covariance: of the saved model (and of a synthetic street) at its optimum, squared "
-        "loss, focal length, principal point and k1 free, poses in the inner gauge."
-    )
+    scenes, own = (STREET, *IMAGE_SCENES), True
+    required = (("cameras", OURS),)
+    always = (OURS, CERES)
 
-    def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene == STREET or has_images(scene, options)
-
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        return (OURS, CERES)
-
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("cameras", OURS),)
-
-    def run(self, task: Task, options: ReportOptions) -> None:
-        folder = options.folder(task.stage, task.scene, task.method)
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         exact, points, given, size = _optimum(task.scene, options)
         poses, camera = _covariances(task.method, exact, points, given, size)
         np.savez(folder / "covariances.npz", poses=poses, camera=camera)

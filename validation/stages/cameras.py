@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 import thesisrecon
+from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.config.text import config_from_tables
 from thesisrecon.errors import StageFailure
@@ -17,25 +18,10 @@ from thesisrecon.io._files import read_json
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
-from validation.metrics.cameras import measure_cameras, measure_reprojection
-from validation.metrics.intervals import focal_errors_pct
+from validation.metrics.cameras import focal_errors_pct, measure_cameras, measure_reprojection
 from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_colmap_model
-from validation.runs.records import (
-    OURS,
-    Judgement,
-    Outcome,
-    Plot,
-    ReportOptions,
-    Stage,
-    Task,
-    Values,
-    each,
-    plot,
-    row,
-    scatter,
-)
-from validation.runs.scenes import has_images, load_images, truth_of
-from validation.runs.tables import Metric
+from validation.runs.records import IMAGE_SCENES, Judgement, Outcome, ReportOptions, Stage, Task, load_images
+from validation.runs.tables import OURS, Metric, Plot, Values, each, plot, row, scatter
 from validation.scenes.real import Scene
 
 THESIS, PER_IMAGE = "ours (thesis)", "ours (a camera each)"
@@ -59,15 +45,7 @@ class CamerasStage(Stage):
     """Reconstruction by ours and by COLMAP without priors on the same images."""
 
     name = "cameras"
-    title = "Cameras and intrinsics"
-    definition = (
-        "From images without any camera prior: the default and the thesis' preset and "
-        "COLMAP (default, with the principal point refined, and its global mapper), one thread each. "
-        "Every number is recomputed from the saved cameras and points."
-    )
-
-    def takes(self, scene: str, options: ReportOptions) -> bool:
-        return has_images(scene, options)
+    scenes, own = IMAGE_SCENES, True
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
@@ -83,9 +61,8 @@ class CamerasStage(Stage):
             return ((self.name, OURS),)
         return ((self.name, MATCHES),) if method in MAPPERS else ()
 
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         scene = load_images(task.scene, options)
-        folder = options.folder(task.stage, task.scene, task.method)
         if task.method not in SETTINGS:
             _run_colmap(task, scene, options, folder)
             return
@@ -142,7 +119,7 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, folder: Path) 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
     rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
-    truth = truth_of(scene)
+    truth = scene.truth
     if truth is None:
         return rows
     errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
@@ -219,11 +196,8 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
 
 
 def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    records: dict[str, Any] = {
-        name: read_json(outcomes[name].folder / "run" / "summary.json")
-        for name in SETTINGS
-        if name in outcomes and outcomes[name].ok
-    }
+    done = [name for name in SETTINGS if name in outcomes and outcomes[name].ok]
+    records: dict[str, Any] = {n: read_json(outcomes[n].folder / "run" / "summary.json") for n in done}
     trusted = each(records, lambda r: bool(r["trusted"]))
     silent = each(records, lambda r: sum(not refused["reason"] for refused in r["refused"]))
     rows = [
@@ -232,47 +206,40 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     ]
     if scene.K is None or not records:
         return rows
+    text = "largest stated standard deviation of a focal length"
     for name, where in ((OURS, ""), (PER_IMAGE, ", a camera each")):
         cameras = records.get(name, {}).get("cameras", [])
         held = _share_held(cameras, scene.K) if cameras else None
-        text = "largest stated standard deviation of a focal length"
-        rows += [
-            row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True),
-            row(scene.name, f"widest focal interval{where}", "%", _widest(cameras), text),
-        ]
+        focals = [c["focal_px"] for c in cameras if c.get("focal_px")]
+        widest = max((100.0 * f["std"] / f["value"] for f in focals), default=None)
+        rows.append(row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True))
+        rows.append(row(scene.name, f"widest focal interval{where}", "%", widest, text))
     return rows
 
 
-def _widest(cameras: list[dict[str, Any]]) -> float | None:
-    focals = [c["focal_px"] for c in cameras if c.get("focal_px")]
-    return max((100.0 * f["std"] / f["value"] for f in focals), default=None)
-
-
-def _share_held(cameras: list[dict[str, Any]], K: np.ndarray[Any, Any]) -> float | None:
-    entries = {"focal_px": None, "principal_x_px": (0, 2), "principal_y_px": (1, 2)}
-    held = []
-    for camera, true_K in zip(cameras, K, strict=True):
-        for name, entry in entries.items():
-            interval = camera.get(name)
-            if interval is None or not interval["std"]:
-                continue
-            truth = np.sqrt(true_K[0, 0] * true_K[1, 1]) if entry is None else true_K[entry]
-            held.append(abs(interval["value"] - truth) <= 1.96 * interval["std"])
+def _share_held(cameras: list[dict[str, Any]], K: F64) -> float | None:
+    truths = {"focal_px": np.sqrt(K[:, 0, 0] * K[:, 1, 1])}
+    truths |= {"principal_x_px": K[:, 0, 2], "principal_y_px": K[:, 1, 2]}
+    held = [
+        abs(interval["value"] - truth[view]) <= 1.96 * interval["std"]
+        for view, camera in enumerate(cameras)
+        for name, truth in truths.items()
+        if (interval := camera.get(name)) and interval["std"]
+    ]
     return 100.0 * float(np.mean(held)) if held else None
 
 
 def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
     """Plot the focal length of every image by each method, and the true one."""
     images = range(1, len(scene.image_paths) + 1)
-    traces = [scatter(name, images, _focals(model)) for name, model in models.items() if model is not None]
+    traces = []
+    for name, model in models.items():
+        if model is not None and model.K is not None:
+            focal = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
+            seen = zip(focal, model.registered, strict=True)
+            traces.append(scatter(name, images, [float(f) if there else None for f, there in seen]))
     if scene.K is not None:
         true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
         marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
         traces.append(scatter("truth", images, true, marker=marker))
     return plot("Focal lengths", traces, "image", "focal length (px)")
-
-
-def _focals(model: Reconstruction) -> list[float | None]:
-    assert model.K is not None
-    found = np.sqrt(model.K[:, 0, 0] * model.K[:, 1, 1])
-    return [float(f) if seen else None for f, seen in zip(found, model.registered, strict=True)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,52 +18,40 @@ from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.records import Reconstruction
 from validation.references.open3d_geometry import refine_by_icp
 from validation.runs.records import (
-    OURS,
+    IMAGE_SCENES,
     Judgement,
     Outcome,
-    Plot,
     ReportOptions,
     Stage,
     Task,
+    load_images,
     read_arrays,
-    row,
-    slug,
 )
-from validation.runs.scenes import has_images, load_images
-from validation.runs.tables import Metric
+from validation.runs.tables import OURS, Metric, Plot, row, slug
 from validation.scenes.real import Scene
 from validation.stages.cameras import COLMAP, COLMAP_PP, read_model
 
 ICP = "Open3D, ICP"
-NEAR_PCT = 0.5
-"""A point has a partner if the other cloud has a point within this share of its depth (%)."""
+NEAR_PCT = 0.5  # A point has a partner if the other cloud has a point within this share of its depth (%)
 
 
 class CloudsStage(Stage):
     """Two clouds of one scene, aligned by their cameras."""
 
     name = "clouds"
-    title = "Point clouds"
-    definition = (
-        "The points of ours and of COLMAP, aligned by the least-squares similarity of their camera "
-        "centres (both to the true ones where they are known). Distances are in per cent of the median "
-        "distance of the points from the cameras. ICP refines rotation and translation, the scale is kept."
-    )
-
-    def takes(self, scene: str, options: ReportOptions) -> bool:
-        return has_images(scene, options)
+    scenes, own = IMAGE_SCENES, True
+    required = (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return () if options.gates_only else (ICP,)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("cameras", OURS), ("cameras", COLMAP), ("cameras", COLMAP_PP))
-
-    def run(self, task: Task, options: ReportOptions) -> None:
-        folder = options.folder(task.stage, task.scene, task.method)
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         images = load_images(task.scene, options)
         for name, clouds in _all_clouds(images, _models(images, options)).items():
-            np.savez(folder / f"{slug(name)}.npz", transform=clouds.refined_by_icp())
+            np.savez(
+                folder / f"{slug(name)}.npz",
+                transform=refine_by_icp(clouds.mine, clouds.other, NEAR_PCT / 100.0 * clouds.unit),
+            )
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
@@ -82,18 +71,13 @@ class CloudsStage(Stage):
 
 
 class Clouds(NamedTuple):
-    """Points of ours (N, 3) and of a reference (M, 3) in one frame, and their distance from the cameras.
-
-    The frame is the true one, or theirs without truth; ``unit`` is the median distance.
+    """Points of ours (N, 3) and of a reference (M, 3) in one frame, and their distance from the cameras. The
+    frame is the true one, or theirs without truth; ``unit`` is the median distance.
     """
 
     mine: F64
     other: F64
     unit: float
-
-    def refined_by_icp(self) -> F64:
-        """Return the motion (4, 4) of ours by Open3D's ICP."""
-        return refine_by_icp(self.mine, self.other, NEAR_PCT / 100.0 * self.unit)
 
     def distances_pct(self) -> F64:
         """Return the distance of each point of ours to the nearest of theirs."""
@@ -113,9 +97,8 @@ def _models(scene: Scene, options: ReportOptions) -> dict[str, Reconstruction]:
 
 def _all_clouds(scene: Scene, models: Mapping[str, Reconstruction]) -> dict[str, Clouds]:
     """Return the clouds of ours and of each reference whose cameras could be aligned."""
-    pairs = {
-        n: common_frame(scene, models[OURS], m) for n, m in models.items() if OURS in models and n != OURS
-    }
+    others = [name for name in models if name != OURS and OURS in models]
+    pairs = {name: common_frame(scene, models[OURS], models[name]) for name in others}
     return {name: clouds for name, clouds in pairs.items() if clouds is not None}
 
 
@@ -139,9 +122,8 @@ def common_frame(scene: Scene, ours: Reconstruction, theirs: Reconstruction) -> 
 
 
 def same_points(ours: Reconstruction, theirs: Reconstruction) -> I64:
-    """Return pairs (M, 2) of indices of valid points that are the same scene point.
-
-    They were seen within a pixel of each other in more images than any other pair of either.
+    """Return pairs (M, 2) of indices of valid points that are the same scene point. They were seen within a
+    pixel of each other in more images than any other pair of either.
     """
     votes: Counter[tuple[int, int]] = Counter()
     for view in np.flatnonzero(ours.registered & theirs.registered):

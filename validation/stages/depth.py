@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.metrics.depth import (
     Judged,
-    JudgedMaps,
+    Scores,
     TrueDepth,
     coloured,
     depth_colours,
@@ -31,9 +32,8 @@ from validation.metrics.depth import (
     true_depth,
     true_from_maps,
 )
-from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, each, row
-from validation.runs.scenes import load_images
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task, load_images
+from validation.runs.tables import OURS, Metric, each, row
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.stages.cameras import our_model
 
@@ -41,40 +41,25 @@ THESIS = "ours (thesis)"
 PRESETS = {OURS: "default", THESIS: "thesis"}
 COURTYARD = "courtyard"
 SCENES = (COURTYARD, "fountain-P11", "Herz-Jesus-P8")
-SIDE_PX = 448
-"""Long side of the depth maps; the library default of 1024 takes too long for a report."""
+SIDE_PX = 448  # Long side of the depth maps; the library default of 1024 takes too long for a report
 FEW, FEW_AROUND = ("fountain-P11",), 2
 """Scenes whose depth maps only their own gates read; images on each side of the middle that these need."""
-WORST = 0.02
-"""Relative error that is red in the figures."""
+WORST = 0.02  # Relative error that is red in the figures
 
 
 class DepthStage(Stage):
     """Depth maps of the default and the thesis preset, from our cameras."""
 
     name = "depth"
-    title = "Depth maps"
-    definition = (
-        f"Depth maps of every image from our own cameras, long side {SIDE_PX} px by "
-        "default (the library's is 1024), the same for both presets: the default (matched pairs, robust "
-        "fusion, slanted windows, completion) and the thesis' (maximum likelihood scanlines, linked along "
-        "the sequence; on the courtyard alone, not in a quick report). The courtyard is compared "
-        "with its true depth after similarity alignment of the cameras; other images with their sparse "
-        "points."
-    )
-
-    def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene in SCENES or scene in options.folders
+    scenes, own = SCENES, True
+    required = (("cameras", OURS),)
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         # The thesis preset takes as long as the default and is evaluated only with true depth.
         whole = scene == COURTYARD and not (options.quick or options.gates_only)
         return (OURS, THESIS) if whole else (OURS,)
 
-    def needs(self, method: str) -> tuple[tuple[str, str], ...]:
-        return (("cameras", OURS),)
-
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         scene = load_images(task.scene, options)
         images, model = images_of(scene), our_model(scene, options)
         if options.gates_only and task.scene in FEW:
@@ -86,7 +71,6 @@ class DepthStage(Stage):
         dense = replace(dense, max_side=side_of(options))
         maps = confirmed_depth_maps(dense, dense.prepare(images, model))
         seconds = time.process_time() - start
-        folder = options.folder(task.stage, task.scene, task.method)
         for view, m in maps.items():
             np.savez(folder / f"{view:04d}.npz", P=m.P, depth=m.depth, std=m.std, views=m.views)
         write_text(folder / "seconds.txt", f"{seconds / max(len(maps), 1)}\n")
@@ -158,7 +142,7 @@ def _judged(
     return [judge_against_truth(found, truths[view], scale) for view, found in maps.items()]
 
 
-def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric]:
+def _metrics(scene: str, judged: Mapping[str, Scores | None]) -> list[Metric]:
     of, against = (
         ("points visible in two images", "true depth")
         if scene == COURTYARD
@@ -166,19 +150,18 @@ def _metrics(scene: str, judged: Mapping[str, JudgedMaps | None]) -> list[Metric
     )
     error = f"median |z / z_true - 1| of all known depths against the {against}"
     right = f"share of the {of} whose depth is known and right to 1 %, mean of the views"
-    right_known = "share of the known depths that are right to 1 %"
     ideal = "median error over the stated standard deviation, over 0.6745: 1 is ideal"
-    least = "the least of these shares"
-    rows: tuple[tuple[str, str, Callable[[JudgedMaps], float], str, bool], ...] = (
-        ("depth error, median", "%", lambda j: 100.0 * j.median, error, False),
-        ("within 1 %", "%", lambda j: 100.0 * j.right, right, True),
-        ("within 1 %, worst view", "%", lambda j: 100.0 * j.worst, least, True),
-        ("known", "%", lambda j: 100.0 * j.known, f"share of the {of} that have a depth", True),
-        ("within 1 % of the known", "%", lambda j: 100.0 * j.right_of_known, right_known, True),
-        ("error in deviations", "", lambda j: j.deviations, ideal, False),
-    )
+    rows = {
+        "depth error, median": ("%", error),
+        "within 1 %": ("%", right),
+        "within 1 %, worst view": ("%", "the least of these shares"),
+        "known": ("%", f"share of the {of} that have a depth"),
+        "within 1 % of the known": ("%", "share of the known depths that are right to 1 %"),
+        "error in deviations": ("", ideal),
+    }
     return [
-        row(scene, name, unit, each(judged, read), text, more=more) for name, unit, read, text, more in rows
+        row(scene, name, unit, each(judged, itemgetter(name)), text, more="error" not in name)
+        for name, (unit, text) in rows.items()
     ]
 
 

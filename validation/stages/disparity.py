@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -15,19 +16,8 @@ from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.metrics.depth import bad_pixels, coloured
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
-from validation.runs.records import (
-    OURS,
-    Judgement,
-    Outcome,
-    Picture,
-    ReportOptions,
-    Stage,
-    Task,
-    each,
-    ratio,
-    read_arrays,
-    row,
-)
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task, read_arrays
+from validation.runs.tables import OURS, each, ratio, row
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
 THESIS, SEMI_GLOBAL = "ours (thesis)", "ours (semi-global)"
@@ -45,19 +35,11 @@ class DisparityStage(Stage):
     """Dense matching with the same parameters for all pairs."""
 
     name = "disparity"
-    title = "Disparities"
-    definition = (
-        "Rectified pairs with dense truth; the same parameters for all pairs, one thread each. OpenCV's "
-        "semi-global matching has block 3, P1 = 216, P2 = 864, and widened images, to see every column; "
-        "timed are the images as they are."
-    )
+    always = (*MATCHERS, THREE_WAY, HH)
 
     scenes = STEREO_PAIRS
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        return (*MATCHERS, THREE_WAY, HH)
-
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         pair = _pair(task.scene)
         runs = 1 if options.quick else 3
         disparity = _match(task.method, pair)  # compiles
@@ -67,7 +49,6 @@ class DisparityStage(Stage):
             # The columns that we add at the left border are not counted as OpenCV's.
             _match(task.method, pair, widened=False)
             seconds.append(time.process_time() - start)
-        folder = options.folder(task.stage, task.scene, task.method)
         np.savez(folder / "disparity.npz", disparity=disparity, seconds=min(seconds))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
@@ -78,39 +59,35 @@ class DisparityStage(Stage):
         worse = each(maps, lambda d: bad_pixels(d, pair, 2.0))
         unseen = np.isfinite(pair.truth) & ~pair.judged
         hidden = each(maps, lambda d: 100.0 * np.isfinite(d)[unseen].mean())
-        on_surfaces = each(maps, lambda d: _surface_error(d, pair))
+        with np.errstate(invalid="ignore"):
+            off = {n: None if d is None else np.abs(d - pair.truth)[pair.judged] for n, d in maps.items()}
+            on_surfaces = each(off, lambda d: d[d < 1.0].mean())
         known = each(maps, lambda d: 100.0 * np.isfinite(d)[pair.judged].mean())
         spent = each(found, lambda f: 1e3 * float(f["seconds"]))
         better = min((v for n in (THREE_WAY, HH) if (v := wrong[n]) is not None), default=None)
+        over, slower = ratio(wrong[OURS], better), ratio(spent[OURS], spent[HH])
         metrics = [
             row(scene, BAD, "%", wrong, DEFINITION),
             row(scene, "off by more than 2 px", "%", worse, DEFINITION),
             row(scene, "known", "%", known, KNOWN, more=True),
             row(scene, "time", "ms", spent, "processor time, minimum of all runs"),
+            row(scene, "bad pixels over the better reference", "", over, f"{BAD}, over the better SGBM"),
         ]
-        text = "off by more than 1 px, over the better mode of OpenCV"
-        over = ratio(wrong[OURS], better)
-        metrics.append(row(scene, "bad pixels over the better reference", "", over, text))
         for name in (THESIS, SEMI_GLOBAL):
             metrics.append(row(scene, f"{name}: {BAD}", "%", wrong[name], DEFINITION))
             metrics.append(row(scene, f"{name}: known", "%", known[name], KNOWN, more=True))
-        text = "share of the pixels hidden in the other image that have a disparity"
-        metrics.append(row(scene, "known though hidden", "%", hidden, text))
-        text = "mean over the pixels visible in both images that are off by less than 1 px"
-        metrics.append(row(scene, "error on surfaces", "px", on_surfaces, text))
-        text = "processor time, a ratio of two runs on the same machine"
-        metrics.append(row(scene, "time over SGBM HH", "s / s", ratio(spent[OURS], spent[HH]), text))
+        unseen_text = "share of the pixels hidden in the other image that have a disparity"
+        near_text = "mean over the pixels visible in both images that are off by less than 1 px"
+        metrics += [
+            row(scene, "known though hidden", "%", hidden, unseen_text),
+            row(scene, "error on surfaces", "px", on_surfaces, near_text),
+            row(scene, "time over SGBM HH", "s / s", slower, "processor time on the same machine"),
+        ]
         drawn = {name: d for name, d in maps.items() if d is not None}
         shown = [name for name in (THESIS, OURS, THREE_WAY) if name in drawn]
         PIL.Image.fromarray(_picture(pair, drawn, shown)).save(options.folder(self.name, scene) / "maps.png")
         text = f"Left image and truth, then {', '.join(shown)}; below: off by 1 px yellow, by 2 px red."
         return Judgement(metrics, pictures=[Picture("maps.png", "Disparities", text)])
-
-
-def _surface_error(disparity: F32, pair: StereoPair) -> float:
-    with np.errstate(invalid="ignore"):
-        off = np.abs(disparity - pair.truth)[pair.judged]
-        return float(off[off < 1.0].mean())
 
 
 def _pair(scene: str) -> StereoPair:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import compose_camera
-from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io._images import read_images
@@ -22,19 +23,16 @@ from validation.references.libraries import NoReference
 from validation.references.opencv import harris_corners, sift_corners
 from validation.references.sift import sift_front_end
 from validation.runs.records import (
-    OURS,
+    IMAGE_SCENES,
     Judgement,
     Outcome,
     ReportOptions,
     Stage,
     Task,
-    Values,
-    each,
+    load_images,
     read_arrays,
-    row,
 )
-from validation.runs.scenes import has_images, load_images
-from validation.runs.tables import Metric
+from validation.runs.tables import OURS, Metric, Values, each, row
 from validation.scenes.real import Scene, load_fixture_depth
 from validation.scenes.real_pairs import RealPair, camera_pairs
 from validation.stages.fundamental import MATCHES
@@ -45,23 +43,17 @@ CORNERS = 1000
 VERIFIED = "mean over the pairs; none if F is wrong"
 NOISE = "median over the pairs of the noise of the verified matches"
 MAX_SIZE_PX = 1600
-WITH_DEPTH = ("courtyard",)
-"""Scenes with true depth, which gives the position of a corner in the next image."""
+WITH_DEPTH = ("courtyard",)  # Scenes with true depth, which gives the position of a corner in the next image
 
 
 class FeaturesStage(Stage):
     """Repeatability of corners, and verified matches of front ends."""
 
     name = "features"
-    title = "Corners and matches"
-    definition = (
-        "Verified matches: inliers of a correct F (error below 1 px on matches of the true cameras), "
-        "all front ends through one estimator and one verification. Repeatability: of the 1000 strongest "
-        "corners, those with a corner within 1.5 px of where the true depth takes them in the next one."
-    )
+    scenes, own = IMAGE_SCENES, True
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return has_images(scene, options) and load_images(scene, options).has_truth
+        return super().takes(scene, options) and load_images(scene, options).has_truth
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         if options.gates_only:
@@ -72,10 +64,9 @@ class FeaturesStage(Stage):
         # The judgement evaluates F on these matches, moved onto the true epipolar lines.
         return () if method else (("fundamental", MATCHES),)
 
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         scene = load_images(task.scene, options)
         images = read_images(scene.image_paths, max_size_px=MAX_SIZE_PX).images
-        folder = options.folder(task.stage, task.scene, task.method)
         if task.scene in WITH_DEPTH:
             corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}
             np.savez(folder / "corners.npz", **corners)
@@ -112,16 +103,13 @@ def _corners(method: str, image: Image) -> F64:
     return sift_corners(image, CORNERS) if method == SIFT else harris_corners(image, CORNERS)
 
 
-def _front_end(method: str) -> PipelineConfig:
-    """Return a front end with the estimator of F and the verification of the default."""
-    ours, thesis = preset("default"), preset("thesis")
-    if method == SIFT:
-        return sift_front_end(ours)
-    return replace(ours, features=thesis.features, matching=thesis.matching) if method == THESIS else ours
-
-
 def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
-    config = _front_end(method)
+    # All with the estimator of F and the verification of the default.
+    config, thesis = preset("default"), preset("thesis")
+    if method == SIFT:
+        config = sift_front_end(config)
+    elif method == THESIS:
+        config = replace(config, features=thesis.features, matching=thesis.matching)
     prepared = [config.matching.prepare(image, config.features.detect(image)) for image in images]
     arrays: dict[str, Any] = {}
     for gap in _gaps(options):
@@ -144,9 +132,7 @@ def in_original_pixels(F: F64, first: Image, second: Image) -> F64:
 def _match_metrics(
     scene: str, gap: int, pairs: list[RealPair], found: Mapping[str, dict[str, Any] | None]
 ) -> list[Metric]:
-    verified: Values = dict.fromkeys(found)
-    right: Values = dict.fromkeys(found)
-    sigma: Values = dict.fromkeys(found)
+    verified, right, sigma = (Values(dict.fromkeys(found)) for _ in range(3))
     for name, arrays in found.items():
         if arrays is not None:
             F, inliers, noise = (arrays[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -13,21 +14,16 @@ from validation.metrics.fundamental_precision import NONE_PX, rms_epipolar_dista
 from validation.references.fundamental import estimate_with
 from validation.references.libraries import NoReference
 from validation.runs.records import (
-    OURS,
+    IMAGE_SCENES,
     Judgement,
     Outcome,
-    Plot,
     ReportOptions,
     Stage,
     Task,
-    each,
-    plot,
+    load_images,
     read_arrays,
-    row,
-    scatter,
 )
-from validation.runs.scenes import has_images, load_images
-from validation.runs.tables import Metric
+from validation.runs.tables import OURS, Metric, Plot, each, plot, row, scatter
 from validation.scenes.real_pairs import RealPair, camera_pairs, kusvod2_pairs
 
 MATCHES = "SIFT matches"
@@ -37,8 +33,6 @@ QUICK = ("USAC_MAGSAC", "PoseLib")
 THRESHOLD_PX = 1.0
 FAILED_PX = 5.0
 ERROR = "RMS distance of right correspondences to their epipolar lines, over both images (5.6)"
-
-
 Answers = dict[str, F64]
 """Answers of a method for all pairs and seeds: ``F`` (pairs, seeds, 3, 3), NaN if missing, ``inliers``
 (pairs, seeds) their number, ``seconds`` (pairs, seeds) of one processor."""
@@ -48,15 +42,10 @@ class FundamentalStage(Stage):
     """F of SIFT matches with one threshold for all methods."""
 
     name = "fundamental"
-    title = "Fundamental matrices"
-    definition = (
-        "F of the same SIFT matches, threshold 1 px, several seeds, which also order the matches. "
-        "Errors are on the matches that agree with the true cameras, moved to where they agree exactly, or on"
-        " correspondences made by hand."
-    )
+    scenes, own = IMAGE_SCENES, True
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene == "kusvod2" or (has_images(scene, options) and load_images(scene, options).has_truth)
+        return scene == "kusvod2" or (super().takes(scene, options) and load_images(scene, options).has_truth)
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         references = () if options.gates_only else QUICK if options.quick else REFERENCES
@@ -65,7 +54,7 @@ class FundamentalStage(Stage):
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return () if method in ("", MATCHES) else ((self.name, MATCHES),)
 
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         pairs = _pairs(task.scene, options)
         if task.method == MATCHES:
             return
@@ -73,13 +62,13 @@ class FundamentalStage(Stage):
         def answer(pair: RealPair, seed: int) -> tuple[F64 | None, B8, float]:
             start = time.process_time()
             found = estimate_with(task.method, pair.xy1, pair.xy2, threshold_px=THRESHOLD_PX, seed=seed)
-            return found.F, found.inliers, time.process_time() - start
+            return *found, time.process_time() - start
 
         answer(pairs[0], 0)  # compiles
         answers = [[answer(pair, options.seed + seed) for seed in range(_seeds(options))] for pair in pairs]
         none = np.full((3, 3), np.nan)
         np.savez(
-            options.folder(task.stage, task.scene, task.method) / "answers.npz",
+            folder / "answers.npz",
             F=[[none if F is None else F for F, _, _ in found] for found in answers],
             inliers=[[float(inliers.sum()) for _, inliers, _ in found] for found in answers],
             seconds=[[seconds for _, _, seconds in found] for found in answers],
@@ -110,11 +99,10 @@ def _pairs(scene: str, options: ReportOptions) -> list[RealPair]:
 
 def _errors(answers: Answers, pairs: list[RealPair]) -> F64:
     """(pairs, seeds) px."""
-    rows = []
-    for pair, found in zip(pairs, answers["F"], strict=True):
-        assert pair.truth is not None
-        rows.append([rms_epipolar_distance(F, pair.truth) for F in found])
-    return np.array(rows)
+    truths = [(pair.truth, found) for pair, found in zip(pairs, answers["F"], strict=True)]
+    return np.array(
+        [[rms_epipolar_distance(F, truth) for F in found] for truth, found in truths if truth is not None]
+    )
 
 
 def _metrics(

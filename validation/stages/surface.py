@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -18,31 +20,23 @@ from thesisrecon.surface.model import SurfaceModel
 from validation.metrics.depth import coloured, true_depth, true_from_maps
 from validation.references.open3d_geometry import Nearest, OpenTsdf, poisson_mesh
 from validation.runs.records import (
-    OURS,
     Judgement,
     Outcome,
     Picture,
     ReportOptions,
     Stage,
     Task,
-    Values,
-    each,
-    ratio,
+    load_images,
     read_arrays,
-    row,
-    slug,
 )
-from validation.runs.scenes import load_images
-from validation.runs.tables import Metric
+from validation.runs.tables import OURS, Metric, Values, each, ratio, row, slug
 from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
 from validation.stages.depth import COURTYARD, PRESETS, THESIS, our_maps, views_of
 
-SAMPLES = 200_000
-"""Number of points sampled on a surface."""
+SAMPLES = 200_000  # Number of points sampled on a surface
 
 
-@dataclass(frozen=True)
-class Truth:
+class Truth(NamedTuple):
     """The true ``surface``, true ``points`` (N, 3) that two images show, and the scene's depth in metres."""
 
     scene: Scene
@@ -68,13 +62,10 @@ def load_truth() -> Truth:
         points.append((rays * depth[y, x, None]) @ R[view] + C[view])
         depths.append(depth[np.isfinite(depth)])
     depth_m = float(np.median(np.concatenate(depths)))
-    return Truth(scene, Nearest(_together(sheets)), np.concatenate(points), depth_m)
-
-
-def _together(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
-    first = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
-    faces = [m.faces + n for m, n in zip(meshes, first, strict=True)]
-    return TexturedMesh(np.concatenate([m.vertices for m in meshes]), np.concatenate(faces))
+    first = np.cumsum([0, *(len(m.vertices) for m in sheets[:-1])])
+    faces = np.concatenate([m.faces + n for m, n in zip(sheets, first, strict=True)])
+    whole = TexturedMesh(np.concatenate([m.vertices for m in sheets]), faces)
+    return Truth(scene, Nearest(whole), np.concatenate(points), depth_m)
 
 
 def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
@@ -109,9 +100,8 @@ def asked_for(points: F64, scene: Scene) -> I64:
 
 def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> tuple[F64, F64]:
     """Accuracy and completeness of a surface in the true frame, as distances in percent of the scene's depth.
-
-    Accuracy: from points spread evenly over the surface, where at least two images could show them, to
-    the true one. Completeness: from true points that two images show to the surface.
+    Accuracy: from points spread evenly over the surface, where at least two images could show them, to the
+    true one. Completeness: from true points that two images show to the surface.
     """
     points = points_on(mesh, samples)
     points = points[asked_for(points, truth.scene) >= 2]
@@ -121,24 +111,14 @@ def judge_surface(mesh: TexturedMesh, truth: Truth, samples: int = SAMPLES) -> t
 
 
 TSDF, POISSON = "Open3D TSDF", "Open3D Poisson"
-RED_PCT = 1.0
-"""Distance that is red in the figures, in percent of the scene depth."""
+RED_PCT = 1.0  # Distance that is red in the figures, in percent of the scene depth
 
 
 class SurfaceStage(Stage):
     """One surface of all depth maps."""
 
     name = "surface"
-    title = "Surfaces"
     scenes = (COURTYARD,)
-    definition = (
-        "Surfaces of the depth maps of the stage above: our default, and Open3D's grid of truncated signed "
-        "distances (voxels of 1.5 pixels, as ours) and its Poisson surface (octree of depth 9) of the same "
-        "maps; the thesis' preset of its own maps. Cameras are aligned to the true ones by a similarity; "
-        "distances are Open3D's, in per cent of the scene's depth, at most 5 % in the means. Accuracy: from "
-        "points spread evenly over the surface, where two images could show them, to the true surface. "
-        "Completeness: from what two images show to the surface."
-    )
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         return (OURS, TSDF) if options.quick or options.gates_only else (OURS, THESIS, TSDF, POISSON)
@@ -146,9 +126,8 @@ class SurfaceStage(Stage):
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:
         return (("cameras", OURS), ("depth", THESIS if method == THESIS else OURS))
 
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         mesh = _surface(task.method, task.scene, options)
-        folder = options.folder(task.stage, task.scene, task.method)
         np.savez(folder / "mesh.npz", vertices=mesh.vertices, faces=mesh.faces.astype(np.int32))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
@@ -197,24 +176,21 @@ def _true_mesh(method: str, outcome: Outcome, scene: str, options: ReportOptions
 def _metrics(scene: str, judged: Mapping[str, tuple[F64, F64] | None]) -> list[Metric]:
     rows, means = [], dict[str, Values]()
     text = {"accuracy": "from the surface to the truth", "completeness": "from the truth to the surface"}
-    for side, what in enumerate(text):
+    for side, (what, where) in enumerate(text.items()):
         distances = {n: None if d is None else d[side] for n, d in judged.items()}
         # Maximum distance in the mean, in percent of the scene depth.
         means[what] = each(distances, lambda d: np.minimum(d, 5.0).mean())
-        median, where = each(distances, np.median), text[what]
+        median = each(distances, np.median)
         rows.append(row(scene, f"{what}, median", "% of depth", median, f"median distance {where}"))
         rows.append(row(scene, f"{what}, mean", "% of depth", means[what], f"mean distance {where}"))
         for bound in (0.2, 0.5, 1.0):
-            near = {
-                n: None if d is None else 100.0 * float((d <= bound).mean()) for n, d in distances.items()
-            }
+            near = each(distances, lambda d, most=bound: 100.0 * (d <= most).mean())  # type: ignore[misc]
             definition = f"share of the points {where} within this distance"
             rows.append(row(scene, f"{what}, within {bound} %", "%", near, definition, more=True))
     for what, values in means.items():
         over = ratio(values.get(OURS), values.get(TSDF))
-        rows.append(
-            row(scene, f"{what} over Open3D TSDF", "", over, "mean distance, ours over that of Open3D's grid")
-        )
+        definition = "mean distance, ours over that of Open3D's grid"
+        rows.append(row(scene, f"{what} over Open3D TSDF", "", over, definition))
     return rows
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,31 +18,17 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
-from validation.references.triangulation import colmap_points, opencv_linear, opencv_polynomial
-from validation.runs.records import (
-    Judgement,
-    Outcome,
-    Plot,
-    ReportOptions,
-    Stage,
-    Task,
-    each,
-    plot,
-    read_arrays,
-    row,
-    scatter,
-)
-from validation.runs.tables import Metric
+from validation.references.fundamental import colmap_points, opencv_linear, opencv_polynomial
+from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task, read_arrays
+from validation.runs.tables import Metric, Plot, each, plot, row, scatter
 from validation.scenes.rigs import SCENES, DrawnRig, draw_rig, squared_distances
 
 OURS = "ours (polynomial, optimal)"
-DESCENT = 40
-"""Iterations to the minimum reprojection error."""
+DESCENT = 40  # Iterations to the minimum reprojection error
 LINEAR, MIDPOINT = "ours (linear)", "ours (mid-point)"
 ADJUSTED = "ours (cameras too)"
 """Projective bundle adjustment of cameras and points of five views (chapter 6)."""
-MOVED = 1e-3
-"""Relative perturbation of camera entries before the adjustment, about a pixel."""
+MOVED = 1e-3  # Relative perturbation of camera entries before the adjustment, about a pixel
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
 NOISES_PX = (0.5, 1.0, 2.0)
 POINTS = 400
@@ -60,18 +47,11 @@ class TriangulationStage(Stage):
     """The thesis' comparison of methods, with the references."""
 
     name = "triangulation"
-    title = "Triangulation"
-    definition = (
-        "Points of a cloud seen by two and five cameras, noise 0.5 to 2 px, in a metric and in projective "
-        "frames of space. The optimum is that of the reprojection over all views."
-    )
+    always = (OURS, LINEAR, MIDPOINT, ADJUSTED, OPENCV, OPENCV_POLYNOMIAL, COLMAP)
 
     scenes = ("cloud",)
 
-    def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        return (OURS, LINEAR, MIDPOINT, ADJUSTED, OPENCV, OPENCV_POLYNOMIAL, COLMAP)
-
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         answers: dict[str, Any] = {}
         seconds = []
         for n, problem in enumerate(_problems(options)):
@@ -87,20 +67,16 @@ class TriangulationStage(Stage):
             answers[f"{n}"] = method(problem.P, problem.xy)
             if len(problem.P) == 2:
                 seconds.append((time.process_time() - start) / problem.xy.shape[1])
-        folder = options.folder(task.stage, task.scene, task.method)
         np.savez(folder / "points.npz", seconds=np.array(seconds), **answers)
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         problems = list(_problems(options))
         found = {name: read_arrays(outcome, "points.npz") for name, outcome in outcomes.items()}
         metrics = [_adjustment(scene, problems, found.pop(ADJUSTED, None))]
-        for views in (2, 5):
-            for projective in (False, True):
-                chosen = {
-                    n: p for n, p in enumerate(problems) if len(p.P) == views and p.projective == projective
-                }
-                where = f"{views} views, {'projective' if projective else 'metric'} frame"
-                metrics += _metrics(scene, where, chosen, found)
+        for views, projective in product((2, 5), (False, True)):
+            chosen = {n: p for n, p in enumerate(problems) if (len(p.P), p.projective) == (views, projective)}
+            where = f"{views} views, {'projective' if projective else 'metric'} frame"
+            metrics += _metrics(scene, where, chosen, found)
         spent = each(found, lambda f: 1e6 * float(np.median(f["seconds"])))
         text = "two views, one processor, median"
         metrics.append(row(scene, "time a point", "us", spent, text, judged=OURS))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -22,19 +21,17 @@ from thesisrecon.views.tensor import CalibratedPair, camera_at, default_intrinsi
 from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
-from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, Values, row
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
+from validation.runs.tables import OURS, Metric, Values, each, row
 from validation.scenes.real import read_rgb
 from validation.scenes.stereo import read_disparity, stereo_folder
 
-SSIM_BORDER_PX = 5
-"""Radius of the SSIM windows."""
+SSIM_BORDER_PX = 5  # Radius of the SSIM windows
 
 
-def psnr_db(image: NDArray[Any], truth: NDArray[Any], *, where: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio of images (H, W, 3) over the pixels ``where`` (H, W), or all."""
-    compared = np.ones(truth.shape[:2], dtype=bool) if where is None else where
-    return similarity.psnr_db(truth, image, compared)
+def psnr_db(image: NDArray[Any], truth: NDArray[Any]) -> float:
+    """Peak signal-to-noise ratio of images (H, W, 3)."""
+    return similarity.psnr_db(truth, image, np.ones(truth.shape[:2], dtype=bool))
 
 
 def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
@@ -46,12 +43,10 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
 ENDS = (2, 6)
 BETWEEN = (3, 4, 5)
 BEYOND = (1, 7)
-DISPARITIES = 64
-"""Between the ends; their disparities are less than this."""
+DISPARITIES = 64  # Between the ends; their disparities are less than this
 
 
-@dataclass(frozen=True)
-class NineViews:
+class NineViews(NamedTuple):
     """``images`` (H, W, 3) by their number, and the true disparities (H, W) of both ends, NaN = unknown."""
 
     images: dict[int, U8]
@@ -62,11 +57,11 @@ class NineViews:
         return (view - ENDS[0]) / (ENDS[1] - ENDS[0])
 
 
-def load_cones() -> NineViews | None:
-    """The Cones of Scharstein and Szeliski (CVPR 2003); None if they are not on this machine."""
+def load_cones() -> NineViews:
+    """The Cones of Scharstein and Szeliski (CVPR 2003)."""
     folder = stereo_folder("Cones")
     if folder is None:
-        return None
+        raise ValueError("the nine views are not on this machine")
     numbers = sorted({*ENDS, *BETWEEN, *BEYOND})
     images = {k: read_rgb(folder / f"im{k}.png") for k in numbers}
     first, second = (read_disparity(folder / f"disp{k}.png", 4.0) for k in ENDS)
@@ -98,46 +93,34 @@ TRUE, DISSOLVE = "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BY_TENSOR = " (tensor)"
 TENSOR = OURS + BY_TENSOR
-BORDER_PX = 50
-"""Border columns of extrapolated views that no input image covers."""
+BORDER_PX = 50  # Border columns of extrapolated views that no input image covers
 
 
 class ViewInterpolationStage(Stage):
     """The same warp with our disparities, OpenCV's and the true ones, and the tensor with each."""
 
     name = "view-interpolation"
-    title = "View interpolation"
-    definition = (
-        "Images 3, 4 and 5 of nine are computed from 2 and 6 and compared: interpolation with our "
-        "disparities, with OpenCV's and with the true ones, the tensor with the same, and a cross-dissolve. "
-        "The tensor also computes 1 and 7, a quarter of the baseline beyond the ends."
-    )
 
     def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene == "Cones" and load_cones() is not None
+        return scene == "Cones" and stereo_folder(scene) is not None
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         sources = (OURS, THREE_WAY, HH, TRUE)
         tensors = (OURS,) if options.gates_only else sources
         return (*sources, DISSOLVE, *(source + BY_TENSOR for source in tensors))
 
-    def run(self, task: Task, options: ReportOptions) -> None:
-        folder = options.folder(task.stage, task.scene, task.method)
-        for view, picture in _pictures(task.method, _cones()).items():
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
+        for view, picture in _pictures(task.method, load_cones()).items():
             PIL.Image.fromarray(picture).save(_file(folder, view))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
-        cones = _cones()
+        cones = load_cones()
         made = {name: _read(outcome) for name, outcome in outcomes.items()}
 
         def mean(measure: Callable[[U8, U8], float]) -> Values:
             """Over the views between the inputs; None if they are missing."""
-            return {
-                name: float(np.mean([measure(images[k], cones.images[k]) for k in BETWEEN]))
-                if images
-                else None
-                for name, images in made.items()
-            }
+            some = {name: images or None for name, images in made.items()}
+            return each(some, lambda images: np.mean([measure(images[k], cones.images[k]) for k in BETWEEN]))
 
         peak, text = mean(psnr_db), "mean over images 3, 4 and 5"
         sgbm = max((v for n in (THREE_WAY, HH) if (v := peak[n]) is not None), default=None)
@@ -177,13 +160,6 @@ def _beside(folder: Path, cones: NineViews, made: Mapping[str, Mapping[int, U8]]
         text = "The image, ours, and four times the difference from middle grey."
         shown.append(Picture(_file(folder, k).name, f"View {k}", text))
     return shown
-
-
-def _cones() -> NineViews:
-    cones = load_cones()
-    if cones is None:
-        raise ValueError("the nine views are not on this machine")
-    return cones
 
 
 def _pictures(method: str, cones: NineViews) -> dict[int, U8]:

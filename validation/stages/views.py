@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,8 @@ from thesisrecon.surface.model import SurfaceModel
 from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, ssim
 from validation.metrics.depth import coloured
 from validation.references.open3d_geometry import OpenTsdf, render_open3d
-from validation.runs.records import OURS, Judgement, Outcome, Picture, ReportOptions, Stage, Task, each, row
-from validation.runs.scenes import load_images
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task, load_images
+from validation.runs.tables import OURS, Metric, each, row
 from validation.stages.depth import COURTYARD, our_maps, read_maps, views_of
 
 TSDF, FINE, LEVELLED = "Open3D TSDF, 1.5 px", "Open3D TSDF, 1 px", "Open3D TSDF, 1 px, levelled"
@@ -28,39 +28,24 @@ OWN_PICTURE = "Open3D TSDF, 1 px, its own image"
 VOXELS_PX = {TSDF: 1.5, FINE: 1.0, LEVELLED: 1.0}
 SCENES = (COURTYARD, "Herz-Jesus-P8")
 LEFT_OUT, QUICK_LEFT_OUT = 2, 1
-RED_LEVELS = 64.0
-"""Difference in grey levels that is red in the figures."""
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """Mean scores of left-out images, exposures equalised or as they are, and the share ``covered``."""
-
-    psnr_db: float
-    ssim: float
-    psnr_as_is_db: float
-    ssim_as_is: float
-    covered: float
+RED_LEVELS = 64.0  # Difference in grey levels that is red in the figures
+EQUAL = "exposures equalised first; mean over the left-out images"
+ORIGINAL = "original exposures; mean over the left-out images"
+NUMBERS = {
+    "PSNR": ("dB", EQUAL),
+    "SSIM": ("", EQUAL),
+    "PSNR as it is": ("dB", ORIGINAL),
+    "SSIM as it is": ("", ORIGINAL),
+    "covered": ("%", "share of the frame that the model covers whole"),
+}
+Scores = dict[str, float]
 
 
 class ViewsStage(Stage):
     """Images are left out one by one."""
 
     name = "views"
-    title = "Views of the model"
-    definition = (
-        f"{LEFT_OUT} images (in a quick report {QUICK_LEFT_OUT}) are left out, one by one: neither "
-        "their depth map nor their colours go into a model. (Other depth maps were matched with them, for "
-        "all alike.) Ours is textured; Open3D's is its grid of truncated signed distances with coloured "
-        "vertices, from the same depth maps and images, once with exposures equalised by our gains. All "
-        "are drawn by our renderer at the left-out camera, Open3D's finer one "
-        "(but for a quick report) also by its own, and compared over the pixels that all cover whole. The "
-        "exposure of a left-out image is unknown: each rendering is first multiplied by the best factor of "
-        "each channel."
-    )
-
-    def takes(self, scene: str, options: ReportOptions) -> bool:
-        return scene in SCENES or scene in options.folders
+    scenes, own = SCENES, True
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
         strictest = (OURS, FINE, LEVELLED)
@@ -70,10 +55,9 @@ class ViewsStage(Stage):
         surface = ((self.name, OURS),) if method == LEVELLED else ()
         return (("cameras", OURS), ("depth", OURS), *surface)
 
-    def run(self, task: Task, options: ReportOptions) -> None:
+    def run(self, task: Task, folder: Path, options: ReportOptions) -> None:
         maps = our_maps(task.scene, options)
         views = views_of(load_images(task.scene, options), options)
-        folder = options.folder(task.stage, task.scene, task.method)
         shared = options.folder(task.stage, task.scene, OURS)
         for k in _left_out(sorted(maps), options):
             others = [i for i in sorted(maps) if i != k]
@@ -93,7 +77,7 @@ class ViewsStage(Stage):
         views = views_of(load_images(scene, options), options)
         left_out = _left_out(sorted(read_maps(options.folder("depth", scene, OURS))), options)
         folder, pictures = options.folder(self.name, scene), list[Picture]()
-        found: dict[str, list[Likeness]] = {}
+        found: dict[str, list[Scores]] = {}
         for k in left_out:
             drawn = _drawn(outcomes, k)
             scores, compared = compare(views[k], drawn)
@@ -147,7 +131,7 @@ def _equally_bright(surface: TexturedMesh, views: Sequence[PinholeView]) -> list
     ]
 
 
-def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Likeness], B8]:
+def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[str, Scores], B8]:
     """Return the scores of the renderings, and the pixels (H, W) that all of them cover whole."""
     whole = {name: covered_pixels(picture) & view.seen for name, picture in drawn.items()}
     compared = np.logical_and.reduce([view.seen, *whole.values()])
@@ -155,7 +139,7 @@ def compare(view: PinholeView, drawn: Mapping[str, RenderedView]) -> tuple[dict[
     for name, picture in drawn.items():
         shown = (match_exposure(view.rgb, picture.color, compared), picture.color)
         scores = [score(view.rgb, color, compared) for color in shown for score in (psnr_db, ssim)]
-        found[name] = Likeness(*[*scores, 100.0 * float(whole[name].mean())])
+        found[name] = dict(zip(NUMBERS, [*scores, 100.0 * float(whole[name].mean())], strict=True))
     return found, compared
 
 
@@ -174,25 +158,15 @@ def _drawn(outcomes: Mapping[str, Outcome], view: int) -> dict[str, RenderedView
     return drawn
 
 
-def _mean(found: Sequence[Likeness] | None) -> Likeness | None:
-    if not found:
-        return None
-    return Likeness(*np.mean([list(vars(one).values()) for one in found], axis=0).tolist())
+def _mean(found: Sequence[Scores] | None) -> Scores | None:
+    return {name: float(np.mean([one[name] for one in found])) for name in NUMBERS} if found else None
 
 
-def _metrics(scene: str, found: Mapping[str, Likeness | None]) -> list[Metric]:
-    equal = "exposures equalised first; mean over the left-out images"
-    original = "original exposures; mean over the left-out images"
-    rows = []
-    for name, unit, field, text in (
-        ("PSNR", "dB", "psnr_db", equal),
-        ("SSIM", "", "ssim", equal),
-        ("PSNR as it is", "dB", "psnr_as_is_db", original),
-        ("SSIM as it is", "", "ssim_as_is", original),
-        ("covered", "%", "covered", "share of the frame that the model covers whole"),
-    ):
-        values = each(found, lambda one, field=field: getattr(one, field))  # type: ignore[misc]
-        rows.append(row(scene, name, unit, values, text, more=True))
+def _metrics(scene: str, found: Mapping[str, Scores | None]) -> list[Metric]:
+    rows = [
+        row(scene, name, unit, each(found, itemgetter(name)), text, more=True)
+        for name, (unit, text) in NUMBERS.items()
+    ]
     for metric in rows[:2]:
         theirs = [v for n, v in metric.values.items() if n.startswith("Open3D") and v is not None]
         ours = metric.values.get(OURS)

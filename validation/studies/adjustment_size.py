@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from validation.runs.processes import call_apart, timed
 from validation.runs.study import Part
 from validation.runs.tables import text_table
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.many_views import FOCAL_REL, walk
+from validation.scenes.many_views import walk, walk_calibration
 from validation.scenes.pose import Pose, look_at, perturb
 from validation.scenes.raycast import trace
 from validation.stages.bundle import FOCAL_K1
@@ -74,9 +75,7 @@ def _place(count: int, rng: np.random.Generator) -> _Scene:
 
 
 def _street(count: int, rng: np.random.Generator, *, step: float = 0.5) -> _Scene:
-    width, height = SIZE
-    focal = FOCAL_REL * width
-    K = np.array([[focal, 0.0, 0.51 * width], [0.0, focal, 0.48 * height], [0.0, 0.0, 1.0]])
+    K = walk_calibration(SIZE)
 
     def bend(x: F64) -> F64:
         return np.asarray(6.0 * np.sin(x / 25.0))
@@ -170,22 +169,14 @@ def adjustment_size_study(
     kinds: tuple[str, ...] = ("place", "street"), sizes: tuple[int, ...] = (100, 300, 1000), threads: int = 2
 ) -> Iterator[Part]:
     """Compare bundle adjustment of many cameras with Ceres from the same start."""
-    lines = []
-    for kind in kinds:
-        for views in sizes:
-            found = [call_apart(measure_adjustment, kind, views, name, threads) for name in ("ours", "Ceres")]
-            ours, theirs = (answer for answer, _ in found)
-            lines.append(
-                [
-                    f"{kind} {views}",
-                    f"{ours['observations']}",
-                    *(f"{a['wall']:.1f}" for a in (ours, theirs)),
-                    f"{ours['wall'] / theirs['wall']:.2f}",
-                    *(f"{a['cpu']:.1f}" for a in (ours, theirs)),
-                    *(f"{process.peak_mb:.0f}" for _, process in found),
-                    f"{ours['cost'] / theirs['cost'] - 1.0:.1e}",
-                ]
-            )
-            yield " ".join(lines[-1])
     heads = ["observations", "wall s", "Ceres", "ratio", "processor s", "Ceres", "peak MB", "Ceres"]
+    lines = list[list[str]]()
+    for kind, views in product(kinds, sizes):
+        found = [call_apart(measure_adjustment, kind, views, name, threads) for name in ("ours", "Ceres")]
+        (ours, mine), (theirs, other) = found
+        line = [f"{kind} {views}", f"{ours['observations']}", f"{ours['wall']:.1f}", f"{theirs['wall']:.1f}"]
+        line += [f"{ours['wall'] / theirs['wall']:.2f}", f"{ours['cpu']:.1f}", f"{theirs['cpu']:.1f}"]
+        line += [f"{mine.peak_mb:.0f}", f"{other.peak_mb:.0f}", f"{ours['cost'] / theirs['cost'] - 1.0:.1e}"]
+        lines.append(line)
+        yield " ".join(line)
     yield text_table(["", *heads, "cost above Ceres'"], lines)

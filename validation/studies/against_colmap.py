@@ -23,18 +23,12 @@ import numpy as np
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._outputs import clear_folder
 from thesisrecon.records import Reconstruction
-from validation.metrics.cameras import (
-    Reprojection,
-    TrueCameras,
-    measure_cameras,
-    measure_reprojection,
-)
+from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
 from validation.references.colmap import read_colmap_model, read_run
 from validation.runs.processes import Process, own_cores, run_process
 from validation.runs.results import camera_limit
-from validation.runs.scenes import truth_of
 from validation.runs.study import Part, report_progress
-from validation.runs.tables import Metric, Rows, machine
+from validation.runs.tables import Metric, Rows, each, machine
 from validation.scenes.real import REAL_SCENES, Scene, scenes_here
 
 OURS, THESIS = "ours (default)", "ours (thesis)"
@@ -43,12 +37,8 @@ COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of one method on one scene.
-
-    ``reconstruction``: none after a failure; ``wall_s``, ``seconds``: the time that counts, and its parts;
-    ``cpu_s``: processor time of the whole process; ``failure``: message of the failure; ``reasons``:
-    unregistered image -> reason that the method gives; ``claimed_rms_px``: reprojection error that the
-    method states.
+    """Result of one method on one scene: the time that counts and its parts, processor time of the process;
+    unregistered image -> ``reasons`` that the method gives; the reprojection error that it states.
     """
 
     reconstruction: Reconstruction | None
@@ -82,29 +72,24 @@ def check_reconstruction(
             ("mean camera-centre error", "mm", "centre-error", "centre_error_mm"),
             ("median rotation error", "deg", "rotation-error", "rotation_error_deg"),
         ):
-            rows.each(name, errors, attrgetter(field), unit, at_most=limit(gate))
-    rows.each("median reprojection", residuals, lambda r: r.median_px, "px", at_most=limit("reprojection"))
-    rows.each("mean reprojection", residuals, lambda r: r.mean_px, "px")
-    rows.each("points", models, lambda m: float(m.valid.sum()))
-    rows.each("observations", residuals, lambda r: float(r.observations))
-    colmap_s = (
-        outcomes[COLMAP].wall_s if COLMAP in outcomes and scene in ("fountain-P11", "Herz-Jesus-P8") else None
-    )
-    rows.each("wall time", outcomes, lambda o: o.wall_s, "s", at_most=colmap_s)
-    rows.add("rms it claims off by", _claims(outcomes, residuals), "%", at_most=1.0)
-    rows.each("processor time", outcomes, lambda o: o.cpu_s, "s")
-    rows.each("peak memory", outcomes, lambda o: o.peak_mb, "MB")
-    return rows
-
-
-def _claims(
-    outcomes: Mapping[str, Outcome], residuals: Mapping[str, Reprojection | None]
-) -> dict[str, float | None]:
-    return {
+            rows.add(name, each(errors, attrgetter(field)), unit, at_most=limit(gate))
+    middle = each(residuals, lambda r: r.median_px)
+    rows.add("median reprojection", middle, "px", at_most=limit("reprojection"))
+    rows.add("mean reprojection", each(residuals, lambda r: r.mean_px), "px")
+    rows.add("points", each(models, lambda m: float(m.valid.sum())))
+    rows.add("observations", each(residuals, lambda r: float(r.observations)))
+    bounded = COLMAP in outcomes and scene in ("fountain-P11", "Herz-Jesus-P8")
+    wall_s = each(outcomes, lambda o: o.wall_s)
+    rows.add("wall time", wall_s, "s", at_most=wall_s[COLMAP] if bounded else None)
+    claims = {
         name: 100.0 * abs(outcome.claimed_rms_px / measured.rms_px - 1.0)
         for name, outcome in outcomes.items()
         if (measured := residuals[name]) is not None and outcome.claimed_rms_px is not None
     }
+    rows.add("rms it claims off by", claims, "%", at_most=1.0)
+    rows.add("processor time", each(outcomes, lambda o: o.cpu_s), "s")
+    rows.add("peak memory", each(outcomes, lambda o: o.peak_mb), "MB")
+    return rows
 
 
 METHODS = {OURS: "default", THESIS: "thesis", COLMAP: "colmap", COLMAP_PP: "colmap-principal-point"}
@@ -116,9 +101,11 @@ def run_method(method: str, scene: Scene, out: Path, *, threads: int, environmen
     clear_folder(out)
     command, cores = _command(method, images, out, threads), own_cores()[:threads]
     process = run_process(command, log=out.with_suffix(".log"), cores=cores, environment=environment)
-    read = _read_colmap if method in (COLMAP, COLMAP_PP) else _read_ours
     try:
-        return read(scene, out, process)
+        if method in (OURS, THESIS):
+            return _read_ours(scene, out, process)
+        model, seconds = read_run(images, out)
+        return Outcome(model, sum(seconds.values()), process.peak_mb, process.cpu_s, seconds=seconds)
     except (StageFailure, OSError) as error:
         failure = f"exit code {process.code}: {error}"
         return Outcome(None, process.wall_s, process.peak_mb, process.cpu_s, failure=failure)
@@ -150,12 +137,6 @@ def _read_ours(scene: Scene, out: Path, process: Process) -> Outcome:
     return Outcome(model, *used, seconds, failure, reasons, claimed)
 
 
-def _read_colmap(scene: Scene, out: Path, process: Process) -> Outcome:
-    run = read_run(scene.image_paths[0].parent, out)
-    wall_s = sum(run.seconds.values())
-    return Outcome(run.reconstruction, wall_s, process.peak_mb, process.cpu_s, seconds=run.seconds)
-
-
 def measure_scene(
     scene: Scene, out: Path, *, threads: int, repeats: int, environment: dict[str, str]
 ) -> tuple[list[Metric], dict[str, Outcome]]:
@@ -170,7 +151,7 @@ def measure_scene(
     outcomes = {
         method: min(found, key=lambda run: (not run.failure, run.wall_s)) for method, found in runs.items()
     }
-    rows = check_reconstruction(scene.name, len(scene.image_paths), truth_of(scene), outcomes)
+    rows = check_reconstruction(scene.name, len(scene.image_paths), scene.truth, outcomes)
     return rows, outcomes
 
 

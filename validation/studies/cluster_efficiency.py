@@ -1,10 +1,9 @@
 """Efficiency of a cluster, simulated from the tasks of a run with one worker.
 
-The tasks of each stage are scheduled in the order in which they are submitted: a task goes to the first free
-worker, and at most twice as many tasks as workers are under way. Pairs are batched as for that number of
-workers; each batch prepares its views again. With a gigabit line each way, the arguments of one task after
-another leave the machine of the command, and the results come back one after another. Everything else counts
-as serial, also pickling and saving, which in fact run during the tasks, and steps that use several threads.
+Tasks are scheduled in the order in which they are submitted: a task goes to the first free worker, and at
+most twice as many tasks as workers are under way. Pairs are batched as for that number of workers; each batch
+prepares its views again. With a gigabit line each way, arguments leave one after another, and so do results.
+Everything else counts as serial, also pickling and saving, which in fact run during the tasks.
 
 Seconds are those of the processor. The efficiency is the work of one worker by workers x critical path.
 """
@@ -18,9 +17,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.pipeline import large_sets, matching, stages
@@ -36,16 +35,13 @@ STAGES: Mapping[Callable[..., Any], str] = {
     matching._detect: "features",
     large_sets.reconstruct_part: "parts",
     stages._depths: "depth maps",
-}
-"""Function of a task -> stage."""
+}  # Function of a task -> stage
 PREPARATIONS = {"prepare": "matches", "prepare_oblique": "oblique matches"}
 """Function that prepares the views of a batch -> stage."""
-LINE = 125e6
-"""Bytes per second of a gigabit line."""
+LINE = 125e6  # Bytes per second of a gigabit line
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(NamedTuple):
     """Processor seconds of a task, and pickled bytes of its arguments and of its result."""
 
     seconds: float
@@ -55,9 +51,8 @@ class Task:
 
 @dataclass
 class Matching:
-    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair.
-
-    ``corners``: their number in each view, which bounds the batches.
+    """The tasks of batches of pairs in pieces: each view (sent and prepared) and each pair. ``corners``:
+    their number in each view, which bounds the batches.
     """
 
     views: dict[int, Task] = field(default_factory=dict)
@@ -88,13 +83,15 @@ class Matching:
         pairs = list(self.pairs)
         corners = [self.corners.get(view, 0) for view in range(max(self.corners) + 1)]
         batches = batch_pairs(pairs, range(len(pairs)), workers, corners)
-        return [self._batch([pairs[n] for n in batch]) for batch in batches]
-
-    def _batch(self, pairs: Sequence[tuple[int, int]]) -> Task:
-        parts = [self.views[view] for view in sorted({view for pair in pairs for view in pair})]
-        parts += [self.pairs[pair] for pair in pairs]
-        seconds = math.fsum(part.seconds for part in parts)
-        return Task(seconds, sum(part.sent for part in parts), sum(part.received for part in parts))
+        found = []
+        for batch in batches:
+            some = [pairs[n] for n in batch]
+            parts = [self.views[view] for view in sorted({view for pair in some for view in pair})]
+            parts += [self.pairs[pair] for pair in some]
+            seconds = math.fsum(part.seconds for part in parts)
+            sent, received = sum(part.sent for part in parts), sum(part.received for part in parts)
+            found.append(Task(seconds, sent, received))
+        return found
 
 
 @dataclass
@@ -153,11 +150,7 @@ def measure_tasks(images: str, count: int, until: Until, settings: Sequence[str]
         options = {"until": until, "set": list(settings), "threads": 1}
         reconstruct(paths, Path(place) / "run", executor=meter, **options)  # type: ignore[arg-type]
         serial_s = time.process_time() - start - meter.used_s
-    found: dict[str, Any] = {}
-    for workers in (1, 2, 4, 8, 16):
-        found[str(workers)] = {
-            stage: [asdict(task) for task in tasks] for stage, tasks in meter.tasks(workers).items()
-        }
+    found = {str(workers): meter.tasks(workers) for workers in (1, 2, 4, 8, 16)}
     return {"serial_s": serial_s, "tasks": found}
 
 
@@ -165,27 +158,24 @@ def efficiency_table(serial_s: float, by_workers: Mapping[int, Mapping[str, Sequ
     """Return work, critical path and efficiency of each stage and of the whole run by number of workers."""
     first = by_workers[min(by_workers)]
     work = {stage: math.fsum(task.seconds for task in tasks) for stage, tasks in first.items()}
-    rows, whole = list[list[str]](), {workers: [serial_s, serial_s] for workers in by_workers}
+    rows, whole = list[list[object]](), {workers: [serial_s, serial_s] for workers in by_workers}
 
     def timed(paths: Sequence[float], work_s: float, workers: int) -> list[str]:
         return [cell for s in paths for cell in (f"{s:.1f}", f"{work_s / max(workers * s, 1e-9):.2f}")]
 
-    for stage in work:
+    for stage, work_s in work.items():
         for workers, found in by_workers.items():
             tasks = found[stage]
             paths = [critical_path(tasks, workers, speed) for speed in (math.inf, LINE)]
             whole[workers] = [total + s for total, s in zip(whole[workers], paths, strict=True)]
-            largest = [
-                f"{max(getattr(task, side) for task in tasks) / 1e6:.2f}" for side in ("sent", "received")
-            ]
+            most = max(t.sent for t in tasks), max(t.received for t in tasks)
+            largest = [f"{size / 1e6:.2f}" for size in most]
             longest = f"{max(task.seconds for task in tasks):.2f}"
-            head = [stage, str(workers), str(len(tasks)), f"{work[stage]:.1f}", longest, *largest]
-            rows.append(head + timed(paths, work[stage], workers))
+            head = [stage, workers, len(tasks), f"{work_s:.1f}", longest, *largest]
+            rows.append(head + timed(paths, work_s, workers))
     all_s = serial_s + math.fsum(work.values())
     for workers, paths in whole.items():
-        rows.append(
-            ["whole run", str(workers), "", f"{all_s:.1f}", "", "", "", *timed(paths, all_s, workers)]
-        )
+        rows.append(["whole run", workers, "", f"{all_s:.1f}", "", "", "", *timed(paths, all_s, workers)])
     head = ["", "workers", "tasks", "work s", "longest s", "largest sent MB", "largest result MB"]
     return text_table([*head, "path s", "efficiency", "with line s", "efficiency"], rows)
 
@@ -203,7 +193,7 @@ def cluster_efficiency_study(
     for count in sorted(sizes):
         found, _ = call_apart(measure_tasks, images, count, until, list(set_), cores=1)
         by_workers = {
-            int(workers): {stage: [Task(**task) for task in tasks] for stage, tasks in stages.items()}
+            int(workers): {stage: [Task(*task) for task in tasks] for stage, tasks in stages.items()}
             for workers, stages in found["tasks"].items()
         }
         head = f"{count} images, {scene}, long side {long_side} px, {found['serial_s']:.1f} s serial"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,32 +29,25 @@ OURS, PUBLISHED = "thesisrecon", "published cameras"
 LOSS_PX, WRONG_PX = 1.0, 3.0
 
 
-@dataclass(frozen=True)
-class Residuals:
+class Residuals(NamedTuple):
     """Distances ``px`` (K,) of all observations, NaN without a camera, and their robust cost."""
 
     px: F64
     cost: float
 
 
-@dataclass(frozen=True)
-class Comparison:
+class Comparison(NamedTuple):
     """Residuals of our and of the published cameras, before and after bundle adjustment."""
 
     reconstruction: Reconstruction
     seconds: float
-    ours: Residuals
-    ours_adjusted: Residuals
-    published: Residuals
-    published_adjusted: Residuals
-
-    @property
-    def right(self) -> B8:
-        """Observations (K,) that either set of cameras explains within ``WRONG_PX``."""
-        return np.fmin(self.ours.px, self.published.px) < WRONG_PX
+    ours: tuple[Residuals, Residuals]
+    published: tuple[Residuals, Residuals]
 
     def rms_px(self, residuals: Residuals, *, all_observations: bool = False) -> float:
-        d = np.minimum(residuals.px, WRONG_PX) if all_observations else residuals.px[self.right]
+        """Of the observations that either set of cameras explains within ``WRONG_PX``, or of all."""
+        right = np.fmin(self.ours[0].px, self.published[0].px) < WRONG_PX
+        d = np.minimum(residuals.px, WRONG_PX) if all_observations else residuals.px[right]
         return float(np.sqrt(np.mean(d**2)))
 
 
@@ -84,16 +77,13 @@ def judge_adjusted(P: F64, registered: B8, tracks: Tracks) -> tuple[Residuals, R
 
 def compare(dinosaur: Dinosaur, *, seed: int = 0) -> Comparison:
     tracks = dinosaur.tracks
-    pairs = pairs_from_tracks(tracks, seed=seed)
+    pairs, rng = pairs_from_tracks(tracks, seed=seed), stream(seed, "projective", 0)
     start = time.perf_counter()
-    found = IncrementalProjective().reconstruct(
-        tracks, pairs, dinosaur.sizes, rng=stream(seed, "projective", 0)
-    )
+    found = IncrementalProjective().reconstruct(tracks, pairs, dinosaur.sizes, rng=rng)
     seconds = time.perf_counter() - start
-    ours, ours_adjusted = judge_adjusted(found.P, found.registered, tracks)
     everywhere = np.ones(len(dinosaur.P), dtype=bool)
-    published, published_adjusted = judge_adjusted(dinosaur.P, everywhere, tracks)
-    return Comparison(found, seconds, ours, ours_adjusted, published, published_adjusted)
+    ours = judge_adjusted(found.P, found.registered, tracks)
+    return Comparison(found, seconds, ours, judge_adjusted(dinosaur.P, everywhere, tracks))
 
 
 def to_metrics(found: Comparison) -> list[Metric]:
@@ -103,10 +93,8 @@ def to_metrics(found: Comparison) -> list[Metric]:
     rows = Rows("dinosaur", OURS)
     rows.add("cameras", registered, at_least=float(n))
     # Two descents into one flat valley differ in the fourth digit.
-    for name, ours, published, slack in (
-        ("as they are", found.ours, found.published, 1.0),
-        ("after bundle adjustment", found.ours_adjusted, found.published_adjusted, 1.001),
-    ):
+    for k, (name, slack) in enumerate((("as they are", 1.0), ("after bundle adjustment", 1.001))):
+        ours, published = found.ours[k], found.published[k]
         for label, everything in (("right observations", False), ("all, at most 3 px each", True)):
             rms = {
                 method: found.rms_px(residuals, all_observations=everything)
@@ -115,7 +103,7 @@ def to_metrics(found: Comparison) -> list[Metric]:
             rows.add(f"RMS, {label}, {name}", rms, "px", at_most=slack * rms[PUBLISHED])
         cost = {OURS: ours.cost, PUBLISHED: published.cost}
         rows.add(f"robust cost, {name}", cost, "px^2", at_most=slack * published.cost)
-    rows.add(f"observations used of {len(found.ours.px)}", found.reconstruction.inlier.sum())
+    rows.add(f"observations used of {len(found.ours[0].px)}", found.reconstruction.inlier.sum())
     rows.add("time", found.seconds, "s")
     return rows
 

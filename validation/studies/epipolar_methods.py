@@ -1,23 +1,24 @@
 """Chapter 5: distance of every F estimator from the KCR bound, and its processor time.
 
-All methods get the same synthetic matches. A cell is the root mean square (and the median) over trials of the
-RMS distance of the exact points to their epipolar lines over the KCR bound. An efficient estimator has the
-ratio 1; its median is then about 0.95, because seven parameters carry the error. OpenCV's robust methods get
-our confidence 0.9999 and 20000 iterations, the others their defaults. Set OPENBLAS_NUM_THREADS=1.
+A cell is the root mean square (and the median) over trials of the RMS distance of the exact points to their
+epipolar lines over the KCR bound. An efficient estimator has the ratio 1; its median is then about 0.95,
+because seven parameters carry the error. OpenCV's robust methods get our confidence 0.9999 and 20000
+iterations, the others their defaults. Set OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.arrays import F64
+from thesisrecon.config import FundamentalEstimator
 from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
@@ -49,16 +50,15 @@ THRESHOLD_PX, MATCHED_SIGMAS = 1.0, 3.0
 
 @dataclass(frozen=True)
 class Method:
-    """A named estimator of F.
-
-    ``name``: name in the tables; ``estimate``: the estimator; ``robust``: whether it accepts wrong matches;
-    ``thresholded``: whether it uses the inlier threshold.
+    """A named estimator of F: whether it is ``robust`` and uses the threshold, and whether this one is
+    ``matched``, :data:`MATCHED_SIGMAS` times the noise.
     """
 
     name: str
     estimate: Estimate
     robust: bool = False
     thresholded: bool = False
+    matched: bool = False
 
     def fundamental(self, xy1: F64, xy2: F64, *, threshold_px: float, seed: int) -> F64 | None:
         """Estimate F (3, 3); None if the method fails or the result is not finite."""
@@ -75,21 +75,14 @@ def _refined(criterion: Criterion, parameters: Parameters) -> Estimate:
     )
 
 
-def _linear(*, normalized: bool, rank_two: bool = True) -> Estimate:
-    return lambda xy1, xy2, _, __: estimate_eight_point(xy1, xy2, normalized=normalized, rank_two=rank_two)
+def _linear(**options: bool) -> Estimate:
+    return lambda xy1, xy2, _, __: estimate_eight_point(xy1, xy2, **options)
 
 
-def _robust(
-    make: Callable[[float], LocallyOptimisedRansac | LeastMedianOfSquares | ThesisRansac],
-) -> Estimate:
-    return lambda xy1, xy2, t, seed: make(t).estimate(xy1, xy2, np.random.default_rng(seed)).F
-
-
-def _thesis(threshold_px: float, **variant: Any) -> ThesisRansac:
-    return ThesisRansac(threshold_px=threshold_px, **variant)
-
-
-_default = _robust(lambda t: LocallyOptimisedRansac(threshold_px=t))
+def _robust(make: Callable[..., FundamentalEstimator], **variant: Any) -> Estimate:
+    return lambda xy1, xy2, t, seed: (
+        make(threshold_px=t, **variant).estimate(xy1, xy2, np.random.default_rng(seed)).F
+    )
 
 
 def _library(name: str) -> Estimate:
@@ -103,7 +96,7 @@ def _library(name: str) -> Estimate:
 OWN = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
-    Method(NORMALISED, _linear(normalized=True)),
+    Method(NORMALISED, _linear()),
     Method("Sampson (5.4), thesis' rows", _refined("sampson", "row")),
     Method("Sampson (5.4), orthonormal", _refined("sampson", "orthonormal")),
     Method("epipolar distance (5.6), thesis' rows", _refined("epipolar-distance", "row")),
@@ -111,7 +104,7 @@ OWN = (
     Method("gold standard, thesis' rows", _refined("reprojection", "row")),
     Method(GOLD, _refined("reprojection", "orthonormal")),
     *(
-        Method(f"Algorithm 2, {label}", _robust(partial(_thesis, **variant)), robust=True, thresholded=True)
+        Method(f"Algorithm 2, {label}", _robust(ThesisRansac, **variant), robust=True, thresholded=True)
         for label, variant in (
             ("seven-point search alone", {"rounds": 0}),
             ("Sampson", {}),
@@ -120,8 +113,8 @@ OWN = (
             ("Sampson, test of the sum", {"inlier_test": "symmetric-distance"}),
         )
     ),
-    Method("least median of squares", _robust(lambda _: LeastMedianOfSquares()), robust=True),
-    Method(DEFAULT, _default, robust=True, thresholded=True),
+    Method("least median of squares", _robust(lambda **_: LeastMedianOfSquares()), robust=True),
+    Method(DEFAULT, _robust(LocallyOptimisedRansac), robust=True, thresholded=True),
 )
 LIBRARIES = (
     Method("OpenCV FM_8POINT", lambda xy1, xy2, _, __: opencv_eight_point(xy1, xy2)),
@@ -137,13 +130,10 @@ LIBRARIES = (
     ),
 )
 METHODS = OWN + LIBRARIES
-
-
 WRONG, WRONG_NOISE_PX = 0.2, 1.0
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """Noise of each coordinate (px), number of matches, and their share of wrong ones."""
 
     sigma_px: float
@@ -151,32 +141,22 @@ class Setting:
     wrong: float = 0.0
 
 
-@dataclass(frozen=True)
-class Result:
-    """One method in one setting.
-
-    ``matched_threshold``: whether the inlier threshold is :data:`MATCHED_SIGMAS` times the noise;
-    ``rms_ratio``, ``median_ratio``: distance of the exact points over the bound, over all trials with an F;
-    ``time_ms``: median processor time; ``failures``, ``trials``: trials without an F, and all trials.
+class Result(NamedTuple):
+    """One method in one setting: distance of the exact points over the bound over all trials with an F,
+    median processor time, and number of trials without an F.
     """
 
-    method: str
-    setting: Setting
-    matched_threshold: bool
     rms_ratio: float
     median_ratio: float
     time_ms: float
     failures: int
-    trials: int
-
-    @property
-    def label(self) -> str:
-        """Name of the method and, if matched, of its threshold."""
-        return f"{self.method}, {MATCHED_SIGMAS:g} sigma" if self.matched_threshold else self.method
 
 
-@dataclass(frozen=True)
-class Trial:
+Results = dict[Setting, dict[str, Result]]
+"""Results of each setting by the names of methods."""
+
+
+class Trial(NamedTuple):
     """Noisy matches (N, 2), the exact points of the right ones (M, 2), and the KCR bound (px) of these."""
 
     xy1: F64
@@ -203,11 +183,9 @@ def make_trial(setting: Setting, seed: int) -> Trial:
     return Trial(xy1, xy2, scene.xy1[right], scene.xy2[right], bound.rms_distance_px)
 
 
-def measure(
-    method: Method, trials: Sequence[Trial], setting: Setting, *, matched_threshold: bool = False
-) -> Result:
+def measure(method: Method, trials: Sequence[Trial], setting: Setting) -> Result:
     """Run one method on the trials of one setting, after two calls that are not timed."""
-    threshold = MATCHED_SIGMAS * setting.sigma_px if matched_threshold else THRESHOLD_PX
+    threshold = MATCHED_SIGMAS * setting.sigma_px if method.matched else THRESHOLD_PX
     ratios, seconds = [], []
     for seed in (-2, -1, *range(len(trials))):
         trial = trials[max(seed, 0)]
@@ -216,46 +194,37 @@ def measure(
         elapsed = time.process_time() - start
         if seed >= 0:
             seconds.append(elapsed)
-            if F is not None:
-                ratios.append(trial.ratio(F))
+            ratios += [trial.ratio(F)] if F is not None else []
     good = np.array(ratios) if ratios else np.array([np.inf])
-    return Result(
-        method.name,
-        setting,
-        matched_threshold,
-        float(np.sqrt(np.mean(good**2))),
-        float(np.median(good)),
-        1e3 * float(np.median(seconds)),
-        len(trials) - len(ratios),
-        len(trials),
-    )
+    rms, middle, time_ms = np.sqrt(np.mean(good**2)), np.median(good), 1e3 * np.median(seconds)
+    return Result(float(rms), float(middle), float(time_ms), len(trials) - len(ratios))
 
 
-def run_methods(settings: Sequence[Setting], methods: Sequence[Method], trials: int) -> list[Result]:
-    """Run all methods in all settings; thresholded ones with the default and with the matched threshold."""
+def run_methods(setting: Setting, methods: Sequence[Method], trials: int) -> dict[str, Result]:
+    """Run all methods in a setting; thresholded ones with the default and with the matched threshold."""
     one_thread()
-    results: list[Result] = []
-    for setting in settings:
-        data = [make_trial(setting, seed) for seed in range(trials)]
-        for method in methods:
-            if method.robust or not setting.wrong:
-                results.append(measure(method, data, setting))
-                if method.thresholded:
-                    results.append(measure(method, data, setting, matched_threshold=True))
-        report_progress(f"done: {setting}")
+    data, results = [make_trial(setting, seed) for seed in range(trials)], dict[str, Result]()
+    for method in methods:
+        if method.robust or not setting.wrong:
+            results[method.name] = measure(method, data, setting)
+            if method.thresholded:
+                matched = replace(method, matched=True)
+                results[f"{method.name}, {MATCHED_SIGMAS:g} sigma"] = measure(matched, data, setting)
+    report_progress(f"done: {setting}")
     return results
 
 
-def report(results: Sequence[Result]) -> str:
+def report(results: Results, trials: int) -> str:
     """Return ratio and time tables for every share of wrong matches."""
     blocks = []
-    for wrong in sorted({r.setting.wrong for r in results}):
-        some = [r for r in results if r.setting.wrong == wrong]
-        title = f"{100.0 * wrong:.0f} % wrong matches, {some[0].trials} trials"
-        sigmas = {r.setting.sigma_px for r in some}
-        timed = [r for r in some if r.setting.sigma_px == (1.0 if 1.0 in sigmas else min(sigmas))]
-        ratios = _table(some, lambda s: f"{s.sigma_px:g} px, {s.n}", _ratio_cell)
-        times = _table(timed, lambda s: f"n = {s.n}", lambda r: f"{r.time_ms:.3g}")
+    for wrong in sorted({s.wrong for s in results}):
+        some = {s: found for s, found in results.items() if s.wrong == wrong}
+        title = f"{100.0 * wrong:.0f} % wrong matches, {trials} trials"
+        sigmas = {s.sigma_px for s in some}
+        sigma = 1.0 if 1.0 in sigmas else min(sigmas)
+        timed = {s: found for s, found in some.items() if s.sigma_px == sigma}
+        ratios = _table(some, [f"{s.sigma_px:g} px, {s.n}" for s in some], _ratio_cell)
+        times = _table(timed, [f"n = {s.n}" for s in timed], lambda r: f"{r.time_ms:.3g}")
         blocks.append(f"{title}: RMS (median) of the distance over the bound\n\n{ratios}")
         blocks.append(f"{title}: median processor time, ms\n\n{times}")
     return "\n\n".join(blocks)
@@ -266,23 +235,20 @@ def _ratio_cell(r: Result) -> str:
     return f"{rms} ({median}{f'; {r.failures} none' if r.failures else ''})"
 
 
-def _table(results: Sequence[Result], head: Callable[[Setting], str], cell: Callable[[Result], str]) -> str:
-    settings = list(dict.fromkeys(r.setting for r in results))
-    labels = list(dict.fromkeys(r.label for r in results))
-    cells = {(r.label, r.setting): cell(r) for r in results}
-    return text_table(
-        ["", *map(head, settings)],
-        ([label, *(cells.get((label, s), "-") for s in settings)] for label in labels),
-    )
+def _table(results: Results, head: Sequence[str], cell: Callable[[Result], str]) -> str:
+    rows = {name: [name] for found in results.values() for name in found}
+    for name, row in rows.items():
+        row += [cell(found[name]) if name in found else "-" for found in results.values()]
+    return text_table(["", *head], rows.values())
 
 
-def check_methods(setting: Setting, results: Sequence[Result]) -> Rows:
-    """Return the judged rows of one setting; a trial without an F misses the bound."""
+def check_methods(setting: Setting, results: Mapping[str, Result]) -> Rows:
+    """Return the RMS ratio of the gold standard and of the default; infinite if a trial has no F."""
     rows = Rows(f"n = {setting.n}, {setting.sigma_px:g} px", OURS)
-    for r in results:
-        if r.method in (GOLD, DEFAULT) and not (r.matched_threshold or setting.wrong):
-            # Largest RMS ratio of the gold standard and of the default.
-            rows.add(r.method, np.inf if r.failures else r.rms_ratio, at_most=1.05)
+    for name in (GOLD, DEFAULT):
+        if name in results and not setting.wrong:
+            r = results[name]
+            rows.add(name, np.inf if r.failures else r.rms_ratio, at_most=1.05)
     return rows
 
 
@@ -296,18 +262,13 @@ def epipolar_methods_study(
     """Compare every estimator of F with the KCR bound."""
     names = pick(methods, [m.name for m in METHODS])
     chosen = [m for m in METHODS if m.name in names]
-    settings = [
-        Setting(sigma, n, share)
-        for share in wrong
-        for sigma in ([WRONG_NOISE_PX] if share else noise)
-        for n in points
-    ]
-    found: list[Result] = []
-    for setting in settings:
-        block = run_methods([setting], chosen, trials)
-        found += block
-        yield check_methods(setting, block)
-    yield report(found)
+    found: Results = {}
+    for share in wrong:
+        for sigma, n in product([WRONG_NOISE_PX] if share else noise, points):
+            setting = Setting(sigma, n, share)
+            found[setting] = run_methods(setting, chosen, trials)
+            yield check_methods(setting, found[setting])
+    yield report(found, trials)
 
 
 LEAST = "gold standard"

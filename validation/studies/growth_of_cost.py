@@ -1,8 +1,8 @@
 """Growth of time and memory with the number of images, compared with COLMAP on the same images and pairs.
 
 The first n images of a long walk become metric cameras: around the courtyard, where each image overlaps with
-ever more others, or along a street, where it overlaps with a few. Exponents are slopes of lines fitted to the
-logarithms; those of time use processor time, which other load disturbs less.
+ever more others, or along a street. Exponents are slopes of lines fitted to the logarithms; those of time use
+processor time, which other load disturbs less.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,28 +24,16 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run import Until
-from validation.metrics.cameras import TrueCameras, measure_cameras, relative_centre_error
+from validation.metrics.cameras import measure_cameras, relative_centre_error
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.references.libraries import load
 from validation.runs.processes import call_apart, peak_mb, reset_peak, timed
 from validation.runs.study import Part
 from validation.runs.tables import text_table
-from validation.scenes.many_views import walk, write_views
-from validation.scenes.street import walk_street, write_street
+from validation.scenes.many_views import walk, walk_street, write_street, write_views
 
-STAGES = (
-    "images",
-    "features",
-    "pairs",
-    "matches",
-    "tracks",
-    "projective",
-    "selfcalibration",
-    "metric",
-    "dense",
-    "model",
-    "outputs",
-)
+STAGES = ("images", "features", "pairs", "matches", "tracks", "projective")
+STAGES += ("selfcalibration", "metric", "dense", "model", "outputs")
 AFTER = {"matches": "tracks", "metric": "outputs", "model": "outputs"}
 """Stage that reports its end -> the following stage, which does not report its beginning."""
 
@@ -72,25 +60,15 @@ class Meter:
         reset_peak()
 
 
-@dataclass(frozen=True)
-class Cost:
-    """One number of images.
-
-    ``cpu_s``, ``peak_mb``: processor seconds and highest memory by stage; ``counts``: numbers of pairs,
-    matches, cameras and points; ``focal_error_rel``, ``centre_error_rel``: of the true focal length and of
-    the extent of the true centres; ``failure``: message of a run without cameras; ``colmap``: the same of
-    COLMAP.
-    """
-
-    images: int
-    cpu_s: Mapping[str, float]
-    peak_mb: Mapping[str, float]
-    counts: Mapping[str, int]
-    wall_s: float
-    focal_error_rel: float
-    centre_error_rel: float = float("nan")
-    failure: str = ""
-    colmap: Mapping[str, float] = field(default_factory=dict)
+Cost = dict[str, float]
+"""Numbers of one run by their names in the table, the number of images under ``IMAGES``."""
+IMAGES = "images"
+DIGITS = {
+    "all, processor s": 1,
+    "focal error, %": 3,
+    "centres, % of their extent": 4,
+    "wall over COLMAP's": 2,
+}
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
@@ -102,45 +80,46 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 def measure_cost(
     images: str, count: int, threads: int, scene: str, until: Until = "metric", settings: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Reconstruct in this process, its kernels loaded before; return the fields of :class:`Cost`."""
+) -> tuple[Cost, str]:
+    """Reconstruct in this process, its kernels loaded before; return the numbers, and why it failed."""
     paths = sorted(Path(images).glob("*.png"))[:count]
     with tempfile.TemporaryDirectory() as place:
-        reconstruct(paths[:4], Path(place) / "warm", until=until, threads=threads)
+        out, given = Path(place) / "run", {"until": until, "threads": threads}
+        reconstruct(paths[:4], Path(place) / "warm", **given)  # type: ignore[arg-type]
         meter, failure, errors = Meter(), "", (float("nan"), float("nan"))
         try:
-            result = reconstruct(
-                paths,
-                Path(place) / "run",
-                until=until,
-                set=list(settings),
-                threads=threads,
-                progress=meter.progress,
-            )
+            result = reconstruct(paths, out, set=list(settings), progress=meter.progress, **given)  # type: ignore[arg-type]
             if result.metric is not None:
-                errors = _errors(result.metric.reconstruction, scene, _size(paths))
+                errors = _errors(result.metric.reconstruction, scene, paths)
             listed = [f"{paths[pair.i].name} {paths[pair.j].name}\n" for pair in result.pairs]
             write_text(Path(images) / f"pairs-{count}.txt", "".join(listed))
         except StageFailure as error:
             failure = str(error)
         meter.enter("end")
-        summary = json.loads((Path(place) / "run" / "summary.json").read_text(encoding="utf-8"))
-        files = [Path(place) / "run" / name for name in ("report.html", "model.glb")]
-        sizes = {f"{file.name}, kB": file.stat().st_size // 1000 for file in files if file.exists()}
-    seconds, counts = summary["elapsed_seconds"], counts_of(summary) | sizes
-    found = Cost(len(paths), meter.cpu_s, meter.peak_mb, counts, seconds, *errors, failure)
-    return asdict(found)
+        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        files = [file for file in (out / "report.html", out / "model.glb") if file.exists()]
+        sizes = {f"{file.name}, kB": file.stat().st_size // 1000 for file in files}
+    pairs, found = summary["pairs"], {IMAGES: len(paths)} | costs_of(meter)
+    found |= {"pairs tried": pairs["matched"], "pairs accepted": pairs["accepted"]}
+    found |= {"verified matches": pairs["verified_matches"], "registered": summary["registered"]}
+    found |= {"points": summary["points"] or 0, **sizes}
+    found |= {"focal error, %": 100.0 * errors[0], "centres, % of their extent": 100.0 * errors[1]}
+    return found | {"wall s": summary["elapsed_seconds"]}, failure
 
 
-def _size(paths: Sequence[Path]) -> tuple[int, int]:
+def costs_of(meter: Meter) -> Cost:
+    """Return processor seconds and memory of each stage and of all."""
+    seconds = {f"{stage}, processor s": meter.cpu_s.get(stage, 0.0) for stage in STAGES}
+    memory = {f"{stage}, peak MB": meter.peak_mb.get(stage, 0.0) for stage in STAGES}
+    seconds["all, processor s"] = sum(meter.cpu_s.values())
+    return seconds | memory | {"whole run, peak MB": max(meter.peak_mb.values())}
+
+
+def _errors(found: Reconstruction, scene: str, paths: Sequence[Path]) -> tuple[float, float]:
     with PillowImage.open(paths[0]) as image:
-        return image.size
-
-
-def _errors(found: Reconstruction, scene: str, size: tuple[int, int]) -> tuple[float, float]:
-    poses = WALKS[scene][0](len(found.P), size)
+        poses = WALKS[scene][0](len(found.P), image.size)
     K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
-    errors = measure_cameras(found, TrueCameras(K, R, C))
+    errors = measure_cameras(found, (K, R, C))
     return errors.focal_error_pct / 100.0, relative_centre_error(errors, C)
 
 
@@ -154,16 +133,13 @@ def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[s
             (folder / path.name).symlink_to(path.resolve())
         pairs = images / f"pairs-{count}.txt"
         costs, process = call_apart(run_colmap, folder, out, pairs, threads, cores=threads)
-        run = read_run(folder, out)
-    focal, centre = _errors(run.reconstruction, scene, _size(paths))
-    return {
-        **costs,
-        "peak MB": process.peak_mb,
-        **{f"{name}, wall s": seconds for name, seconds in run.seconds.items()},
-        "registered": float(run.reconstruction.registered.sum()),
-        "focal error, %": 100 * focal,
-        "centres, %": 100 * centre,
-    }
+        model, spent = read_run(folder, out)
+    focal, centre = _errors(model, scene, paths)
+    costs |= {"peak MB": process.peak_mb}
+    costs |= {f"{name}, wall s": seconds for name, seconds in spent.items()}
+    costs |= {"registered": float(model.registered.sum())}
+    found: dict[str, float] = costs | {"focal error, %": 100 * focal, "centres, %": 100 * centre}
+    return found
 
 
 def run_colmap(images: str, out: str, pairs: str, threads: int) -> dict[str, float]:
@@ -174,45 +150,19 @@ def run_colmap(images: str, out: str, pairs: str, threads: int) -> dict[str, flo
     return {"wall s": wall, "processor s": cpu}
 
 
-def counts_of(summary: Mapping[str, Any]) -> dict[str, int]:
-    pairs = summary["pairs"]
-    counts = {"pairs tried": pairs["matched"], "pairs accepted": pairs["accepted"]}
-    counts |= {"verified matches": pairs["verified_matches"]}
-    return counts | {"registered": summary["registered"], "points": summary["points"] or 0}
-
-
-def cost_table(costs: Sequence[Cost]) -> str:
-    """Return processor seconds, memory and counts by stage, with their powers of N, without rows of zeros."""
-    sizes, lines = [float(cost.images) for cost in costs], []
-
-    def row(name: str, values: Sequence[float], digits: int) -> None:
-        if not any(values):
-            return
-        known = len(sizes) > 1 and bool(np.isfinite(values).all()) and min(values) > 0.0
-        power = f"{exponent(sizes, values):.2f}" if known else "-"
-        lines.append([name, *(f"{v:.{digits}f}" for v in values), power])
-
-    for stage in STAGES:
-        row(f"{stage}, processor s", [cost.cpu_s.get(stage, 0.0) for cost in costs], 2)
-    row("all, processor s", [sum(cost.cpu_s.values()) for cost in costs], 1)
-    for stage in STAGES:
-        row(f"{stage}, peak MB", [cost.peak_mb.get(stage, 0.0) for cost in costs], 0)
-    row("whole run, peak MB", [max(cost.peak_mb.values()) for cost in costs], 0)
-    for name in dict.fromkeys(name for cost in costs for name in cost.counts):
-        row(name, [float(cost.counts.get(name) or 0) for cost in costs], 0)
-    row("focal error, %", [100.0 * cost.focal_error_rel for cost in costs], 3)
-    row("centres, % of their extent", [100.0 * cost.centre_error_rel for cost in costs], 4)
-    row("wall s", [cost.wall_s for cost in costs], 0)
-    for name in dict.fromkeys(name for cost in costs for name in cost.colmap):
-        row(
-            f"COLMAP, {name}",
-            [cost.colmap.get(name, float("nan")) for cost in costs],
-            4 if "%" in name else 0,
-        )
-    if all(cost.colmap for cost in costs):
-        row("wall over COLMAP's", [cost.wall_s / cost.colmap["wall s"] for cost in costs], 2)
-    failures = [f"\n{cost.images} images: {cost.failure}" for cost in costs if cost.failure]
-    return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *failures])
+def cost_table(costs: Sequence[Cost], failures: Sequence[str] = ()) -> str:
+    """Return all numbers with their powers of N, without rows of zeros."""
+    sizes, lines = [cost[IMAGES] for cost in costs], []
+    for name in dict.fromkeys(name for cost in costs for name in cost if name != IMAGES):
+        theirs = name.startswith("COLMAP")
+        values = [cost.get(name, np.nan if theirs else 0.0) for cost in costs]
+        if any(values):
+            digits = 4 * ("%" in name) if theirs else DIGITS.get(name, 2 * name.endswith("processor s"))
+            known = len(sizes) > 1 and bool(np.isfinite(values).all()) and min(values) > 0.0
+            power = f"{exponent(sizes, values):.2f}" if known else "-"
+            lines.append([name, *(f"{v:.{digits}f}" for v in values), power])
+    notes = [f"\n{why}" for why in failures if why]
+    return "\n".join([text_table(["", *(f"{n:.0f}" for n in sizes), "power of N"], lines), *notes])
 
 
 WALKS = {"place": (walk, write_views), "street": (walk_street, write_street)}
@@ -242,11 +192,15 @@ def growth_of_cost_study(
     images = write_scene(out, scene, max(sizes), long_side, threads)
     head = [scene, f"long side {long_side} px", f"{threads} threads", f"{os.cpu_count()} cores", *set_]
     yield ", ".join(head)
-    costs = []
+    costs, failures = list[Cost](), list[str]()
     for count in sorted(sizes):
         arguments = (images, count, threads, scene, until, list(set_))
-        costs.append(Cost(**call_apart(measure_cost, *arguments, cores=threads)[0]))
-        yield cost_table(costs[-1:]) if len(sizes) > 1 else ""
-        if colmap and not costs[-1].failure:
-            costs[-1] = replace(costs[-1], colmap=measure_colmap(images, count, threads, scene))
-    yield cost_table(costs)
+        (cost, failure), _ = call_apart(measure_cost, *arguments, cores=threads)
+        costs.append(cost)
+        failures.append(f"{count} images: {failure}" if failure else "")
+        yield cost_table(costs[-1:], failures[-1:]) if len(sizes) > 1 else ""
+        if colmap and not failure:
+            theirs = measure_colmap(images, count, threads, scene)
+            cost |= {f"COLMAP, {name}": value for name, value in theirs.items()}
+            cost["wall over COLMAP's"] = cost["wall s"] / theirs["wall s"]
+    yield cost_table(costs, failures)

@@ -1,18 +1,17 @@
 """Harsh synthetic image sets: trusted answers whose focal length is wrong and outside its interval.
 
-Random sets with noisy tracks and verified pairs become metric cameras as in
-the pipeline. A trusted focal length that errs by more than 3 % and by more than its 95 % interval is a silent
-error.
+Noisy tracks and verified pairs of random sets become metric cameras as in the pipeline. A trusted focal
+length that errs by more than 3 % and by more than its 95 % interval is a silent error.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +20,7 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError
 from thesisrecon.records import MetricResult, Tracks, TwoView
-from validation.metrics.intervals import LEVEL
+from validation.metrics.cameras import LEVEL
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import Rows, text_table
 from validation.scenes.critical import SIZE, filling_focal
@@ -33,9 +32,8 @@ from validation.studies.subsets import Matched, solve
 
 @dataclass(frozen=True)
 class HarshSet:
-    """True cameras ``K, R`` (V, 3, 3), ``C`` (V, 3), points ``X`` (N, 3); ``lens`` (k1, k2); observation
-    errors (``sigma_px``, share of ``wrong`` matches, share of points ``moving`` with an object); and the
-    camera assumption ``cameras``.
+    """True cameras and points; ``lens`` (k1, k2); errors: ``sigma_px``, shares of ``wrong`` matches and of
+    points ``moving`` with an object; and the camera assumption ``cameras``.
     """
 
     K: F64
@@ -99,10 +97,6 @@ def _path(rng: np.random.Generator, C: F64, turn_deg: float) -> tuple[F64, F64]:
     return turns @ start, C
 
 
-def _orbit(rng: np.random.Generator, views: int) -> tuple[F64, F64]:
-    return turntable(rng, views, 4.0, highest_deg=40.0, widest_deg=300.0)
-
-
 def _set(poses: tuple[F64, F64], X: F64, rng: np.random.Generator) -> HarshSet:
     """One focal that fills the image with the scene, the principal point off by half a hundredth."""
     R, C = poses
@@ -120,34 +114,38 @@ def _general(rng: np.random.Generator, views: int | None = None) -> HarshSet:
     return _set(_cap(rng, views or _several(rng)), _points(rng), rng)
 
 
-def _zooming(scene: HarshSet, factors: F64, cameras: Literal["shared", "per-image"]) -> HarshSet:
-    K = scene.K.copy()
-    K[:, :2, :2] *= factors[:, None, None]
-    return replace(scene, K=K, cameras=cameras)
+def _turntable(rng: np.random.Generator) -> HarshSet:
+    poses = turntable(rng, _several(rng), 4.0, highest_deg=40.0, widest_deg=300.0)
+    return _set(poses, _points(rng), rng)
 
 
-def _cropped(scene: HarshSet, shift: F64) -> HarshSet:
-    """Principal points moved by ``shift`` (V, 2) or (2,), in width and height."""
+def _changed(scene: HarshSet, zoom: F64 | float = 1.0, shift: F64 | float = 0.0, **more: Any) -> HarshSet:
+    """Focal lengths times ``zoom`` (V,), principal points moved by ``shift`` (V, 2) in width and height."""
     K = scene.K.copy()
+    K[:, :2, :2] *= np.reshape(zoom, (-1, 1, 1))
     K[:, :2, 2] += shift * SIZE
-    return replace(scene, K=K)
+    return replace(scene, K=K, **more)
 
 
-def _own_zooms(scene: HarshSet, rng: np.random.Generator, zoom: float = 0.3) -> HarshSet:
-    return _zooming(scene, np.exp(rng.uniform(-zoom, zoom, len(scene.K))), "per-image")
+def _own_zooms(scene: HarshSet, rng: np.random.Generator) -> HarshSet:
+    return _changed(scene, np.exp(rng.uniform(-0.3, 0.3, len(scene.K))), cameras="per-image")
+
+
+def _own_crops(rng: np.random.Generator) -> HarshSet:
+    scene = _general(rng)
+    return _changed(scene, shift=rng.uniform(-0.1, 0.1, (len(scene.K), 2)))
 
 
 def _two_zooms(rng: np.random.Generator, low: float, high: float) -> HarshSet:
     scene = _general(rng)
-    factors = np.where(np.arange(len(scene.K)) % 2 == 0, 1.0, rng.uniform(low, high))
-    return _zooming(scene, factors, "shared")
+    return _changed(scene, np.where(np.arange(len(scene.K)) % 2 == 0, 1.0, rng.uniform(low, high)))
 
 
 def _one_other(rng: np.random.Generator) -> HarshSet:
     scene = _general(rng)
     factors = np.ones(len(scene.K))
     factors[rng.integers(len(factors))] = rng.uniform(1.05, 1.5)
-    return _zooming(scene, factors, "shared")
+    return _changed(scene, factors)
 
 
 def _sideways(rng: np.random.Generator) -> HarshSet:
@@ -161,22 +159,19 @@ def _forward(rng: np.random.Generator) -> HarshSet:
 
 
 def _nearly_turning(rng: np.random.Generator) -> HarshSet:
-    start = np.array([4.0, 0.0, 0.0])
-    C = start + 4.0 * rng.uniform(0.003, 0.06) * rng.normal(size=(8, 3))
+    C = np.array([4.0, 0.0, 0.0]) + 4.0 * rng.uniform(0.003, 0.06) * rng.normal(size=(8, 3))
     return _set(_path(rng, C, rng.uniform(4.0, 9.0)), _points(rng), rng)
 
 
 def _aspect(rng: np.random.Generator) -> HarshSet:
     scene = _general(rng)
-    K = scene.K.copy()
-    K[:, 1, 1] *= rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.06) + 1.0
-    return replace(scene, K=K)
+    scene.K[:, 1, 1] *= rng.choice([-1.0, 1.0]) * rng.uniform(0.01, 0.06) + 1.0
+    return scene
 
 
 def _telephoto(rng: np.random.Generator) -> HarshSet:
     R, C = _cap(rng, _several(rng))
-    factor = rng.uniform(3.0, 8.0)
-    return _set((R, factor * C), _points(rng), rng)
+    return _set((R, rng.uniform(3.0, 8.0) * C), _points(rng), rng)
 
 
 def _shallow(rng: np.random.Generator) -> HarshSet:
@@ -185,60 +180,52 @@ def _shallow(rng: np.random.Generator) -> HarshSet:
     return _set(_cap(rng, _several(rng)), X, rng)
 
 
+def _strong_lens(rng: np.random.Generator) -> HarshSet:
+    return replace(_general(rng), lens=(float(rng.uniform(-0.4, -0.1)), float(rng.uniform(0.0, 0.15))))
+
+
+def _few_points(rng: np.random.Generator) -> HarshSet:
+    return _own_zooms(_set(_cap(rng, 5), _points(rng, int(rng.integers(70, 120))), rng), rng)
+
+
+def _small_arc(rng: np.random.Generator) -> HarshSet:
+    return _set(_cap(rng, _several(rng), rng.uniform(2.5, 5.0)), _points(rng), rng)
+
+
 KINDS: Mapping[str, Callable[[np.random.Generator], HarshSet]] = {
     "three images": lambda rng: _general(rng, 3),
     "four images, one zoom per image": lambda rng: _own_zooms(_general(rng, 4), rng),
-    "a small arc of 5 to 10 degrees": lambda rng: _set(
-        _cap(rng, _several(rng), rng.uniform(2.5, 5.0)), _points(rng), rng
-    ),
+    "a small arc of 5 to 10 degrees": _small_arc,
     "nearly pure rotation": _nearly_turning,
     "sideways, turned by 0.1 to 2 degrees": _sideways,
     "forward, turned by 0.1 to 2 degrees": _forward,
     "sideways or forward, one zoom per image": lambda rng: _own_zooms(
         (_sideways if rng.random() < 0.5 else _forward)(rng), rng
     ),
-    "turntable": lambda rng: _set(_orbit(rng, _several(rng)), _points(rng), rng),
-    "turntable, all cropped equally": lambda rng: _cropped(
-        _set(_orbit(rng, _several(rng)), _points(rng), rng), rng.uniform(-0.1, 0.1, 2)
-    ),
-    "turntable, one zoom per image": lambda rng: _own_zooms(
-        _set(_orbit(rng, _several(rng)), _points(rng), rng), rng
-    ),
+    "turntable": _turntable,
+    "turntable, all cropped equally": lambda r: _changed(_turntable(r), shift=r.uniform(-0.1, 0.1, 2)),
+    "turntable, one zoom per image": lambda rng: _own_zooms(_turntable(rng), rng),
     "two alternating zooms, shared camera assumed": lambda rng: _two_zooms(rng, 1.1, 2.0),
     "two similar alternating zooms, shared camera assumed": lambda rng: _two_zooms(rng, 1.02, 1.1),
     "one image with another focal length, shared camera assumed": _one_other,
-    "all cropped equally": lambda rng: _cropped(_general(rng), rng.uniform(-0.12, 0.12, 2)),
-    "each cropped differently": lambda rng: _own_zooms(
-        _cropped(scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))), rng
-    ),
-    "each cropped differently, shared camera assumed": lambda rng: _cropped(
-        scene := _general(rng), rng.uniform(-0.1, 0.1, (len(scene.K), 2))
-    ),
+    "all cropped equally": lambda rng: _changed(_general(rng), shift=rng.uniform(-0.12, 0.12, 2)),
+    "each cropped differently": lambda rng: _own_zooms(_own_crops(rng), rng),
+    "each cropped differently, shared camera assumed": _own_crops,
     "pixels not square": _aspect,
-    "strong lens": lambda rng: replace(
-        _general(rng), lens=(float(rng.uniform(-0.4, -0.1)), float(rng.uniform(0.0, 0.15)))
-    ),
+    "strong lens": _strong_lens,
     "telephoto": _telephoto,
     "shallow scene": _shallow,
     "noise of 2 to 3 px": lambda rng: replace(_general(rng), sigma_px=float(rng.uniform(2.0, 3.0))),
     "a fifth of the matches wrong": lambda rng: replace(_general(rng), wrong=0.2),
     "an object moves with 30 % of the points": lambda rng: replace(_general(rng), moving=0.3),
-    "five images of few points, one zoom per image": lambda rng: _own_zooms(
-        _set(_cap(rng, 5), _points(rng, int(rng.integers(70, 120))), rng), rng
-    ),
+    "five images of few points, one zoom per image": _few_points,
 }
-
-
 OFF = 0.03
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One set and its outcome.
-
-    ``outcome``: "refused", "not trusted" or "trusted"; ``worst``, ``median``: relative focal errors of the
-    registered cameras; ``silent``: cameras that err by more than 3 % and by more than their 95 % intervals;
-    ``failed_checks``: failed checks, or the refusal.
+class Trial(NamedTuple):
+    """One set: "refused", "not trusted" or "trusted"; relative focal errors of the registered cameras;
+    ``silent`` cameras, which err by more than 3 % and by more than their intervals; failed checks or refusal.
     """
 
     number: int
@@ -249,26 +236,15 @@ class Trial:
     silent: int
     failed_checks: tuple[str, ...]
 
-    @property
-    def is_silent_error(self) -> bool:
-        """Whether the answer is trusted, wrong, and has an interval that does not show it."""
-        return self.outcome == "trusted" and self.silent > 0
-
 
 def run_trial(kind: str, number: int) -> Trial:
     rng = np.random.default_rng([number, list(KINDS).index(kind), 7])
     scene = KINDS[kind](rng)
     observed = scene.observe(rng)
-    pairs = pairs_from_tracks(observed, seed=number)
-    tracks = verified_tracks(observed, pairs)
-    config = PipelineConfig()
+    pairs, config = pairs_from_tracks(observed, seed=number), PipelineConfig()
     config = replace(config, intrinsics=replace(config.intrinsics, cameras=scene.cameras))
-    matched = Matched(kind, tracks, pairs, scene.sizes, scene.focal_px)
+    matched = Matched(kind, verified_tracks(observed, pairs), pairs, scene.sizes, scene.focal_px)
     result, failures, _ = solve(matched, config, seed=number, first=0)
-    return judge(number, result, failures, matched)
-
-
-def judge(number: int, result: MetricResult | None, failures: Sequence[str], matched: Matched) -> Trial:
     if result is None:
         return Trial(number, "refused", 0, np.nan, np.nan, 0, tuple(failures[-1:]))
     error, stated = focal_errors(result, matched)
@@ -307,20 +283,6 @@ def table_row(kind: str, trials: Sequence[Trial]) -> list[object]:
     return [kind, count["refused"], count["not trusted"], good, count["trusted"], median, off, silent]
 
 
-def _report(found: Iterable[tuple[str, Sequence[Trial]]]) -> Iterator[Part]:
-    lines, errors, total = [], [], 0
-    for kind, trials in found:
-        lines.append(table_row(kind, trials))
-        total += sum(t.outcome == "trusted" for t in trials)
-        errors += [f"{kind}: {t}" for t in trials if t.is_silent_error]
-        report_progress(f"{kind} done")
-    yield text_table(HEAD, lines)
-    yield "\n".join(errors)
-    rows = Rows(f"{total} trusted", "ours")
-    rows.add("trusted, wrong, outside its interval", len(errors), at_most=0.0)
-    yield rows
-
-
 HEAD = ["set", "refused", "not trusted", "not trusted though within 3 %", "trusted"]
 HEAD += ["their worst focal, median, %", "off by more than 3 %", "and by more than the interval"]
 
@@ -330,5 +292,16 @@ def harsh_study(trials: int = 20, workers: int = 1, kinds: Sequence[str] | None 
     chosen = [k for k in KINDS if kinds is None or any(word in k for word in kinds)]
     if not chosen:
         raise UsageError(f"no kind has one of these words; choose from {', '.join(KINDS)}")
+    lines, errors, total = [], [], 0
     with ProcessPoolExecutor(workers) as pool:
-        yield from _report((k, list(pool.map(partial(run_trial, k), range(trials)))) for k in chosen)
+        for kind in chosen:
+            found = list(pool.map(partial(run_trial, kind), range(trials)))
+            lines.append(table_row(kind, found))
+            total += sum(t.outcome == "trusted" for t in found)
+            errors += [f"{kind}: {t}" for t in found if t.outcome == "trusted" and t.silent]
+            report_progress(f"{kind} done")
+    yield text_table(HEAD, lines)
+    yield "\n".join(errors)
+    rows = Rows(f"{total} trusted", "ours")
+    rows.add("trusted, wrong, outside its interval", len(errors), at_most=0.0)
+    yield rows

@@ -14,8 +14,7 @@ from validation.runs.processes import call_apart
 from validation.runs.study import Part, pick, report_progress
 from validation.runs.tables import text_table
 
-LARGEST_SIDE = 13_376
-"""A square of this side has 178.9 megapixels, the most that are accepted."""
+LARGEST_SIDE = 13_376  # A square of this side has 178.9 megapixels, the most that are accepted
 _ROTATED = PIL.Image.Exif()
 _ROTATED[0x0112] = 6
 FORMATS: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -31,8 +30,7 @@ FORMATS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "JPEG, progressive": ("RGB", "jpg", {"progressive": True}),
     "WebP": ("RGB", "webp", {}),
     "GIF": ("P", "gif", {}),
-}
-"""Name -> mode of the pixels, suffix of the file, options of Pillow."""
+}  # Name -> mode of the pixels, suffix of the file, options of Pillow
 
 
 def write_image(name: str, side: int, path: str) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -21,17 +21,16 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from validation.runs.study import Part
 from validation.runs.tables import text_table
+from validation.scenes.many_views import build_corner
 from validation.scenes.pose import Pose
 from validation.scenes.raycast import trace
 from validation.scenes.real import write_png
 from validation.scenes.sensor import PER_PIXEL, Sensor, expose, integrate_pixels
-from validation.scenes.street import build_corner
 
 CAR, PHONE = (1241, 376), (640, 480)
 
 
-@dataclass(frozen=True)
-class Lens:
+class Lens(NamedTuple):
     """``centre``: principal point off, in widths; ``readout``: time of all rows over that of an image."""
 
     k1: float = 0.0
@@ -41,8 +40,7 @@ class Lens:
     readout: float = 0.0
 
 
-@dataclass(frozen=True)
-class Moving:
+class Moving(NamedTuple):
     """Pixels (V, N, 2), NaN where a point is not seen, the size of all images, and the true focal length."""
 
     xy: F64
@@ -184,11 +182,10 @@ CASES: dict[str, tuple[Callable[[int, Lens], Moving], Lens]] = {
     "hand-held, camera as assumed": (hand_held, Lens()),
     "hand-held, readout 5 ms": (hand_held, Lens(readout=0.05)),
     "hand-held, readout 25 ms": (hand_held, Lens(readout=0.25)),
-}
-"""Images of the hand-held videos are 0.1 s apart."""
+}  # Images of the hand-held videos are 0.1 s apart
 RENDERED = {
-    "rendered car, camera as assumed": (drive, Lens()),
-    "rendered car, k1 = 0.015, aspect ratio 1.002": (drive, Lens(k1=0.015, aspect=1.002)),
+    "rendered car, camera as assumed": Lens(),
+    "rendered car, k1 = 0.015, aspect ratio 1.002": Lens(k1=0.015, aspect=1.002),
 }
 
 
@@ -222,7 +219,8 @@ def moving_cameras_study(trials: int = 60, *, rendered: bool = False) -> Iterato
     head = ["camera", "results", "trusted", "of these: mean z", "standard deviation of z", "within 95 %",
             "largest z", "median error, %", "median standard deviation, %"]  # fmt: skip
     rows = []
-    for name, (make, lens) in (RENDERED if rendered else CASES).items():
+    cases = {name: (drive, lens) for name, lens in RENDERED.items()} if rendered else CASES
+    for name, (make, lens) in cases.items():
         tried = (measure_rendered(k, lens) if rendered else measure(make(k, lens)) for k in range(trials))
         found = [r for r in tried if r is not None]
         trusted, error, std = np.array([r for r in found if r[0]]).reshape(-1, 3).T

@@ -7,9 +7,9 @@ models lose some of their views and points.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,21 +140,13 @@ CORRUPTIONS: dict[str, Callable[[MetricEstimate, np.random.Generator], MetricEst
     "mirrored": mirrored,
     "wrong plane at infinity": wrong_infinity,
     "focal halved or doubled": wrong_focal,
-}
-"""Reconstruction errors by name."""
-
-
+}  # Reconstruction errors by name
 SCENES = ("courtyard", "fountain-P11", "Herz-Jesus-P8", "kermit")
 LATE, ANGLE, ROUNDS = 7.0, np.radians(0.05), 3
 WRONG_FOCAL, WRONG_CENTRE, WRONG_TURN_DEG = 0.03, 0.03, 1.0
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A corrupted or reduced model: ``wrong`` in truth, ``rejected`` by the self-check."""
-
-    wrong: bool
-    rejected: bool
+Outcome = tuple[bool, bool] | None
+"""Whether a corrupted or reduced model is wrong in truth, and rejected by the self-check; None if nothing is
+left."""
 
 
 def settle(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate | None:
@@ -185,21 +177,10 @@ def is_wrong(model: MetricEstimate, right: MetricEstimate) -> bool:
     )
 
 
-def fails_self_check(
-    model: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment
-) -> bool:
-    """Return whether a model with narrow intervals fails the self-check, shared cameras apart."""
-    stated = [
-        {"focal_px": IntrinsicInterval(float(model.cameras.intrinsics[g, 0]), 0.0, "")}
-        for g in model.cameras.group
-    ]
-    failed_checks = self_check(model, calibration, stated, sigmas=LATE)[1]
-    return bool(failed_checks or contradicted_focal_priors(model, adjustment))
-
-
 def judge(
     model: MetricEstimate, right: MetricEstimate, calibration: SelfCalibration, adjustment: MetricAdjustment
-) -> Outcome | None:
+) -> Outcome:
+    """Settle a model and test it, its intervals as narrow as can be; None if nothing is left."""
     settled = settle(model, adjustment)
     if settled is None:
         return None
@@ -207,35 +188,32 @@ def judge(
         (model, adjustment, *_), sharing, *_ = settle_camera_model(finish_metric(settled, adjustment))
     except StageFailure:
         return None
-    rejected = bool(sharing.failed_checks) or fails_self_check(model, calibration, adjustment)
-    return Outcome(is_wrong(model, right), rejected)
+    focals = model.cameras.intrinsics[model.cameras.group, 0]
+    stated = [{"focal_px": IntrinsicInterval(float(focal), 0.0, "")} for focal in focals]
+    failed = sharing.failed_checks or self_check(model, calibration, stated, sigmas=LATE)[1]
+    return is_wrong(model, right), bool(failed or contradicted_focal_priors(model, adjustment))
 
 
-def corrupted_outcomes(
-    result: RunResult, prior: IntrinsicsPrior, seeds: int
-) -> dict[str, list[Outcome | None]]:
+def corrupted_outcomes(result: RunResult, prior: IntrinsicsPrior, seeds: int) -> dict[str, list[Outcome]]:
     assert result.metric is not None
     assert result.calibration is not None
-    adjustment = MetricAdjustment(prior, 0.02, 0.02)
+    adjustment, calibration = MetricAdjustment(prior, 0.02, 0.02), result.calibration
     right = settle(model_from_reconstruction(result.metric.reconstruction, prior), adjustment)
     assert right is not None
-    found: dict[str, list[Outcome | None]] = defaultdict(list)
+    found: dict[str, list[Outcome]] = defaultdict(list)
     for number, (name, corrupt) in enumerate(CORRUPTIONS.items()):
         for seed in range(seeds):
             bad = corrupt(right, np.random.default_rng([seed, number]))
-            found[name].append(judge(bad, right, result.calibration, adjustment))
+            found[name].append(judge(bad, right, calibration, adjustment))
     fixed, fixed_prior = _fixed_focal(right, prior)
-    found["focal length fixed 10 % off"].append(
-        judge(fixed, right, result.calibration, MetricAdjustment(fixed_prior, 0.02, 0.02))
-    )
-    found["right, as it is"].append(judge(right, right, result.calibration, adjustment))
+    off = judge(fixed, right, calibration, MetricAdjustment(fixed_prior, 0.02, 0.02))
+    found["focal length fixed 10 % off"].append(off)
+    found["right, as it is"].append(judge(right, right, calibration, adjustment))
     # Few views with a focal each leave the focals open, which only their intervals show.
     one_camera = len(np.unique(prior.shared[:, 0])) == 1
     for seed in range(seeds if one_camera else 0):
-        rng = np.random.default_rng([seed, 99])
-        found["right, some views and points"].append(
-            judge(_reduced(right, rng), right, result.calibration, adjustment)
-        )
+        some = _reduced(right, np.random.default_rng([seed, 99]))
+        found["right, some views and points"].append(judge(some, right, calibration, adjustment))
     return found
 
 
@@ -264,7 +242,7 @@ def _reduced(model: MetricEstimate, rng: np.random.Generator) -> MetricEstimate:
 
 def self_check_study(out: Path, scenes: Sequence[str] = SCENES, seeds: int = 5) -> Iterator[Part]:
     """Count wrong models that fail the self-check and right models that pass."""
-    table: dict[str, list[Outcome | None]] = defaultdict(list)
+    table: dict[str, list[Outcome]] = defaultdict(list)
     for scene in scenes_here(scenes):
         result = thesisrecon.reconstruct(scene.image_paths[0].parent, out / scene.name, until="metric")
         assert result.metric is not None
@@ -275,18 +253,14 @@ def self_check_study(out: Path, scenes: Sequence[str] = SCENES, seeds: int = 5) 
         report_progress(f"{scene.name} done")
     lines = []
     for kind, outcomes in table.items():
-        some = [o for o in outcomes if o is not None]
-        wrong, right = [o for o in some if o.wrong], [o for o in some if not o.wrong]
-        counts = [len(outcomes), len(outcomes) - len(some), len(wrong), sum(o.rejected for o in wrong)]
-        lines.append([kind, *counts, len(right), sum(o.rejected for o in right)])
+        counts = Counter(outcomes)
+        wrong, right = (counts[w, True] + counts[w, False] for w in (True, False))
+        found = [len(outcomes), counts[None], wrong, counts[True, True], right, counts[False, True]]
+        lines.append([kind, *found])
     yield text_table(["made", "models", "nothing left", "wrong", "rejected", "right", "rejected"], lines)
     every = [o for outcomes in table.values() for o in outcomes if o is not None]
-    rejected = {
-        name: [100.0 * o.rejected for o in every if o.wrong is (name == "wrong")]
-        for name in ("wrong", "right")
-    }
-    for name, values in rejected.items():
-        rows, share = Rows(f"{len(values)} {name}", "ours"), float(np.mean(values))
-        bound = 100.0 if name == "wrong" else None
-        rows.add("rejected", share, "%", at_most=2.0 if bound is None else None, at_least=bound)
+    for name, bounds in {"wrong": {"at_least": 100.0}, "right": {"at_most": 2.0}}.items():
+        values = [100.0 * o[1] for o in every if o[0] is (name == "wrong")]
+        rows = Rows(f"{len(values)} {name}", "ours")
+        rows.add("rejected", float(np.mean(values)), "%", **bounds)
         yield rows

@@ -18,8 +18,7 @@ SURFACES: Mapping[str, LinearSurface | BSplineSurface] = {
     "linear": LinearSurface(),
     "b-spline": BSplineSurface(),
 }
-NOISE = 5e-4
-"""Standard deviation of the inverse depths, which are about 0.2."""
+NOISE = 5e-4  # Standard deviation of the inverse depths, which are about 0.2
 
 
 def known_surfaces() -> dict[str, F64]:

@@ -1,17 +1,16 @@
 """Wide baselines: which front ends find the right matches, and up to which difference of the views.
 
-``warped``: images and warped views of them (roll, scale, obliqueness, exposure), ``rendered``: a yard from
-two known poses. A pair is found if it is accepted and its F is right: the median distance of the
-true correspondences to its epipolar lines is below ``RIGHT_REL`` of the long side; accepted with another F
-it is wrong.
+Images and warped views of them (roll, scale, obliqueness, exposure), and a yard from two known poses. A pair
+is found if it is accepted and the median distance of the true correspondences to the epipolar lines of its F
+is below ``RIGHT_REL`` of the long side; accepted with another F it is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,13 +21,13 @@ from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import symmetric_residuals
 from thesisrecon.pipeline.image_pair import match_images
-from thesisrecon.records import Image, TwoView
+from thesisrecon.records import Image
 from validation.references.libraries import cv2
 from validation.references.sift import sift_front_end
-from validation.runs.study import Part, pick, report_progress
+from validation.runs.study import Part, report_progress
 from validation.runs.tables import Metric, Rows, text_table
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.many_views import YARDS
+from validation.scenes.many_views import YARDS, walk_calibration
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.raycast import World, trace
 from validation.scenes.real import data_root, read_rgb, write_png
@@ -43,11 +42,10 @@ PHOTOGRAPHS = (
 )
 LONG_SIDE, SAMPLES_PER_PX = 1000, 3
 GRID = 40
-SIZE, FOCAL_REL = (960, 720), 0.9
+SIZE = (960, 720)
 
 
-@dataclass(frozen=True)
-class WideStep:
+class WideStep(NamedTuple):
     """What differs between the images: roll and obliqueness (deg), scale and exposure (factors)."""
 
     roll: float = 0.0
@@ -75,16 +73,8 @@ STEPS = (
     WideStep(roll=45.0, scale=2.0, tilt=60.0),
     WideStep(scale=3.0, tilt=60.0),
 )
-
-
-@dataclass(frozen=True)
-class WidePair:
-    """Two images, and true correspondences (M, 4) px spread over what both show."""
-
-    name: str
-    step: WideStep
-    images: tuple[Image, Image]
-    truth: F64
+WidePair = tuple[tuple[Image, Image], F64]
+"""Two images, and true correspondences (M, 4) px spread over what both show."""
 
 
 def warped_pairs(step: WideStep) -> Iterator[WidePair]:
@@ -110,7 +100,7 @@ def warp_photograph(path: Path, step: WideStep) -> WidePair:
     points = homogenize(np.column_stack([x.ravel(), y.ravel()]))
     xy1, xy2 = dehomogenize(points @ first.T), dehomogenize(points @ second.T)
     inside = ((xy2 >= 0.0) & (xy2 <= size - 1.0)).all(axis=1)
-    return WidePair(f"{path.parent.parent.name} {path.stem}", step, pair, np.hstack([xy1, xy2])[inside])
+    return pair, np.hstack([xy1, xy2])[inside]
 
 
 def _to_canvas(whole: F64, size: np.ndarray, step: WideStep) -> F64:
@@ -138,7 +128,7 @@ def rendered_pair(step: WideStep) -> WidePair:
     poses = [_yard_pose(WideStep()), _yard_pose(step)]
     names = ("front", str(step))
     images = [_image(_rendered(world, pose, name)) for name, pose in zip(names, poses, strict=True)]
-    return WidePair("courtyard", step, (images[0], images[1]), _true_matches(world, poses))
+    return (images[0], images[1]), _true_matches(world, poses)
 
 
 def _image(rgb: U8) -> Image:
@@ -147,8 +137,7 @@ def _image(rgb: U8) -> Image:
 
 def _yard_pose(step: WideStep) -> Pose:
     """A camera that looks at the middle of the yard, moved on a circle, nearer and turned."""
-    focal = FOCAL_REL * max(SIZE)
-    K = np.array([[focal, 0.0, 0.51 * SIZE[0]], [0.0, focal, 0.48 * SIZE[1]], [0.0, 0.0, 1.0]])
+    K = walk_calibration(SIZE)
     target, angle = np.array([-0.3, -0.6, 1.7]), np.radians(step.tilt)
     distance = 7.0 / step.scale
     C = target + distance * np.array([np.sin(angle), -np.cos(angle), 0.05])
@@ -199,68 +188,40 @@ def front_ends() -> dict[str, PipelineConfig]:
     return {OURS: ours, ORDINARY: ordinary, SIFT: sift_front_end(ours)}
 
 
-@dataclass(frozen=True)
-class WideResult:
-    """A pair by one front end, and the median distance (share of the long side) of true correspondences."""
-
-    pair: WidePair
-    view: TwoView
-    error_rel: float
-
-    @property
-    def found(self) -> bool:
-        return self.view.accepted and self.error_rel < RIGHT_REL
-
-    @property
-    def wrong(self) -> bool:
-        return self.view.accepted and not self.error_rel < RIGHT_REL
-
-
-def relate(config: PipelineConfig, pair: WidePair) -> WideResult:
-    view = match_images(config, pair.images, 0)
+def relate(config: PipelineConfig, pair: WidePair) -> tuple[int, bool]:
+    """Return the verified matches of a pair that is found, 0 for another one, and whether it is wrong."""
+    images, truth = pair
+    view = match_images(config, images, 0)
     if not view.accepted:
-        return WideResult(pair, view, np.inf)
-    d = symmetric_residuals(view.F, pair.truth[:, :2], pair.truth[:, 2:]) / np.sqrt(2.0)
-    return WideResult(pair, view, float(np.median(d)) / max(pair.images[0].size))
+        return 0, False
+    d = symmetric_residuals(view.F, truth[:, :2], truth[:, 2:]) / np.sqrt(2.0)
+    right = float(np.median(d)) / max(images[0].size) < RIGHT_REL
+    return view.inliers * right, not right
 
 
-def check_step(step: WideStep, by: dict[str, list[WideResult]]) -> list[Metric]:
-    """Pairs found and wrong, and the verified matches of those found."""
+def check_step(step: WideStep, by: dict[str, list[tuple[int, bool]]]) -> list[Metric]:
+    """Pairs found and wrong."""
     rows, pairs = Rows(str(step), OURS), max(map(len, by.values()))
-    rows.add(f"pairs found, of {pairs}", {n: float(sum(r.found for r in found)) for n, found in by.items()})
-    wrong = {n: float(sum(r.wrong for r in found)) for n, found in by.items()}
-    rows.add("wrong", wrong, at_most=0.0 if OURS in by else None)
+    found = {name: float(sum(verified > 0 for verified, _ in some)) for name, some in by.items()}
+    rows.add(f"pairs found, of {pairs}", found)
+    wrong = {name: float(sum(is_wrong for _, is_wrong in some)) for name, some in by.items()}
+    rows.add("wrong", wrong, at_most=0.0)
     return rows
 
 
-def wide_baseline_study(
-    parts: Sequence[Literal["warped", "rendered"]] = ("warped", "rendered"),
-    methods: Sequence[str] | None = None,
-) -> Iterator[Part]:
+def wide_baseline_study() -> Iterator[Part]:
     """Find pairs of images whose view directions, distances or rolls differ much."""
-    configs = front_ends()
-    chosen = pick(methods, configs)
-    lines, rows = list[list[object]](), list[Part]()
+    configs, lines, rows = front_ends(), list[list[object]](), list[Part]()
     for step in STEPS:
-        pairs = list(_pairs(step, parts))
-        if not pairs:
-            return
-        by = {name: [relate(configs[name], pair) for pair in pairs] for name in chosen}
-        lines.append([step, *(_cell(by[name]) for name in chosen)])
+        pairs = [*warped_pairs(step), rendered_pair(step)]
+        by = {name: [relate(config, pair) for pair in pairs] for name, config in configs.items()}
+        lines.append([step, *map(_cell, by.values())])
         report_progress(" | ".join(map(str, lines[-1])))
         rows.append(check_step(step, by))
-    yield text_table(["step; found of all (wrong), median verified", *chosen], lines)
+    yield text_table(["step; found of all (wrong), median verified", *configs], lines)
     yield from rows
 
 
-def _pairs(step: WideStep, parts: Iterable[str]) -> Iterator[WidePair]:
-    if "warped" in parts:
-        yield from warped_pairs(step)
-    if "rendered" in parts:
-        yield rendered_pair(step)
-
-
-def _cell(results: Sequence[WideResult]) -> str:
-    wrong = sum(r.wrong for r in results)
-    verified = [r.view.inliers if r.found else 0 for r in results]
-    return f"{sum(r.found for r in results)} of {len(results)} ({wrong}), {np.median(verified):.0f}"
+def _cell(results: Sequence[tuple[int, bool]]) -> str:
+    verified, wrong = zip(*results, strict=True)
+    return f"{np.count_nonzero(verified)} of {len(results)} ({sum(wrong)}), {np.median(verified):.0f}"

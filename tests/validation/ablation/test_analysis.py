@@ -1,16 +1,15 @@
-"""What is said of rows: planted effects are found, others are not, failures are counted."""
-
-import csv
+"""What is said of rows, and intervals, p-values and effect sizes against a hand, SciPy and simulations."""
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from tests.validation.ablation.toy import Darts
 from validation.ablation import Measure, Study, analyse
 from validation.ablation.analysis import as_reported
-from validation.ablation.page import write_tables
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import Row, Rows
+from validation.ablation.statistics import STUDENTISED_FROM, holm, on_front, paired_interval, resampled_t
 
 
 def rows_of(study, value):
@@ -93,17 +92,6 @@ def test_seeds_and_parts_of_a_scene_are_no_sample_of_scenes():
     assert "[" not in str(analyse(rows)).split("warning")[-1].partition("\n\n")[2]
 
 
-def test_scenes_with_parts_are_a_sample_and_the_table_names_it():
-    level = {name: n for n, name in enumerate(BOARDS)}
-    rows = on_boards(
-        BOARDS, lambda p: 9.0 + level[p.scene] + (2.0 + 0.1 * level[p.scene]) * (p.variant == "aim = 1")
-    )
-    found = compared(rows, "aim = 1")
-    assert (found.verdict, found.interval.count, found.interval.pairs) == ("worse", 6, 18)
-    assert "] 6 scenes" in str(analyse(rows))
-    assert compared(rows, "aim = 2").verdict == "no difference shown"
-
-
 def test_only_pairs_count_and_failures_are_reported():
     rows = rows_of(darts(), lambda p: "no luck" if p.variant == "aim = 1" and p.seed < 15 else float(p.seed))
     analysis = analyse(rows)
@@ -111,9 +99,6 @@ def test_only_pairs_count_and_failures_are_reported():
     assert (cell.rows, cell.failed) == (5, 15)
     assert not cell.on_front
     assert compared(rows, "aim = 1").interval.pairs == 5
-    # On easier rows its mean would be another one; its rank counts what it failed at.
-    ranks = {c.variant: c.rank for c in analysis.cells if c.measure.name == "miss"}
-    assert ranks["aim = 1"] == pytest.approx((15 * 3.0 + 5 * 2.0) / 20)
     assert "17 (15 of 20 failed)" in str(analysis)
     assert "| aim = 1 | a (15 seeds) | no luck |" in str(analysis)
 
@@ -129,19 +114,62 @@ def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():
     assert against["aim = 2"].interval.mean == pytest.approx(-2.5, abs=0.1)
 
 
-def test_tables_hold_every_row_and_comparison(tmp_path):
-    rows = rows_of(
-        darts(conditions={"task.spread": [1.0, 2.0]}), lambda p: "gone" if p.seed == 3 else float(p.seed)
+def test_five_differences_by_hand():
+    # 1 2 3 4 5: mean 3, variance 2.5, standard error sqrt(2.5 / 5), t = 4.2426 with 4 degrees of freedom,
+    # whose 97.5 % quantile is 2.7764; Hedges' factor 1 - 3 / 15.
+    found = paired_interval([np.arange(1.0, 6.0)], "draws")
+    assert found.mean == 3.0
+    assert found.low == pytest.approx(3.0 - 2.7764 * 0.70711, abs=1e-4)
+    assert found.high == pytest.approx(3.0 + 2.7764 * 0.70711, abs=1e-4)
+    assert found.p == pytest.approx(0.0132, abs=1e-4)
+    assert found.effect == pytest.approx(3.0 / 1.58114 * 0.8, abs=1e-4)
+    assert (found.pairs, found.sample, found.count) == (5, "draws", 5)
+
+
+def test_two_scenes_are_welch():
+    # The mean of two means has the standard error and the freedom of Welch's test of their difference.
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1.0, 1.0, 5), rng.normal(2.0, 3.0, 7)
+    found, known = paired_interval([a, b], "draws"), stats.ttest_ind(a, -b, equal_var=False)
+    assert found.mean == pytest.approx((a.mean() + b.mean()) / 2.0)
+    assert found.p == pytest.approx(known.pvalue)
+    low, high = known.confidence_interval(0.95)
+    assert (2.0 * found.low, 2.0 * found.high) == pytest.approx((low, high))
+
+
+def test_the_studentised_bootstrap_is_that_of_scipy():
+    d = np.random.default_rng(3).exponential(size=STUDENTISED_FROM)
+    t = resampled_t([[np.array([v]) for v in d]], resamples=20000)
+
+    def statistic(x, axis=-1):
+        return (x.mean(axis=axis) - d.mean()) / (x.std(axis=axis, ddof=1) / np.sqrt(x.shape[axis]))
+
+    known = stats.bootstrap(
+        (d,), statistic, n_resamples=20000, rng=np.random.default_rng(4), method="percentile"
     )
-    written = {path.name: path for path in write_tables(analyse(rows), tmp_path)}
-    with written["rows.csv"].open(encoding="utf-8") as file:
-        stated = list(csv.DictReader(file))
-    assert len(stated) == 3 * 2 * 20
-    assert stated[0]["axis:task.spread"] == "spread = 1"
-    assert {r["failure"] for r in stated} == {"", "gone"}
-    assert {r["miss"] for r in stated if r["failure"]} == {""}
-    text = written["tables.md"].read_text()
-    assert text.startswith("Commit ")
-    assert "| miss, cm | spread = 1 | spread = 2 | cost, s |" in text
-    with written["comparisons.csv"].open(encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) == 2 * 2 * 2
+    for q in (0.5, 0.9, 0.95):
+        assert np.quantile(t, q) == pytest.approx(
+            np.quantile(np.abs(known.bootstrap_distribution), q), rel=0.04
+        )
+
+
+@pytest.mark.parametrize("count", [5, 20])
+def test_at_most_five_per_cent_of_null_effects_are_reported(count):
+    rng, trials = np.random.default_rng(7), 400
+    found = [paired_interval([rng.standard_t(3, size=count)], "draws") for _ in range(trials)]
+    held = sum(f.low <= 0.0 <= f.high for f in found)
+    # Two standard deviations of a count of trials that each hold in 95 of 100.
+    assert held >= 0.95 * trials - 2.0 * np.sqrt(trials * 0.05 * 0.95)
+    assert sum(f.p > 0.05 for f in found) == pytest.approx(held, abs=2)
+
+
+def test_holm_by_hand():
+    assert holm([0.01, 0.04, 0.03, float("nan")])[:3] == pytest.approx([0.03, 0.06, 0.06])
+    assert np.isnan(holm([0.01, float("nan")])[1])
+    assert holm([0.6, 0.7]) == pytest.approx([1.0, 1.0])
+    assert holm([]) == []
+
+
+def test_the_front_is_not_dominated():
+    cost, loss = np.array([1.0, 2.0, 3.0, 2.0, np.nan]), np.array([5.0, 3.0, 4.0, 3.0, 0.0])
+    assert on_front(cost, loss).tolist() == [True, True, False, True, False]

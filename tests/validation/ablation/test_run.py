@@ -3,20 +3,13 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.validation.ablation.toy import Darts, Steps, marks
 from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def study(log, **more):
@@ -42,17 +35,6 @@ def test_every_row_is_computed_once_and_reported_in_order(tmp_path):
     grown = ablate(study(log, seeds=3), out, executor="local")
     assert len(grown) == 18
     assert len(marks(log)) == 18
-
-
-def test_a_row_on_disk_stands_on_its_own(tmp_path):
-    rows = ablate(study(tmp_path / "log", seeds=1), tmp_path / "out", executor="local")
-    reported = json.loads((tmp_path / "out" / "rows" / f"{rows[1].key}.json").read_text())
-    assert reported["variant"] == "aim = 1"
-    assert reported["task"]["aim"] == 1.0
-    assert reported["config"]["epipolar"]["kind"] == "locally-optimised-ransac"
-    assert reported["versions"]["numpy"] == np.__version__
-    assert reported["metrics"] == dict(rows[1].metrics)
-    assert reported["seconds"] > 0.0
 
 
 def test_failures_are_stored_with_their_reason_and_not_retried(tmp_path):
@@ -115,40 +97,6 @@ def test_a_row_that_kills_its_process_is_lost_alone_and_tried_again_next_time(tm
     assert [bool(r.failure) for r in rows] == [False, False, True]
     assert "was killed or ran out of memory" in rows[2].failure
     assert len(read_rows(planned, tmp_path / "out")) == 2
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from tests.validation.ablation.test_run import slow
-from validation.ablation import ablate
-if __name__ == "__main__":
-    ablate(slow(Path(sys.argv[1])), Path(sys.argv[1]) / "out", executor="local")
-"""
-
-
-def slow(folder):
-    return study(folder / "log", seeds=8, task=Darts(pause_s=0.02, log=str(folder / "log")))
-
-
-def test_a_killed_study_loses_no_more_than_the_rows_in_flight(tmp_path):
-    script = tmp_path / "killed.py"
-    script.write_text(KILLED, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, str(script), str(tmp_path)], env=environment)
-    patience = time.monotonic() + 300.0
-    while len(marks(tmp_path / "log")) < 12 and process.poll() is None and time.monotonic() < patience:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    begun = len(marks(tmp_path / "log"))
-    kept = len(read_rows(slow(tmp_path), tmp_path / "out"))
-    assert 12 <= begun < 48, "it was killed in the middle"
-    assert begun - 1 <= kept <= begun
-    rows = ablate(slow(tmp_path), tmp_path / "out", executor="local")
-    assert len(rows) == 48
-    assert not any(r.failure for r in rows)
-    assert len(marks(tmp_path / "log")) == 48 + begun - kept
 
 
 @pytest.mark.parametrize("executor", ["local", "processes"])

@@ -1,6 +1,7 @@
 """Tasks and variants that take no time, for the tests of studies."""
 
 import errno
+import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,11 +11,11 @@ from typing import ClassVar
 import numpy as np
 
 from thesisrecon.errors import StageFailure, UsageError
-from validation.ablation.study import Measure
+from validation.ablation.study import Measure, Task
 
 
 @dataclass(frozen=True)
-class Darts:
+class Darts(Task):
     """A draw about ``aim``, and a mark in ``log`` whenever one is made.
 
     ``refuses`` and ``empty`` are scenes where nothing, or no number, is found, and ``full`` is one without
@@ -36,9 +37,6 @@ class Darts:
         if scene == "nowhere":
             raise UsageError("there is no scene 'nowhere'")
 
-    def scene_key(self, scene):
-        return scene
-
     def run(self, config, scene, seed, place):
         mark(self.log, f"row {scene} {seed} {self.aim:g}")
         time.sleep(self.pause_s)
@@ -56,18 +54,12 @@ class Darts:
 
 
 @dataclass(frozen=True)
-class Steps:
+class Steps(Task):
     """Two steps that several rows may share, ``miss`` the length of what they left behind."""
 
     log: str = ""
 
     measures: ClassVar[Sequence[Measure]] = (Measure("miss"),)
-
-    def check(self, scene):
-        pass
-
-    def scene_key(self, scene):
-        return scene
 
     def steps(self, config, scene, seed):
         first = f"first-{scene}-{config.images.max_size_px}"
@@ -75,7 +67,7 @@ class Steps:
 
     def prepare(self, config, scene, seed, place, *, step):
         for name, key in self.steps(config, scene, seed):
-            kept = place.shared / f"{hash_of(key)}.txt"
+            kept = place.shared / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.txt"
             if not kept.is_file():
                 mark(self.log, name)
                 kept.write_text(name, encoding="utf-8")
@@ -85,12 +77,6 @@ class Steps:
     def run(self, config, scene, seed, place):
         self.prepare(config, scene, seed, place, step="second")
         return {"miss": float(seed)}
-
-
-def hash_of(key):
-    import hashlib
-
-    return hashlib.sha256(key.encode()).hexdigest()[:16]
 
 
 def mark(log, word):

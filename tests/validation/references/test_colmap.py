@@ -8,10 +8,10 @@ from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
-from validation.references.ceres import cameras_from_colmap, colmap_model
+from validation.references.ceres import colmap_model
 from validation.references.colmap import match_with_pycolmap, read_colmap_model
+from validation.references.fundamental import colmap_points
 from validation.references.libraries import pycolmap
-from validation.references.triangulation import colmap_points
 
 skip_without("pycolmap")
 
@@ -49,15 +49,6 @@ def test_colmap_sees_our_points_half_a_pixel_farther(looked):
             np.testing.assert_allclose(point.xy, expected, atol=1e-9)
     for j in (0, 17, len(looked.X) - 1):
         np.testing.assert_array_equal(model.points3D[j + 1].xyz, looked.X[j])
-
-
-def test_a_written_cloud_is_read_back(looked):
-    cameras, seen = problem(looked)
-    back, X = cameras_from_colmap(colmap_model(cameras, looked.X, seen, SIZE), cameras)
-    np.testing.assert_allclose(back.R, cameras.R, atol=1e-12)
-    np.testing.assert_array_equal(back.t, cameras.t)
-    np.testing.assert_array_equal(back.intrinsics, cameras.intrinsics)
-    np.testing.assert_array_equal(X, looked.X)
 
 
 @pytest.mark.parametrize("text", [True, False])

@@ -10,31 +10,16 @@ import pytest
 
 from tests.surface.sphere import SHAPE, K, paint, photograph, ring_of
 from tests.validation.references.conftest import skip_without
-from thesisrecon.api.export import write_mesh
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
 from thesisrecon.records import DepthMap, PinholeView
-from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.model import SurfaceModel
 from validation.references import open3d_geometry
-from validation.references.libraries import open3d
 
 # Without libraries of the system (libgomp1, libgl1, libegl1, libx11-6) it cannot be loaded.
 skip_without("open3d")
 
 ROOT = Path(__file__).parents[3]
 NORMAL = np.array([0.3, 0.2, 1.0])
-
-
-def read_glb(path):
-    """Vertices (N, 3) in glTF's axes, faces (M, 3), texture coordinates (M, 3, 2), v up, and the texture of a
-    GLB as Open3D reads it."""
-    model = open3d.io.read_triangle_model(str(path))
-    mesh = model.meshes[0].mesh
-    albedo = np.asarray(model.materials[model.meshes[0].material_idx].albedo_img)
-    uv = np.asarray(mesh.triangle_uvs).reshape(-1, 3, 2)
-    faces = np.asarray(mesh.triangles).astype(np.int64)
-    return np.asarray(mesh.vertices).copy(), faces, uv.copy(), albedo[..., :3].copy()
 
 
 def slanted():
@@ -72,42 +57,6 @@ def test_meshes_lie_on_the_sphere_and_distances_are_right():
     np.testing.assert_allclose(open3d_geometry.Nearest(fused).distances(away), [2.0, 1.0, 0.0], atol=0.01)
     assert fused.colors is not None
     assert np.median(np.abs(fused.colors - paint(fused.vertices))) < 12.0
-
-
-@pytest.fixture(scope="module")
-def model():
-    surface = VolumetricFusion().fuse(ring_of())
-    return SurfaceModel().color(surface, [photograph(m) for m in ring_of()])
-
-
-def color_errors(points, vertices, faces, uv, texture):
-    """Errors (N, 3) in the middle of the face whose middle is nearest to each point; v runs up."""
-    middle = vertices[faces].mean(axis=1)
-    nearest = np.argmin(((points[:, None] - middle[None]) ** 2).sum(axis=-1), axis=1)
-    height, width = texture.shape[:2]
-    u, v = uv[nearest].mean(axis=1).T
-    x, y = np.rint(u * width - 0.5).astype(int), np.rint((1.0 - v) * height - 0.5).astype(int)
-    on_sphere = middle[nearest] / np.linalg.norm(middle[nearest], axis=1, keepdims=True)
-    return np.abs(texture[y, x] - paint(on_sphere))
-
-
-def places():
-    """Points of the sphere that photographs see well."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    return np.stack([np.sin(angle), 0.3 * np.cos(5 * angle), -np.cos(angle)], axis=1)
-
-
-def test_a_glb_opens_in_open3d_with_its_texture(model, tmp_path):
-    write_mesh(tmp_path / "model.glb", model)
-    vertices, faces, uv, texture = read_glb(tmp_path / "model.glb")
-    assert len(faces) == len(model.faces)
-    assert model.texture is not None
-    assert texture.shape == model.texture.shape
-    points = places()
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    errors = color_errors(points, vertices * [1.0, -1.0, -1.0], faces, uv, texture)
-    assert np.median(errors) < 6.0
-    assert np.quantile(errors, 0.9) < 20.0
 
 
 DRAW = """

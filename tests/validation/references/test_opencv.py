@@ -1,23 +1,16 @@
-"""Conventions between our arrays and OpenCV's, at their border."""
+"""Conventions between our arrays and OpenCV's, and the direction of F in every library."""
 
 import numpy as np
-import PIL.Image
 import pytest
 
-from tests.synthetic import texture
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import Image
-from validation.references.opencv import (
-    MODES,
-    OpenCVSemiGlobal,
-    harris_corners,
-    sift_corners,
-)
-from validation.references.triangulation import opencv_linear, opencv_polynomial
-from validation.scenes.real_pairs import match_images
+from validation.metrics.fundamental_precision import rms_epipolar_distance
+from validation.references.fundamental import SOLVERS, estimate_with, opencv_linear, opencv_polynomial
+from validation.references.opencv import MODES, OpenCVSemiGlobal, harris_corners, sift_corners
 
-skip_without("cv2")
+skip_without("cv2", "pycolmap", "poselib")
 
 AT = np.array([33.0, 28.0])
 
@@ -33,23 +26,6 @@ def spot(sigma):
 def test_points_of_world_to_camera_matrices_are_where_they_were(solve, looked):
     assert callable(solve)
     np.testing.assert_allclose(dehomogenize(solve(looked.P, looked.xy)), looked.X, atol=1e-6)
-
-
-def test_matches_in_the_cache_are_those_of_these_images(tmp_path):
-    found = []
-    for number in range(2):
-        paths = tuple(tmp_path / f"{number}" / "scene" / "images" / f"{side}.png" for side in "ab")
-        paths[0].parent.mkdir(parents=True)
-        for k, path in enumerate(paths):
-            grey = texture(160, 200, 5 * number)[:, 10 * k : 150 + 10 * k]
-            PIL.Image.fromarray(grey.astype(np.uint8)).save(path)
-        found += [match_images(paths, tmp_path / "cache", ratio=0.8, mutual=True)[0] for _ in range(2)]
-    first, again, other, _ = found
-    assert len(first) > 10
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-    one_way, _ = match_images(paths, tmp_path / "cache", ratio=0.8, mutual=False)
-    assert len(one_way) >= len(other)
 
 
 def test_the_middle_of_a_pixel_is_a_whole_number():
@@ -74,3 +50,14 @@ def test_a_disparity_is_the_shift_to_the_left_in_the_right_image(mode, widened):
     # The columns that a disparity of 31 would take out of the photograph.
     assert np.isfinite(found[8:-8, 10:31]).any() == widened
     assert not (found < 0.0).any()
+
+
+@pytest.mark.parametrize("method", SOLVERS)
+def test_lines_in_the_second_image_are_f_times_points_of_the_first(method, looked):
+    xy1, xy2 = looked.xy
+    F, _ = estimate_with(method, xy1, xy2, threshold_px=1.0, seed=0)
+    assert F is not None
+    lines = np.column_stack([xy1, np.ones(len(xy1))]) @ F.T
+    off = np.abs((lines * np.column_stack([xy2, np.ones(len(xy2))])).sum(axis=1))
+    assert (off / np.linalg.norm(lines[:, :2], axis=1)).max() < 0.02
+    assert rms_epipolar_distance(F.T, np.hstack([xy1, xy2])) > 5.0

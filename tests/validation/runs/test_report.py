@@ -1,22 +1,28 @@
-"""Reports of toy stages: tasks in processes, references that fail, gates, tables, pages, two runs."""
+"""Reports of toy stages: tasks in processes, references that fail, gates, tables, pages, two runs, stops."""
 
 import csv
 import dataclasses
 import json
-import re
+import os
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
 from tests.conftest import before_each_output, failing
-from tests.validation.runs.toy_stages import STAGES, WAYS
+from tests.runtime.test_signals import is_alive
+from tests.validation.runs.toy_stages import STAGES, WAYS, ToyStage
 from thesisrecon.errors import STRICT_VARIABLE
 from validation.command import main
+from validation.references.libraries import NAMES, PACKAGES, NoReference, load
 from validation.runs.page import write_pages
 from validation.runs.records import ReportOptions
 from validation.runs.report import run_tasks
-from validation.runs.results import Gate, collect, read_gates, read_results, write_results
-from validation.runs.scenes import QUICK
-from validation.stages import STAGES as REPORTED
+from validation.runs.results import Gate, Row, collect, read_gates, write_results
+from validation.scenes.real import ROOT
+from validation.studies.robustness import stopped
 
 LIMIT_S = 8.0
 GATES = {
@@ -27,14 +33,8 @@ GATES = {
 
 
 def toy_options(out, *, quick):
-    return ReportOptions(
-        out,
-        ("yard", "elsewhere"),
-        ("toy",),
-        quick=quick,
-        limit_s=LIMIT_S,
-        stages_from="tests.validation.runs.toy_stages",
-    )
+    given = {"quick": quick, "limit_s": LIMIT_S, "stages_from": "tests.validation.runs.toy_stages"}
+    return ReportOptions(out, ("yard", "elsewhere"), ("toy",), **given)
 
 
 @pytest.fixture(scope="module")
@@ -60,34 +60,21 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     assert len(reported) == 8
 
 
-def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran):
+def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran, tmp_path):
     options, judged, _ = ran
     results = collect(options, judged, GATES)
     row = results.rows[0]
-    assert (row.key, row.value, row.limit, row.direction, row.verdict) == (
-        "toy/yard/wheels-lost",
-        0.5,
-        1.0,
-        "at most",
-        "reached",
-    )
+    assert (row.value, row.limit, row.direction, row.verdict) == (0.5, 1.0, "at most", "reached")
     assert row.reference["good"] == 2.0
     assert results.missing == ["toy/yard/never-reported"]
     assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
     strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
     assert collect(options, judged, strict).broken[0].key == row.key
-
-
-@pytest.mark.parametrize("name", REPORTED)
-def test_a_quick_report_includes_all_gated_numbers(name, tmp_path):
-    quick = ReportOptions(tmp_path, ("courtyard",), (name,), quick=True)
-    asked = dataclasses.replace(quick, gates_only=True)
-    stage = REPORTED[name]
-    scenes = [s for s in QUICK if stage.takes(s, quick)]
-    for scene in scenes:
-        keys = [key for key in read_gates() if key.startswith(f"{name}/{scene}/")]
-        if keys:
-            assert set(stage.methods(scene, asked)) <= set(stage.methods(scene, quick)), keys
+    write_results(tmp_path, results)
+    assert len(json.loads((tmp_path / "results.json").read_text())["rows"]) == len(results.rows)
+    with (tmp_path / "tables" / "toy.csv").open(encoding="utf-8") as source:
+        first = next(csv.DictReader(source))
+    assert (first["ours"], first["good"], first["crashing"]) == ("0.5", "2.0", "")
 
 
 @pytest.mark.parametrize(
@@ -99,60 +86,14 @@ def test_a_gate_holds_up_to_its_limit(value, held):
     assert Gate("a/b/c", -1.0, False, "").holds(mirrored) == held
 
 
-def test_results_are_written_and_read(ran, tmp_path):
-    options, judged, _ = ran
-    results = collect(options, judged, GATES)
-    write_results(tmp_path, results)
-    assert read_results(tmp_path).rows == results.rows
-    with (tmp_path / "tables" / "toy.csv").open(encoding="utf-8") as source:
-        first = next(csv.DictReader(source))
-    assert (first["key"], first["ours"], first["good"], first["crashing"]) == (
-        "toy/yard/wheels-lost",
-        "0.5",
-        "2.0",
-        "",
-    )
-
-
-def test_the_pages_escape_their_input(ran):
-    options, judged, _ = ran
-    results = collect(options, judged, GATES)
-    index = write_pages(options, STAGES, judged, results)
-    whole, scene = (options.out / n for n in ("index.html", "scene-yard.html"))
-    assert index == whole
-    text = whole.read_text(encoding="utf-8")
-    assert "A &lt;b&gt;toy&lt;/b&gt;" in text
-    assert "1 of 2 limits are reached" in text
-    assert "crashed with signal 11" in text
-    page = scene.read_text(encoding="utf-8")
-    assert "A &lt;/script&gt; note." in page
-    assert "data:image/jpeg;base64," in page
-    # Without plotly's own script.
-    markup = "".join(html.split("<script>")[0] for html in (text, page))
-    assert not re.search(r'(?:src|href)="(?!data:|#|scene-|index)', markup)
-
-
-@pytest.mark.parametrize("error", [ValueError("no figure"), MemoryError(), OSError(28, "No space left")])
-def test_a_page_of_a_scene_that_fails_is_listed_on_the_first_page(ran, tmp_path, monkeypatch, error):
+def test_a_page_of_a_scene_that_fails_is_listed_on_the_first_page(ran, tmp_path, monkeypatch):
     options, judged, _ = ran
     options = dataclasses.replace(options, out=tmp_path)
     monkeypatch.delenv(STRICT_VARIABLE)
-    before_each_output(monkeypatch, failing("scene-yard.html", error))
+    before_each_output(monkeypatch, failing("scene-yard.html", ValueError("no figure")))
     index = write_pages(options, STAGES, judged, collect(options, judged, GATES))
     assert "output-not-made: scene-yard.html" in index.read_text(encoding="utf-8")
     assert not (tmp_path / "scene-yard.html").exists()
-
-
-def test_no_gate_without_its_reason(tmp_path):
-    gates = read_gates()
-    assert gates
-    for words in ("at_most = 1.0", 'at_most = 1.0\nat_least = 0.0\nreason = "r"', 'reason = "r"'):
-        (tmp_path / "gates.toml").write_text(f'["a/b/c"]\n{words}\n')
-        with pytest.raises(ValueError, match="a gate has one of"):
-            read_gates(tmp_path / "gates.toml")
-    (tmp_path / "gates.toml").write_text('["a/c"]\nat_most = 1.0\nreason = "r"\n')
-    with pytest.raises(ValueError, match="stage/scene/number"):
-        read_gates(tmp_path / "gates.toml")
 
 
 @pytest.mark.parametrize(
@@ -196,3 +137,108 @@ def test_a_run_starts_from_no_unlike_one(change, tmp_path):
     with pytest.raises(ValueError, match="use a run with the same options" if change else "holds no run"):
         run_tasks(options, STAGES, lambda _: None)
     assert (options.out / "data").is_dir(), "results of a run that is there are kept"
+
+
+@pytest.mark.parametrize(
+    ("value", "reference", "direction", "expected"),
+    [
+        (2.0, {"COLMAP": 4.0, "OpenCV": 8.0}, "at most", 0.5),
+        (2.0, {"COLMAP": 4.0, "OpenCV": 8.0}, "at least", 4.0),
+        (2.0, {"COLMAP": None, "ours, fast": 1.0}, "at most", None),
+        (None, {"COLMAP": 1.0}, "at most", None),
+        (0.0, {"COLMAP": 1.0}, "at most", None),
+    ],
+)
+def test_a_ratio_above_one_is_always_worse(value, reference, direction, expected):
+    one = Row("a/b/c", "b", "c", value, "px", direction, None, reference, "", "reported")
+    assert one.ratio == expected
+    assert dataclasses.replace(one, ranked=False).ratio is None
+
+
+MISSING = "raise ModuleNotFoundError(\"No module named '{0}'\", name='{0}')"
+
+
+def not_installed(library):
+    return f"{NAMES[library]} is not installed: pip install {PACKAGES[library]}"
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """A folder whose modules come before those that are installed, in every process started from here."""
+    folder = tmp_path / "stubs"
+    folder.mkdir()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(ROOT)]))
+    return folder
+
+
+def test_report_and_check_run_without_any(stub, tmp_path):
+    for library in PACKAGES:
+        (stub / f"{library}.py").write_text(MISSING.format(library))
+    command = [sys.executable, "-m", "validation", "check", "--quick", "--scenes", "street"]
+    command += ["--stages", "bundle", "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    reported = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
+    assert reported["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
+    promised = [key for key in read_gates() if key.startswith("bundle/street/")]
+    assert done.returncode == int(bool(promised))
+    for key in promised:
+        assert f"missed   {key}: no method reported this number ({not_installed('pycolmap')})" in done.stdout
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "bundle/street/Ceres" in page
+    assert not_installed("pycolmap") in page
+
+
+def test_a_library_that_does_not_load_states_why(stub, monkeypatch):
+    (stub / "open3d.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(str(stub))
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    with pytest.raises(NoReference, match=r"^Open3D does not load: libGL\.so\.1: cannot open"):
+        load("open3d")
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from tests.validation.runs.test_report import hanging_stages, toy_options
+from thesisrecon.runtime._signals import with_resume_advice, install_signal_handlers
+from validation.runs.report import run_tasks
+install_signal_handlers("toy")
+with with_resume_advice("begin again"):
+    run_tasks(toy_options(Path(sys.argv[1]), quick=False), hanging_stages(), print)
+"""
+
+
+class HangingStage(ToyStage):
+    """All its methods hang."""
+
+    def methods(self, scene, options):
+        return ("hanging",)
+
+
+def hanging_stages():
+    return {"toy": HangingStage()}
+
+
+def process_of(out):
+    """The process of the task that hangs, 0 where it is not there yet."""
+    reported = list(out.rglob("hanging/process"))
+    return int(reported[0].read_text() or 0) if reported else 0
+
+
+def is_gone(number):
+    """Say whether the process ends soon, as its parent has ended."""
+    end = time.monotonic() + 10.0
+    while is_alive(number) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not is_alive(number)
+
+
+@pytest.mark.parametrize("asked", [signal.SIGINT, signal.SIGKILL])
+def test_a_report_that_is_ended_takes_its_tasks_along(asked, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    program = [sys.executable, "-c", PROGRAM, str(tmp_path)]
+    stop = stopped(program, lambda: process_of(tmp_path) > 0, asked, environment=environment)
+    assert is_gone(process_of(tmp_path))
+    if asked == signal.SIGINT:
+        assert (stop.code, stop.message, stop.left) == (130, "toy: interrupted; begin again\n", 0)

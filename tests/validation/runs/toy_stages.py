@@ -9,8 +9,8 @@ import time
 import PIL.Image
 
 from thesisrecon.errors import StageFailure
-from validation.runs.records import Judgement, Picture, Plot
-from validation.runs.tables import Metric
+from validation.runs.records import Judgement, Picture
+from validation.runs.tables import Metric, Plot
 
 VALUES = {"ours": 0.5, "good": 2.0, "after": 4.0}
 WAYS = ("ours", "good", "missing", "failing", "crashing", "hanging")
@@ -30,8 +30,7 @@ class ToyStage:
     def needs(self, method):
         return (("toy", "good"),) if method == "after" else ()
 
-    def run(self, task, options):
-        folder = options.folder(task.stage, task.scene, task.method)
+    def run(self, task, folder, options):
         if task.method == "missing":
             import no_such_library  # noqa: F401
         if task.method == "failing":

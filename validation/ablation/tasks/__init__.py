@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from validation.ablation.tasks.calibration import CalibrationOverNoise
-from validation.ablation.tasks.fundamental import FundamentalOfCube
-from validation.ablation.tasks.pairs import ImagePairs
+from validation.ablation.tasks.images import ImagePairs, RectifiedPairs
 from validation.ablation.tasks.reconstruction import Reconstruction
-from validation.ablation.tasks.stereo import RectifiedPairs
-from validation.ablation.tasks.triangulation import TriangulationOverNoise
+from validation.ablation.tasks.synthetic import (
+    CalibrationOverNoise,
+    FundamentalOfCube,
+    TriangulationOverNoise,
+)
 
 __all__ = ["TASKS", "Reconstruction"]
 

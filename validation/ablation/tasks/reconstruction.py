@@ -20,8 +20,7 @@ from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
-from validation.runs.records import ReportOptions
-from validation.runs.scenes import IMAGE_SCENES, load_images, truth_of
+from validation.runs.records import IMAGE_SCENES, ReportOptions, load_images
 from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene
 
@@ -32,25 +31,21 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "metric": ("intrinsics", "selfcalibration", "metric"),
     "dense": ("dense",),
     "model": ("model",),
-}
-"""The settings that each step adds to those before it."""
+}  # The settings that each step adds to those before it
 NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
 AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
     "matches": ("verified", "sigma_px"),
     "projective": ("registered_pct", "points"),
     "metric": ("reprojection_px", "trusted", *NEED_TRUTH),
-}
-"""The first step after which a number is known."""
+}  # The first step after which a number is known
 
 
 @dataclass(frozen=True)
 class Reconstruction(Task):
-    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread.
-
-    A scene is one with a name, or a folder of images, with ``cameras.json`` or ``sparse/0`` as its truth
-    if there is one; without truth the errors of cameras are missing. "NAME#k/n" is a subset: the k-th of n
-    windows of two thirds of the images, in the order of their names, spread over the scene. "yard-N" is
-    a rendered yard with true cameras, another one for each number.
+    """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread. A scene is one with a name, or
+    a folder of images with ``cameras.json`` or ``sparse/0`` as its truth if there is one. "NAME#k/n" is a
+    subset: the k-th of n windows of two thirds of the images, in the order of their names. "yard-N" is a
+    rendered yard with true cameras, another one for each number.
     """
 
     until: str = "metric"
@@ -110,24 +105,16 @@ class Reconstruction(Task):
         return found
 
     def prepare(self, config: PipelineConfig, scene: str, seed: int, place: Place, *, step: str) -> None:
-        self._reconstruct(config, scene, seed, place, step)
+        _reconstruct(config, scene, seed, place, step)
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
-        result = self._reconstruct(config, scene, seed, place, self.until)
+        result = _reconstruct(config, scene, seed, place, self.until)
         return _measured(result, _load(scene), len(_images(scene)))
 
-    def _reconstruct(
-        self, config: PipelineConfig, scene: str, seed: int, place: Place, until: str
-    ) -> RunResult:
-        return thesisrecon.reconstruct(
-            _images(scene),
-            place.own,
-            config=config,
-            seed=seed,
-            until=until,  # type: ignore[arg-type]
-            threads=1,
-            shared=place.shared,
-        )
+
+def _reconstruct(config: PipelineConfig, scene: str, seed: int, place: Place, until: str) -> RunResult:
+    given: Any = {"config": config, "seed": seed, "until": until, "threads": 1, "shared": place.shared}
+    return thesisrecon.reconstruct(_images(scene), place.own, **given)
 
 
 def _images(scene: str) -> tuple[Path, ...]:
@@ -176,15 +163,14 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
 
 
 def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
-    truth = truth_of(scene)
-    if truth is None:
+    if scene.truth is None:
         return None
     number = {path.name: n for n, path in enumerate(scene.image_paths)}
     chosen = [number[image.name] for image in result.images]
-    K = truth.K[chosen]
+    K, R, C = (part[chosen] for part in scene.truth)
     scale = np.array([image.scale for image in result.images])[:, None, None]
     # Pixel centres are whole numbers: (x + 0.5) s - 0.5.
     K[:, :2, 2] += 0.5
     K[:, :2] *= scale
     K[:, :2, 2] -= 0.5
-    return TrueCameras(K, truth.R[chosen], truth.C[chosen])
+    return K, R, C
