@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from thesisrecon.arrays import F64
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -15,14 +15,21 @@ class Block:
     """True cameras and points with exact observations."""
 
     cameras: MetricCameras
-    X: F64
-    view: NDArray[np.int64]
-    point: NDArray[np.int64]
-    xy: F64
+    X: np.ndarray
+    view: np.ndarray
+    point: np.ndarray
+    xy: np.ndarray
 
     @property
     def Xh(self):
-        return np.column_stack([self.X, np.ones(len(self.X))])
+        return homogenize(self.X)
+
+    def seen(self, xy=None):
+        return Observations(self.view, self.point, self.xy if xy is None else xy)
+
+    def image(self, P, X):
+        """Pixels of the observations for cameras (V, 3, 4) and homogeneous points."""
+        return dehomogenize(np.einsum("kab,kb->ka", P[self.view], X[self.point]))
 
 
 def project_block(cameras, X, view, point):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tests.synthetic import projective_reconstruction
+from tests.synthetic import projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.selfcalibration._frame import projective_scene
 
@@ -28,16 +28,24 @@ def setup(scene, options=CENTRED, *, seed=0):
     return found, true_plane(scene, found)
 
 
+def calibrated(method, scene, prior, *, seed=0):
+    """What a method makes of the exact projective cameras of a scene in a random frame."""
+    given = projective_reconstruction(scene, seed=seed)
+    return method.calibrate(given, prior=prior, rng=np.random.default_rng(0))
+
+
+def with_calibrations(scene, K):
+    """The same views through other lenses."""
+    return with_poses(replace(scene, K=np.broadcast_to(K, scene.K.shape).copy()), scene.R, scene.centres)
+
+
 def true_plane(scene, found):
     """p of the plane at infinity: A_j - a_j p' = s_j H_j with the true infinite homographies H_j."""
     frame = found.frame
-    unit = np.linalg.inv(frame.pixel_from_unit)
-    M = unit @ scene.K @ scene.R
+    M = np.linalg.inv(frame.pixel_from_unit) @ scene.K @ scene.R
     H = M @ np.linalg.inv(M[frame.reference])
     rows, right = [], []
-    for j in range(len(H)):
-        if j == frame.reference:
-            continue
+    for j in np.delete(np.arange(len(H)), frame.reference):
         block = np.zeros((9, 3 + len(H)))
         block[:, :3] = np.einsum("a,bc->abc", frame.a[j], np.eye(3)).reshape(9, 3)
         block[:, 3 + j] = H[j].ravel()
@@ -54,4 +62,4 @@ def turned_about_one_axis(scene, degrees):
     along = np.linspace(-0.4, 0.4, len(R))[:, None]
     centres = np.einsum("vba,b->va", R, [0.0, 0.0, -8.0]) + along * [1, 0.7, 0.2]
     centres[:, 1] += 0.3 * np.cos(np.arange(len(R)) * 2.0)
-    return replace(scene, R=R, t=-np.einsum("vab,vb->va", R, centres))
+    return with_poses(scene, R, centres)

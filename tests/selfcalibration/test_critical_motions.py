@@ -1,4 +1,4 @@
-"""Critical motions by their measures and names, the counting argument, and the verdict with its sentences."""
+"""Critical motions, the counting argument, verdicts in words, and self-calibration by hypotheses."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
+from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.critical_motions import (
     UpgradedCameras,
     _infinite_homography_shift,
@@ -26,11 +27,16 @@ from thesisrecon.optimize.bundle.identifiability import (
 )
 from thesisrecon.records import Tracks, Upgrade
 from thesisrecon.selfcalibration._candidates import (
+    _biased_focal,
+    _no_candidate_failure,
     check_identifiability,
     identifiability_without_calibration,
+    plane_from_focals,
 )
 from thesisrecon.selfcalibration._frame import normalized_frame
+from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import quadric_hypotheses
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
@@ -44,13 +50,9 @@ def report_at_the_truth(scene, cameras="shared"):
     """The verdict when self-calibration found the true answer."""
     rng = np.random.default_rng(0)
     estimate = projective_estimate(scene, rng)
-    known = IntrinsicsOptions(cameras="per-image" if cameras == "per-image" else "shared")
-    prior = prior_for(estimate, known)
-    answer = with_constants(HypothesesAndRefinement, camera_subsets=0, focal_steps=17)(search=None).calibrate(
-        estimate, prior=prior, rng=rng
-    )
-    assert answer.identifiability is not None
-    return answer.identifiability
+    prior = prior_for(estimate, IntrinsicsOptions(cameras=cameras))
+    method = with_constants(HypothesesAndRefinement, camera_subsets=0, focal_steps=17)(search=None)
+    return method.calibrate(estimate, prior=prior, rng=rng).identifiability
 
 
 @pytest.mark.parametrize("by_hand", [False, True], ids=["exact", "by hand"])
@@ -76,10 +78,15 @@ def test_cameras_that_hardly_turned_nor_moved_have_the_name_of_the_nearer_motion
     assert nearest_critical_motion(measure_motion(turned))[0] == "pure rotation"
 
 
-def test_general_motions_are_far_from_all():
+def test_general_motions_are_far_from_all_and_thickness_forgives_a_few_far_points():
     for seed in range(20):
         scene = make_sequence(Motion.GENERAL, np.random.default_rng(seed))
         assert nearest_critical_motion(measure_motion(true_cameras(scene)))[1] > 2.0
+    rng = np.random.default_rng(0)
+    wall = rng.uniform(-1.0, 1.0, (300, 3)) * [1.0, 1.0, 0.005]
+    wall[:5] += 30.0 * rng.normal(size=(5, 3))
+    assert _planarity_ratio(wall) < 0.01
+    assert _planarity_ratio(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
 
 
 @pytest.mark.parametrize("motion", [Motion.TRANSLATION, Motion.OPTICAL_AXIS])
@@ -103,14 +110,6 @@ def test_missing_tilt_is_detected_from_projective_cameras():
         assert not identifiability.identifiable
         assert (identifiability.motion == "pure translation") == small
         assert any("pure translation" in sentence for sentence in identifiability.sentences) == small
-
-
-def test_thickness_forgives_a_few_far_points():
-    rng = np.random.default_rng(0)
-    wall = rng.uniform(-1.0, 1.0, (300, 3)) * [1.0, 1.0, 0.005]
-    wall[:5] += 30.0 * rng.normal(size=(5, 3))
-    assert _planarity_ratio(wall) < 0.01
-    assert _planarity_ratio(rng.uniform(-1.0, 1.0, (300, 3))) > 0.5
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_missing_equations_are_reported_with_their_number():
     assert any("2 equations are missing" in sentence for sentence in sentences)
 
 
-def test_square_pixels_resolve_a_turntable_and_this_is_reported():
+def test_square_pixels_resolve_a_turntable_but_no_pure_roll():
     identifiability = report_at_the_truth(make_sequence(Motion.TURNTABLE, np.random.default_rng(4)))
     assert identifiability.identifiable
     assert identifiability.critical
@@ -146,9 +145,6 @@ def test_square_pixels_resolve_a_turntable_and_this_is_reported():
     assert evidence["focal_std_rel_free"] > 3.0 * evidence["focal_std_rel_median"]
     assert any("turntable" in sentence for sentence in identifiability.sentences)
     assert any("square pixels" in sentence for sentence in identifiability.sentences)
-
-
-def test_pure_roll_is_rejected_with_advice():
     for cameras in ("shared", "per-image"):
         scene = make_sequence(Motion.OPTICAL_AXIS, np.random.default_rng(5))
         identifiability = report_at_the_truth(scene, cameras)
@@ -175,16 +171,13 @@ def test_a_rotation_within_lens_model_error_determines_no_focal():
     assert any("errors of a lens model" in sentence for sentence in identifiability.sentences)
 
 
-def test_a_general_motion_needs_no_words():
+def test_a_general_motion_needs_no_words_and_large_residuals_are_not_identifiable():
     identifiability = report_at_the_truth(make_sequence(Motion.GENERAL, np.random.default_rng(6)))
     assert 1e-4 < identifiability.evidence["principal_point_std_free"] < 0.2
     assert identifiability.identifiable
     assert not identifiability.critical
     assert identifiability.sentences == ()
     assert identifiability.undetermined == ()
-
-
-def test_a_solution_with_large_residuals_is_not_identifiable():
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(7))
     estimate = projective_estimate(scene, np.random.default_rng(0))
     prior = prior_for(estimate)
@@ -195,8 +188,19 @@ def test_a_solution_with_large_residuals_is_not_identifiable():
     assert identifiability.sentences
 
 
-def bent_by_zooms():
-    """Verdicts on zoomed photographs that are said to have one focal length, and each its own."""
+def metric_frame(estimate, scene):
+    """The projective transform that takes the estimate to the true cameras: rows of P T = lambda P_true."""
+    registered = np.flatnonzero(estimate.registered)
+    rows = []
+    for place, v in enumerate(registered):
+        scale = np.zeros((12, len(registered)))
+        scale[:, place] = -scene.P[v].ravel() / np.linalg.norm(scene.P[v])
+        rows.append(np.hstack([np.kron(estimate.P[v] / np.linalg.norm(estimate.P[v]), np.eye(4)), scale]))
+    return np.linalg.inv(np.linalg.svd(np.vstack(rows))[2][-1][:16].reshape(4, 4))
+
+
+def test_noise_is_compared_with_the_projective_residual_not_a_floor():
+    """Zoomed photographs that are said to have one focal length, and each its own."""
     scene = make_sequence(Motion.GENERAL, np.random.default_rng(8), zoom=0.15)
     t = scene.tracks
     exact = dehomogenize(np.einsum("kij,kj->ki", scene.P[t.view_index], homogenize(scene.X)[t.point_index]))
@@ -208,23 +212,6 @@ def bent_by_zooms():
         check_identifiability(estimate, upgrade, prior_for(estimate, IntrinsicsOptions(cameras=how)))
         for how in ("shared", "per-image")
     )
-    return shared, own
-
-
-def metric_frame(estimate, scene):
-    """The projective transform that takes the estimate to the true cameras: rows of P T = lambda P_true."""
-    registered = np.flatnonzero(estimate.registered)
-    rows = []
-    for place, v in enumerate(registered):
-        scale = np.zeros((12, len(registered)))
-        scale[:, place] = -scene.P[v].ravel() / np.linalg.norm(scene.P[v])
-        rows.append(np.hstack([np.kron(estimate.P[v] / np.linalg.norm(estimate.P[v]), np.eye(4)), scale]))
-    T = np.linalg.svd(np.vstack(rows))[2][-1][:16].reshape(4, 4)
-    return np.asarray(np.linalg.inv(T))
-
-
-def test_noise_is_compared_with_the_projective_residual_not_a_floor():
-    shared, own = bent_by_zooms()
     assert shared.evidence["noise_ratio_to_projective"] > 3.0
     assert not shared.identifiable
     assert any("zoomed" in sentence for sentence in shared.sentences)
@@ -246,3 +233,102 @@ def test_advice_never_asks_for_a_given_focal_length(given, advice):
     estimate = projective_estimate(scene, np.random.default_rng(0))
     sentences = identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences
     assert next(s for s in sentences if "rotate the camera" in s).endswith(advice)
+
+
+def calibrate(scene, *, shared=True, seed=0):
+    reconstruction = projective_reconstruction(scene, seed=seed)
+    prior = prior_for(reconstruction, IntrinsicsOptions(cameras="shared" if shared else "per-image"))
+    rng = np.random.default_rng(seed)
+    return HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=rng)
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.3])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_exact_cameras_give_the_exact_focal(zoom, seed):
+    scene = make_scene(zoom=zoom, seed=seed)
+    answer = calibrate(scene, shared=zoom == 0.0, seed=seed)
+    # The weak pull on the focal moves exact data by far less than any noise would.
+    np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
+    assert answer.identifiable
+
+
+def test_the_upgrade_makes_every_camera_a_scaled_rotation_with_its_points_in_front():
+    scene = make_scene(seed=4)
+    reconstruction, answer = projective_reconstruction(scene, seed=4), calibrate(scene, seed=4)
+    G, t = answer.metric_from_projective, scene.tracks
+    P, X = reconstruction.P @ np.linalg.inv(G), reconstruction.X @ G.T
+    C = np.linalg.inv(answer.K) @ P[:, :, :3]
+    CC = C @ C.swapaxes(1, 2)
+    CC /= np.trace(CC, axis1=1, axis2=2)[:, None, None] / 3.0
+    np.testing.assert_allclose(CC, np.tile(np.eye(3), (len(C), 1, 1)), atol=5e-3)
+    P *= np.sign(np.linalg.det(P[:, :, :3]))[:, None, None]
+    depth = np.einsum("kj,kj->k", P[t.view_index, 2], X[t.point_index]) / X[t.point_index, 3]
+    assert (depth > 0).all()
+
+
+def test_each_closed_form_contains_the_truth():
+    scene = make_scene(seed=6)
+    reconstruction = projective_reconstruction(scene, seed=6)
+    frame = normalized_frame(reconstruction, prior_for(reconstruction))
+    f = scene.K[0, 0, 0] / 1536.0
+    criterion = RotationCriterion(focal_weight=0.0)
+    planes, focals = quadric_hypotheses(frame, np.array([f]))
+    assert focals[0] == pytest.approx(f, rel=1e-6)
+    log_f = np.full((1, 1), np.log(f))
+    assert criterion.cost(frame, planes, log_f)[0] < 1e-12
+    other = 0 if frame.reference != 0 else 1
+    both_signs = plane_from_focals(frame, other, np.array([f]), np.array([f]))
+    assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
+
+
+def test_pure_translation_is_unidentifiable_and_a_prior_pulls_its_focal():
+    scene = make_scene(seed=7)
+    still = with_poses(scene, np.tile(scene.R[0], (8, 1, 1)), scene.centres)
+    answer = calibrate(still)
+    assert not answer.identifiable
+    assert any("translation" in reason for reason in answer.reasons)
+    reconstruction = projective_reconstruction(still)
+    prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1500.0, focal_std_rel=0.01))
+    pulled = HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(pulled.K[:, 0, 0], 1500.0, rtol=0.1)
+
+
+def test_a_focal_without_a_solution_is_named_and_not_requested():
+    scene = make_scene(seed=3)
+    reconstruction = projective_reconstruction(scene)
+    prior = prior_for(reconstruction, IntrinsicsOptions(focal_px=1.0, focal_std_rel=0.05))
+    with pytest.raises(StageFailure) as failure:
+        HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=np.random.default_rng(0))
+    assert "near the given focal length" in str(failure.value)
+    assert "1 px (+- 5.0%)" in failure.value.evidence
+    assert "the images contradict it" in failure.value.advice
+    assert "give the focal length" not in str(failure.value)
+
+
+@pytest.mark.parametrize(
+    ("focal", "words"),
+    [((499.4, 499.8), "499 px"), ((500.0, 500.8), "500 to 501 px"), ((700.0, 500.0), "500 to 700 px")],
+)
+def test_a_failure_near_given_focal_lengths_states_them(focal, words):
+    scene = make_scene(views=4)
+    given = projective_reconstruction(scene)
+    options = IntrinsicsOptions(cameras="per-image", focal_px=500.0, focal_std_rel=0.02)
+    frame = normalized_frame(given, prior_for(given, options))
+    mean = frame.prior.mean.copy()
+    mean[:, 0] = [*focal, *focal]
+    frame = replace(frame, prior=replace(frame.prior, mean=mean))
+    failure = _no_candidate_failure(frame, given, 40)
+    assert str(failure.reason).endswith("near the given focal length")
+    assert failure.evidence.startswith(f"{words} (+- 2.0%) at working size was given")
+
+
+def test_a_focal_length_off_that_of_bundle_adjustment_is_reported():
+    scene = make_scene(views=5)
+    found, given = calibrate(scene), projective_reconstruction(scene)
+    frame, best = normalized_frame(given, prior_for(given, IntrinsicsOptions())), found.candidates[0]
+    assert _biased_focal(frame, best, found.identifiability) == ()
+    for factor, words in ((1.2, "+20%"), (0.8, "-20%")):
+        off = replace(best, K=best.K * [[[factor], [factor], [1.0]]])
+        (sentence,) = _biased_focal(frame, off, found.identifiability)
+        assert f"the focal length of this method is {words} from that of bundle adjustment" in sentence
+        assert "bundle adjustment, 1500 px" in sentence

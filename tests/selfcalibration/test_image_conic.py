@@ -1,4 +1,4 @@
-"""The image conic from exact infinite homographies, constant and zooming, and the equations' properties."""
+"""The image conic from exact infinite homographies, and the plane at infinity from vanishing points."""
 
 from dataclasses import replace
 
@@ -7,11 +7,17 @@ import pytest
 
 from tests.conftest import refuses
 from tests.selfcalibration import stratified_scenes as scenes
-from tests.synthetic import make_scene
+from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.strata import calibration_from_image
-from thesisrecon.selfcalibration._frame import infinite_homographies, square_pixel_constraints
+from thesisrecon.io._images import read_images
+from thesisrecon.records import Tracks
+from thesisrecon.selfcalibration._frame import (
+    infinite_homographies,
+    projective_scene,
+    square_pixel_constraints,
+)
 from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,
     LinearAbsoluteConic,
@@ -20,6 +26,18 @@ from thesisrecon.selfcalibration.absolute_conic import (
     solve_conic,
     solve_conic_batch,
 )
+from thesisrecon.selfcalibration.parallel_lines import (
+    LineSegments,
+    ParallelLines,
+    VanishingPoints,
+    _find_parallel_directions,
+    _normalize_segments,
+    _propose_vanishing_points,
+    _refine_plane,
+    _refined_point,
+)
+from thesisrecon.selfcalibration.stratified import Stratified
+from validation.scenes.real import load_fixture_scene
 
 WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]
 
@@ -56,18 +74,31 @@ def test_the_true_plane_gives_the_true_calibrations(way, options, zoom, seed):
     np.testing.assert_allclose(K, scene.K, atol=2e-5)
 
 
-def test_roughly_known_principal_points_move_towards_the_truth():
+def test_rough_principal_points_and_right_angles_help():
     scene = make_scene(seed=3, principal_shift=(12.0, -9.0))
     found, plane = scenes.setup(scene, IntrinsicsOptions(), seed=3)
     K = pixels(found, LinearAbsoluteConic().calibrations(found, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
     assert np.linalg.norm(K[0, :2, 2] - scene.K[0, :2, 2]) < 5.0
+    # With square pixels, three vanishing points at right angles give all of K.
+    scene = make_scene(seed=5, principal_shift=(40.0, 25.0))
+    found, _ = scenes.setup(scene, scenes.NOTHING_BUT_CONSTANT, seed=5)
+    reference = found.frame.reference
+    H = np.tile(np.eye(3), (len(scene.K), 1, 1))
+    v = (np.linalg.inv(found.frame.pixel_from_unit[reference]) @ scene.K[reference] @ scene.R[reference]).T
+    orthogonal = np.array([[v[0], v[1]], [v[0], v[2]], [v[1], v[2]]])
+    constraints = square_pixel_constraints(found.frame)
+    constraints.std[:, 1:3] = np.inf
+    conic = solve_conic(H, constraints, orthogonal=orthogonal)
+    dual = np.linalg.inv(conic.w)
+    K = found.frame.pixel_from_unit[reference] @ calibration_from_image(dual, is_dual=True)
+    np.testing.assert_allclose(K, scene.K[reference], rtol=1e-8, atol=1e-5)
+    assert conic.determined
 
 
 @pytest.mark.parametrize("focal", [500.0, 6000.0])
 def test_short_and_long_lenses_need_no_guess(focal):
-    scene = make_scene(seed=2, focal=focal)
-    found, plane = scenes.setup(scene, scenes.CENTRED, seed=2)
+    found, plane = scenes.setup(make_scene(seed=2, focal=focal), scenes.CENTRED, seed=2)
     for way in WAYS:
         K = pixels(found, way.calibrations(found, plane))
         np.testing.assert_allclose(K[:, 0, 0], focal, rtol=1e-7)
@@ -88,46 +119,25 @@ def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it():
     assert np.sqrt(f2[0]) * unit == pytest.approx(1500.0, rel=1e-8)
 
 
-def test_right_angles_determine_the_calibration_of_cameras_that_do_not_turn():
-    """With square pixels, three vanishing points at right angles give all of K."""
-    scene = make_scene(seed=5, principal_shift=(40.0, 25.0))
-    found, _ = scenes.setup(scene, scenes.NOTHING_BUT_CONSTANT, seed=5)
-    reference = found.frame.reference
-    H = np.tile(np.eye(3), (len(scene.K), 1, 1))
-    v = (np.linalg.inv(found.frame.pixel_from_unit[reference]) @ scene.K[reference] @ scene.R[reference]).T
-    orthogonal = np.array([[v[0], v[1]], [v[0], v[2]], [v[1], v[2]]])
-    constraints = square_pixel_constraints(found.frame)
-    constraints.std[:, 1:3] = np.inf
-    conic = solve_conic(H, constraints, orthogonal=orthogonal)
-    dual = np.linalg.inv(conic.w)
-    K = found.frame.pixel_from_unit[reference] @ calibration_from_image(dual, is_dual=True)
-    np.testing.assert_allclose(K, scene.K[reference], rtol=1e-8, atol=1e-5)
-    assert conic.determined
-
-
-def test_turns_measures_the_rotation_and_its_axis():
-    scene = scenes.turned_about_one_axis(make_scene(seed=0), np.linspace(-20.0, 20.0, 8))
-    K, R = scene.K[0], scene.R
-    H = K @ R @ R[0].T @ np.linalg.inv(K)
-    angle, axis = _largest_rotation(H)
+def test_motions_and_planes_without_a_calibration_are_named():
+    scene = make_scene(seed=0)
+    turned = scenes.turned_about_one_axis(scene, np.linspace(-20.0, 20.0, 8))
+    K, R = turned.K[0], turned.R
+    angle, axis = _largest_rotation(K @ R @ R[0].T @ np.linalg.inv(K))
     assert angle == pytest.approx(40.0)
     seen = K @ R[0] @ [0.0, 1.0, 0.0]
     assert np.linalg.norm(np.cross(axis, seen / np.linalg.norm(seen))) < 1e-9
-
-
-def test_one_axis_of_rotation_is_named():
-    scene = make_scene(seed=0)
-    turned = scenes.turned_about_one_axis(scene, np.linspace(-20.0, 20.0, 8))
+    linear, fixed = (way.calibrations for way in WAYS)
     found, plane = scenes.setup(turned, scenes.NOTHING_BUT_CONSTANT)
-    with pytest.raises(StageFailure, match=r"same axis.*one-parameter|one-parameter.*same axis"):
-        LinearAbsoluteConic().calibrations(found, plane)
-    refuses(StageFailure, "one-parameter", FixedPlaneQuadric().calibrations, found, plane)
-
-
-def test_cameras_that_do_not_turn_are_named():
-    turned = scenes.turned_about_one_axis(make_scene(seed=0), np.zeros(8))
-    found, plane = scenes.setup(turned, scenes.NOTHING_BUT_CONSTANT)
-    refuses(StageFailure, "do not rotate", LinearAbsoluteConic().calibrations, found, plane)
+    refuses(StageFailure, r"same axis.*one-parameter|one-parameter.*same axis", linear, found, plane)
+    refuses(StageFailure, "one-parameter", fixed, found, plane)
+    still = scenes.turned_about_one_axis(scene, np.zeros(8))
+    refuses(StageFailure, "do not rotate", linear, *scenes.setup(still, scenes.NOTHING_BUT_CONSTANT))
+    found, plane = scenes.setup(make_scene(seed=1), seed=1)
+    other = 0 if found.frame.reference else 1
+    centre = -np.linalg.solve(found.frame.A[other], found.frame.a[other])
+    through = plane - (plane @ centre + 1.0) / (centre @ centre) * centre
+    refuses(StageFailure, "passes through a camera", linear, found, through)
 
 
 def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
@@ -142,10 +152,153 @@ def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
     assert refused > 0
 
 
-def test_a_plane_through_a_camera_is_refused():
+TURN = np.array([[0.8, 0.36, 0.48], [-0.6, 0.48, 0.64], [0.0, -0.8, 0.6]])
+"""Three directions at right angles, none of them along an axis."""
+
+
+def vanishing_points(scene, directions, views):
+    """Exact vanishing points of directions (D, 3) in the named views."""
+    xyh = np.concatenate([directions @ M.T for M in (scene.K @ scene.R)[views]])
+    n = len(directions)
+    return VanishingPoints(np.repeat(views, n), np.tile(np.arange(n), len(views)), xyh)
+
+
+def drawn_segments(scene, *, sigma_px, stray, seed):
+    """Segments of 40 lines along each of three directions seen by every camera, and ``stray`` of none."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-1.5, 1.5, (120, 3))
+    Y = X + np.repeat(TURN, 40, axis=0) * rng.uniform(0.5, 1.0, (120, 1))
+    found = []
+    for P in scene.P:
+        ends = [np.column_stack([Z, np.ones(len(Z))]) @ P.T for Z in (X, Y)]
+        true = np.concatenate([e[:, :2] / e[:, 2:] for e in ends], axis=1)
+        place = rng.uniform(0.0, 1000.0, (stray, 2))
+        wild = np.concatenate([place, place + rng.normal(0.0, 60.0, (stray, 2))], axis=1)
+        found.append(np.concatenate([true + rng.normal(0.0, sigma_px, true.shape), wild]))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
+def test_three_given_directions_fix_the_plane(seed, views):
+    scene = make_scene(seed=seed)
+    found, plane = scenes.setup(scene, seed=seed)
+    way = ParallelLines(vanishing_points(scene, TURN, views))
+    located = way.locate(found, np.random.default_rng(0))
+    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+
+
+def test_more_directions_and_points_at_infinity_do_no_harm():
     scene = make_scene(seed=1)
+    given = vanishing_points(scene, np.vstack([scene.R[0], [0.3, -0.2, 0.9]]), [0, 3, 6])
+    assert abs(given.xyh[0, 2]) < 1e-12
     found, plane = scenes.setup(scene, seed=1)
-    other = 0 if found.frame.reference else 1
-    centre = -np.linalg.solve(found.frame.A[other], found.frame.a[other])
-    through = plane - (plane @ centre + 1.0) / (centre @ centre) * centre
-    refuses(StageFailure, "passes through a camera", LinearAbsoluteConic().calibrations, found, through)
+    located = ParallelLines(given).locate(found, np.random.default_rng(0))
+    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+
+
+def test_directions_at_right_angles_give_the_calibration_too():
+    """With three views nothing but right angles and zero skew settles K of one camera."""
+    scene = make_scene(seed=2, views=3, principal_shift=(50.0, -30.0), seen_share=1.0)
+    way = ParallelLines(vanishing_points(scene, TURN, [0, 1]), orthogonal_directions=True)
+    prior = scenes.prior_for(scene, scenes.NOTHING_BUT_CONSTANT)
+    answer = scenes.calibrated(Stratified(way, refine=False), scene, prior, seed=2)
+    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
+
+
+def test_directions_that_do_not_fix_the_plane_are_refused():
+    scene = make_scene(seed=3)
+    found, plane = scenes.setup(scene, seed=3)
+    every, rng = vanishing_points(scene, TURN, [0, 1]), np.random.default_rng(0)
+    flat = vanishing_points(scene, np.array([TURN[0], TURN[1], TURN[0] + TURN[1]]), [0, 1])
+    two = VanishingPoints(*(part[:5] for part in (every.view, every.direction, every.xyh)))
+    baseline = np.array([*TURN[:2], scene.centres[1] - scene.centres[0]])
+    along = vanishing_points(scene, baseline, [0, 1])
+    for words, given in (
+        ("lie in one plane", flat),
+        (r"three directions.*2 have", two),
+        (r"2 have vanishing points .*not parallel to the baseline", along),
+    ):
+        refuses(StageFailure, words, ParallelLines(given).locate, found, rng)
+    given = vanishing_points(scene, np.vstack([baseline, TURN[2]]), [0, 1])
+    np.testing.assert_allclose(ParallelLines(given).locate(found, rng).planes[0], plane, atol=1e-8)
+
+
+@pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
+def test_directions_are_found_among_strays(sigma, stray, limit):
+    scene = make_scene(seed=5, views=6)
+    found, plane = scenes.setup(scene, seed=5)
+    frame = found.frame
+    segments = _normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
+    rng = np.random.default_rng(1)
+    proposals = [
+        _propose_vanishing_points(
+            segments.subset(segments.camera == k), max_points=5, samples=300, tolerance_px=1.5, rng=rng
+        )
+        for k in range(6)
+    ]
+    X, direction = _find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
+    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    again = _refined_point(P, segments, X[0] + [1e-3, -1e-3, 1e-3, 0.0], 1.5)
+    np.testing.assert_allclose(again, X[0], atol=2e-4)
+    truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
+    for d in range(3):
+        mine = truth[direction == d]
+        # A segment that runs towards two of the directions goes to the stronger one.
+        right = np.bincount(mine[mine >= 0], minlength=3).max()
+        assert right > max(0.7 * 240, 0.85 * len(mine))
+    v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
+    start = np.linalg.svd(X)[2][-1]
+    refined, _, noise = _refine_plane(frame, segments, direction, start[:3] / start[3], v)
+    np.testing.assert_allclose(refined, plane, atol=limit)
+    assert noise == pytest.approx(sigma, rel=0.5, abs=0.01)
+
+
+def test_the_detector_finds_the_sides_of_a_turned_square_and_nothing_in_noise():
+    y, x = np.mgrid[0:200, 0:240].astype(np.float64)
+    half, c, s = 60.0, np.cos(np.radians(17.0)), np.sin(np.radians(17.0))
+
+    def off_the_sides(x, y):
+        u, v = x - 118.3, y - 97.6
+        return np.maximum(np.abs(u * c + v * s), np.abs(v * c - u * s)) - half
+
+    gray = (60.0 + 120.0 * np.clip(0.5 - off_the_sides(x, y), 0.0, 1.0)).astype(np.float32)
+    segments = LineSegments().detect(gray)
+    assert len(segments) == 4
+    ends = segments.reshape(4, 2, 2)
+    assert (np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 100.0).all()
+    np.testing.assert_allclose(off_the_sides(ends[..., 0], ends[..., 1]), 0.0, atol=0.15)
+    assert LineSegments().detect(np.full((50, 60), 90.0, dtype=np.float32)).shape == (0, 4)
+    noise = np.random.default_rng(0).normal(128.0, 5.0, (300, 400)).astype(np.float32)
+    assert len(LineSegments().detect(noise)) < 10
+
+
+def courtyard(views):
+    """The true cameras of the courtyard with points strewn over the yard."""
+    truth, n = load_fixture_scene(), len(views)
+    X = np.random.default_rng(0).uniform([-3.0, -2.5, 0.2], [3.0, -0.2, 3.0], (200, 3))
+    point, view = np.indices((200, n)).reshape(2, -1)
+    tracks, sizes = Tracks(view, point, np.zeros((200 * n, 2)), n, 200), np.tile([1024, 768], (n, 1))
+    scene = TrueScene(truth.K[views], truth.R[views], np.zeros((n, 3)), X, 0.0, tracks, sizes)
+    return with_poses(scene, scene.R, truth.C[views]), [truth.image_paths[v] for v in views]
+
+
+def test_parallel_lines_are_found_in_photographs():
+    scene, paths = courtyard([0, 3, 6, 9, 12])
+    photographs = read_images(paths, max_size_px=1600).images
+    given, prior = projective_reconstruction(scene), scenes.prior_for(scene, scenes.CENTRED)
+    variant = Stratified(ParallelLines(), refine=False).with_images(photographs)
+    found = projective_scene(given, prior)
+    located = variant.plane.locate(found, np.random.default_rng(0))
+    plane = scenes.true_plane(scene, found)
+    assert np.linalg.norm(located.planes[0] - plane) < 0.02 * (1.0 + np.linalg.norm(plane))
+    answer = variant.calibrate(given, prior=prior, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[0, 0, 0], rtol=0.03)
+
+
+def test_a_wall_of_nothing_is_refused_with_its_directions():
+    scene, paths = courtyard([0, 6, 12])
+    photographs = read_images(paths, max_size_px=1600).images
+    flat = [replace(image, rgb=np.full_like(image.rgb, 90)) for image in photographs]
+    method = Stratified(ParallelLines()).with_images(flat)
+    refuses(StageFailure, "0 directions", scenes.calibrated, method, scene, scenes.prior_for(scene))

@@ -1,16 +1,27 @@
-"""The ways to the plane at infinity on exact and noisy scenes, and what they refuse."""
+"""The ways to the plane at infinity on exact and noisy scenes, and the affine stratum that it gives."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import thesisrecon
+from tests.conftest import refuses
 from tests.constants import with_constants
-from tests.selfcalibration.stratified_scenes import CENTRED_ZOOM, NOTHING_BUT_CONSTANT, prior_for, setup
-from tests.synthetic import make_scene, projective_reconstruction
-from thesisrecon.api.cameras import reconstruction_from_cameras
+from tests.selfcalibration.stratified_scenes import (
+    CENTRED,
+    CENTRED_ZOOM,
+    NOTHING_BUT_CONSTANT,
+    calibrated,
+    prior_for,
+    setup,
+)
+from tests.synthetic import make_scene, projective_reconstruction, with_poses
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.conditioning import pixel_from_unit
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.pipeline.outputs import write_affine
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import (
     CheiralityRegion,
@@ -21,7 +32,8 @@ from thesisrecon.selfcalibration.cheirality import (
     _pairs_of_constant_cameras,
     _plane_box,
 )
-from thesisrecon.selfcalibration.stratified import Stratified
+from thesisrecon.selfcalibration.parallel_lines import ParallelLines
+from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
 
 PAIRS = [
     (plane, way)
@@ -59,12 +71,15 @@ def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed
     np.testing.assert_allclose(t[0], angles, atol=1e-8)
 
 
+def region_of(found):
+    rng = np.random.default_rng(0)
+    return CheiralityRegion.of(found.frame, found.reconstruction, max_points=200, rng=rng)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_cheirality_bounds_hold_the_true_plane(seed):
-    found, plane = setup(make_scene(seed=seed, sigma_px=0.0), seed=seed)
-    region = CheiralityRegion.of(
-        found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
-    )
+    found, plane = setup(make_scene(seed=seed), seed=seed)
+    region = region_of(found)
     assert region.wrong_side_ratio(plane[None])[0] == 0.0
     planes = [np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0) for part in region.polytopes]
     inside = [part.contains(v[None, :3] / v[3])[0] for part, v in zip(region.polytopes, planes, strict=True)]
@@ -74,38 +89,35 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
 def test_samples_of_the_bounds_are_inside_them():
     rows = np.column_stack([np.vstack([np.eye(3), -np.eye(3)]), [1.0] * 3 + [2.0] * 3])
     np.testing.assert_allclose(_plane_box(rows), [[-1.0, 2.0]] * 3)
-    found, _ = setup(make_scene(seed=2))
-    region = CheiralityRegion.of(
-        found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
-    )
+    region = region_of(setup(make_scene(seed=2))[0])
     for part in region.polytopes:
         v = part.sample(100, np.random.default_rng(1))
         assert part.contains(v).all()
         assert (np.ptp(v, axis=0) > 0.1 * np.ptp(part.box, axis=1)).all()
-        back = part.reference_planes(v)
-        assert region.wrong_side_ratio(back).max() == 0.0
+        assert region.wrong_side_ratio(part.reference_planes(v)).max() == 0.0
 
 
 @pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("seed", range(3))
 def test_exact_cameras_give_the_exact_solution_in_closed_form(plane, way, seed):
     scene = make_scene(seed=seed)
-    answer = Stratified(plane, way, refine=False).calibrate(
-        projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(seed)
-    )
+    answer = calibrated(Stratified(plane, way, refine=False), scene, prior_for(scene), seed=seed)
     np.testing.assert_allclose(answer.K[:, 0, 0], 1500.0, rtol=1e-8)
     assert answer.identifiable
     assert type(plane).__name__ in answer.candidates[0].method
 
 
-def test_an_unknown_constant_calibration_comes_out_whole():
+def test_an_unknown_constant_calibration_comes_out_whole_from_copies_of_a_point_too():
     scene = make_scene(seed=4, principal_shift=(70.0, -50.0))
-    answer = Stratified(ModulusConstraint(), refine=False).calibrate(
-        projective_reconstruction(scene, seed=4),
-        prior=prior_for(scene, NOTHING_BUT_CONSTANT),
-        rng=np.random.default_rng(4),
-    )
-    np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-4)
+    method, prior = Stratified(ModulusConstraint(), refine=False), prior_for(scene, NOTHING_BUT_CONSTANT)
+    np.testing.assert_allclose(calibrated(method, scene, prior, seed=4).K, scene.K, rtol=1e-7, atol=1e-4)
+    scene = make_scene(seed=0)
+    scene.X[:] = [0.1, 0.2, 0.3]
+    one, prior = with_poses(scene, scene.R, scene.centres), prior_for(scene, NOTHING_BUT_CONSTANT)
+    search = Stratified(CheiralitySearch())
+    refuses(StageFailure, "found no plane at infinity", calibrated, search, one, prior)
+    found = calibrated(Stratified(ModulusConstraint()), one, prior)
+    np.testing.assert_allclose(found.K, scene.K, rtol=1e-6, atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -113,21 +125,18 @@ def test_three_views_of_a_constant_camera_suffice(seed):
     scene = make_scene(views=3, seed=seed, seen_share=1.0)
     found, plane = setup(scene, seed=seed)
     candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
-    nearest = np.linalg.norm(candidates.planes - plane, axis=1).min()
-    assert nearest < 1e-6
-    answer = with_constants(Stratified, max_candidates=21)(ModulusConstraint()).calibrate(
-        projective_reconstruction(scene, seed=seed), prior=prior_for(scene), rng=np.random.default_rng(0)
-    )
+    assert np.linalg.norm(candidates.planes - plane, axis=1).min() < 1e-6
+    method = with_constants(Stratified, max_candidates=21)(ModulusConstraint())
+    answer = calibrated(method, scene, prior_for(scene), seed=seed)
     assert answer.K[0, 0, 0] == pytest.approx(1500.0, rel=1e-6)
 
 
 def test_zooming_cameras_are_found_by_the_search_and_refused_by_the_modulus_constraint():
     scene = make_scene(seed=6, zoom=0.3)
-    given, prior = projective_reconstruction(scene, seed=6), prior_for(scene, CENTRED_ZOOM)
-    answer = Stratified(refine=False).calibrate(given, prior=prior, rng=np.random.default_rng(0))
+    prior, modulus = prior_for(scene, CENTRED_ZOOM), Stratified(ModulusConstraint())
+    answer = calibrated(Stratified(refine=False), scene, prior, seed=6)
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
-    with pytest.raises(StageFailure, match="three images of one camera"):
-        Stratified(ModulusConstraint()).calibrate(given, prior=prior, rng=np.random.default_rng(0))
+    refuses(StageFailure, "three images of one camera", calibrated, modulus, scene, prior, seed=6)
 
 
 @pytest.mark.parametrize(("plane", "way"), PAIRS, ids=lambda v: type(v).__name__)
@@ -145,25 +154,88 @@ def test_noise_moves_the_focal_by_little(plane, way):
 
 def test_the_same_seed_gives_the_same_bytes():
     scene = make_scene(seed=9)
-    given, prior = projective_reconstruction(scene, seed=9), prior_for(scene)
     for plane in (CheiralitySearch(), ModulusConstraint()):
-        first, second = (
-            Stratified(plane).calibrate(given, prior=prior, rng=np.random.default_rng(3)) for _ in range(2)
-        )
+        first, second = (calibrated(Stratified(plane), scene, prior_for(scene), seed=9) for _ in range(2))
         assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
 
 
-def test_copies_of_one_point_set_no_bounds():
-    scene = make_scene(seed=0)
-    X = np.tile([0.1, 0.2, 0.3, 1.0], (50, 1))
-    xh = np.einsum("vij,nj->vni", scene.P, X)
-    H = np.random.default_rng(0).normal(size=(4, 4))
-    one = reconstruction_from_cameras(
-        scene.P @ np.linalg.inv(H), sizes=scene.sizes, X=X @ H.T, xy=xh[..., :2] / xh[..., 2:],
-        stratum="projective",
-    )  # fmt: skip
-    prior, rng = prior_for(scene, NOTHING_BUT_CONSTANT), np.random.default_rng(0)
-    with pytest.raises(StageFailure, match="found no plane at infinity"):
-        Stratified(CheiralitySearch()).calibrate(one, prior=prior, rng=rng)
-    found = Stratified(ModulusConstraint()).calibrate(one, prior=prior, rng=rng)
-    np.testing.assert_allclose(found.K, scene.K, rtol=1e-6, atol=1e-3)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("plane", [CheiralitySearch(), ModulusConstraint()], ids=lambda p: type(p).__name__)
+def test_the_located_plane_leaves_an_affine_map_to_the_scene(plane, seed):
+    scene = make_scene(seed=seed)
+    config = PipelineConfig(selfcalibration=Stratified(plane), intrinsics=CENTRED)
+    affine = thesisrecon.upgrade_affine(projective_reconstruction(scene, seed=seed), config=config)
+    assert affine.stratum == "affine"
+    assert affine.valid.all()
+    np.testing.assert_allclose(affine.X[:, 3], 1.0)
+    A = np.linalg.lstsq(homogenize(scene.X), affine.X[:, :3], rcond=None)[0]
+    np.testing.assert_allclose(homogenize(scene.X) @ A, affine.X[:, :3], atol=1e-7)
+    estimated = -np.linalg.solve(affine.P[:, :, :3], affine.P[:, :, 3:])[..., 0]
+    np.testing.assert_allclose(estimated, homogenize(scene.centres) @ A, atol=1e-6)
+
+
+def test_parallels_stay_parallel_and_ratios_are_kept():
+    scene, rng = make_scene(seed=1), np.random.default_rng(0)
+    start, step, ratio = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.5, 0.4]), rng.uniform(0.2, 0.8, 50)
+    points = np.concatenate([start, start + step, start + ratio[:, None] * step, scene.X[150:]])
+    given = projective_reconstruction(replace(scene, X=points), seed=1)
+    answer = Stratified(ModulusConstraint()).calibrate(given, prior=prior_for(scene), rng=rng)
+    affine = upgrade_to_affine(given, answer.plane_at_infinity)
+    a, b, c = affine.X[:150, :3].reshape(3, 50, 3)
+    np.testing.assert_allclose(b - a, np.tile(b[0] - a[0], (50, 1)), atol=1e-6)
+    np.testing.assert_allclose(c - a, ratio[:, None] * (b - a), atol=1e-6)
+    # The projective frame keeps neither.
+    p, q = dehomogenize(given.X[:100]).reshape(2, 50, 3)
+    directions = (q - p) / np.linalg.norm(q - p, axis=1)[:, None]
+    assert np.abs(directions - directions[0]).max() > 0.01
+
+
+def test_images_stay_what_they_are_and_depths_are_positive():
+    scene = make_scene(seed=2)
+    given = projective_reconstruction(scene, seed=2)
+    affine = upgrade_to_affine(given, np.array([0.1, -0.2, 0.05, 1.0]))
+    t = scene.tracks
+    before, after = (np.einsum("kij,kj->ki", r.P[t.view_index], r.X[t.point_index]) for r in (given, affine))
+    np.testing.assert_allclose(before[:, :2] / before[:, 2:], after[:, :2] / after[:, 2:], rtol=1e-9)
+    # Outliers behind a camera do not turn it, even if they are more than the inliers.
+    away, X = np.arange(len(affine.X)) % 3 > 0, affine.X.copy()
+    X[away, :3] = -2.0 * np.linalg.solve(affine.P[0, :, :3], affine.P[0, :, 3]) - X[away, :3]
+    assert (_facing(replace(affine, X=X, inlier=~away[t.point_index]))[0] == affine.P[0]).all()
+    true = thesisrecon.upgrade_affine(given, config=PipelineConfig(intrinsics=CENTRED))
+    depth = np.einsum("kj,kj->k", true.P[t.view_index, 2], true.X[t.point_index])
+    assert (depth > 0).all()
+    # One camera is [I | 0] behind its nominal calibration, its points at a median depth of 1.
+    units = np.linalg.solve(pixel_from_unit(true.sizes), true.P)
+    units /= np.linalg.norm(units[:, 2, :3], axis=1)[:, None, None]
+    view = int(np.argmin(np.abs(units - np.eye(3, 4)).max(axis=(1, 2))))
+    np.testing.assert_allclose(units[view], np.eye(3, 4), atol=1e-9)
+    assert np.median(true.X[t.point_index[t.view_index == view], 2]) == pytest.approx(1.0)
+
+
+def test_a_plane_may_be_given_and_wrong_calls_and_hopeless_data_are_refused():
+    given = projective_reconstruction(make_scene(seed=3), seed=3)
+    plane = np.array([0.1, 0.0, -0.1, 1.0])
+    affine = upgrade_to_affine(given, plane)
+    np.testing.assert_array_equal(thesisrecon.upgrade_affine(given, plane).X, affine.X)
+    refuses(ValueError, "affine", upgrade_to_affine, affine, np.ones(4))
+    refuses(ValueError, "plane", upgrade_to_affine, given, np.zeros(4))
+    few = replace(given, registered=np.arange(8) < 2)
+    refuses(StageFailure, "at least 3", thesisrecon.upgrade_affine, few)
+    lines = PipelineConfig(selfcalibration=Stratified(ParallelLines()))
+    refuses(ValueError, "an image for each", thesisrecon.upgrade_affine, given, config=lines)
+
+
+def test_points_and_camera_centres_are_written_but_for_those_at_infinity(tmp_path):
+    affine = upgrade_to_affine(projective_reconstruction(make_scene()), np.array([0.02, -0.03, 0.01, 1.0]))
+    near = affine.valid & (np.abs(affine.X[:, :3]) < 1e3).all(axis=1)
+    P = affine.P.copy()
+    P[1, 2, :3] = P[1, 0, :3] + P[1, 1, :3]
+    P[2, 2, :3] = 0.0
+    for some, centres in ((affine, 8), (replace(affine, P=P), 6)):
+        write_affine(tmp_path / "affine.ply", some, np.full((300, 3), 77, dtype=np.uint8))
+        head, _, body = (tmp_path / "affine.ply").read_bytes().partition(b"end_header\n")
+        assert f"element vertex {near.sum() + centres}\n".encode() in head
+        vertices = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        assert (vertices["rgb"][-centres:] == [255, 0, 0]).all()
+        assert (vertices["rgb"][:-centres] == 77).all()
+        np.testing.assert_allclose(vertices["xyz"][:-centres], affine.X[near, :3], rtol=1e-5)
