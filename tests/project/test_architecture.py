@@ -37,6 +37,23 @@ def test_chapters_export_nothing():
     assert [path for path, body in code.items() if body] == []
 
 
+def test_mathematics_touches_no_file():
+    """Global randomness is refused by ruff, logging by ``lint-imports``."""
+    files = {
+        "open",
+        "read_text",
+        "read_bytes",
+        "write_text",
+        "write_bytes",
+        "savez",
+        "load",
+        "mkdir",
+        "unlink",
+    }
+    for path in (path for name in CHAPTERS for path in (PACKAGE / name).rglob("*.py")):
+        assert not {name.split(".")[-1] for name in calls(tree_of(path))} & files, path
+
+
 def test_the_page_on_the_architecture_is_up_to_date():
     """``scripts/make_architecture`` writes it."""
     assert PAGE["PAGE"].read_text(encoding="utf-8") == PAGE["page"]()
@@ -58,6 +75,12 @@ def kernels():
 
 def calls(node):
     return {ast.unparse(call.func) for call in ast.walk(node) if isinstance(call, ast.Call)}
+
+
+def test_kernels_take_few_arguments():
+    assert len(kernels()) > 100
+    given = {place: node.args for place, node, _ in kernels()}
+    assert [place for place, a in given.items() if len([*a.posonlyargs, *a.args, *a.kwonlyargs]) > 8] == []
 
 
 def test_kernels_that_reorder_sums_are_inlined_into_their_callers():
