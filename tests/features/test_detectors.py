@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 from scipy.ndimage import convolve1d, correlate1d, gaussian_filter, maximum_filter
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from scipy.special import erf
 
 from tests.conftest import refuses
@@ -19,7 +21,6 @@ from thesisrecon.features.multiscale import (
     MultiScaleCorners,
     _low_frequencies,
     _normalize_patches,
-    sample_patches,
     simulate_view,
 )
 from thesisrecon.imaging.resampling import gaussian_taps
@@ -76,15 +77,16 @@ def test_tiny_blank_and_noisy_images_do_no_harm(variant, size, kind):
         assert len(features.xy) == 0
 
 
-def test_thesis_corners_keep_their_distance_and_their_number():
-    features = with_constants(HarrisCorners, spacing_rel=0.02)(max_corners=150).detect(
-        photograph(texture(300, 400))
-    )
-    distance = np.linalg.norm(features.xy[:, None] - features.xy[None], axis=2) + 1e9 * np.eye(
-        len(features.xy)
-    )
-    assert len(features.xy) == 150
-    assert distance.min() >= 0.02 * 400
+def test_thesis_corners_keep_their_distance_their_number_and_the_strongest():
+    image = photograph(texture(300, 400))
+    xy = with_constants(HarrisCorners, spacing_rel=0.02)(max_corners=150).detect(image).xy
+    assert len(xy) == 150
+    assert pdist(xy).min() >= 0.02 * 400
+    everything = with_constants(HarrisCorners, spacing_rel=0.0)(10**6, 0.0).detect(image).xy
+    for selection in ("spacing", "spread"):
+        xy = HarrisCorners(max_corners=100, selection=selection).detect(image).xy
+        assert len(xy) == 100 < len(everything)
+        assert np.array_equal(xy[0], everything[0])
 
 
 def test_corners_that_are_spread_cover_the_image_though_one_side_is_faint():
@@ -111,21 +113,12 @@ def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width, scales
 
 def test_turned_patches_turn_with_the_photograph():
     gray = texture(301, 301, 8)
-    one = MultiScaleCorners().detect(photograph(gray)).seeds
-    two = MultiScaleCorners().detect(photograph(np.rot90(gray))).seeds
-    assert one is not None
-    assert two is not None
+    one, two = (MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray)))
     first, second = one.angle != 0, two.angle != 0
     # np.rot90 takes pixel (x, y) to (y, width - 1 - x).
-    moved = np.stack([one.xy[first, 1], 300 - one.xy[first, 0]], 1)
-    agreement = []
-    for n in range(0, len(moved), 7):
-        distance = np.linalg.norm(two.xy[second] - moved[n], axis=1) + np.abs(
-            two.scale[second] - one.scale[first][n]
-        )
-        m = int(np.argmin(distance))
-        if distance[m] < 0.2:
-            agreement.append(float(one.patches[first][n] @ two.patches[second][m]))
+    moved = np.stack([one.xy[first, 1], 300 - one.xy[first, 0], one.scale[first]], 1)[::7]
+    distance, m = cKDTree(np.column_stack([two.xy, two.scale])[second]).query(moved)
+    agreement = np.sum(one.patches[first][::7] * two.patches[second][m], axis=1)[distance < 0.2]
     assert len(agreement) > 50
     assert np.median(agreement) > 0.95
 
@@ -151,74 +144,34 @@ def test_both_formulas_find_the_same_corner_and_no_edge(formula):
     assert (response[1:] < 0.01 * response[0]).all()
 
 
-def test_a_grey_photograph_has_the_same_response_in_colour():
+def test_colour_and_surface_fits_find_more_and_nearer_corners():
+    """Red and green squares of one luminance; a grey photograph has the same response in colour."""
     image = photograph(texture(90, 110))
-    gray, colour = CornerMeasure(), CornerMeasure(colour=True)
-    one, three = gray._response(gray._channels(image)), colour._response(colour._channels(image))
-    assert colour._channels(image).shape == (3, 90, 110)
+    one, three = (m._response(m._channels(image)) for m in (CornerMeasure(), CornerMeasure(colour=True)))
     assert np.abs(one - three).max() < 1e-4 * one.max()
-
-
-def test_corners_that_only_colour_shows_are_found_in_colour():
-    """Red and green squares of one luminance."""
     board = chessboard(0.0, 0.0).rgb[:, :, 0] > 128
     rgb = np.where(board[:, :, None], np.array([200, 60, 90]), np.array([50, 136, 91])).astype(np.uint8)
     image = Image("a.png", rgb, (120, 100))
     found = {c: HarrisCorners(measure=CornerMeasure(colour=c)).detect(image) for c in (False, True)}
     assert found[False].response.max(initial=0.0) < 0.01 * found[True].response.max()
     assert np.linalg.norm(found[True].xy[0] - (60.0, 50.0)) < 3.0
-
-
-def test_without_surface_fit_corners_stay_on_pixels_and_with_it_they_are_nearer():
     error = {False: [], True: []}
-    for dx, dy in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
+    for corner in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
         for subpixel, reported in error.items():
-            measure = CornerMeasure(subpixel=subpixel)
-            xy, _ = measure._find(chessboard(dx, dy).gray[None])
+            xy, _ = CornerMeasure(subpixel=subpixel)._find(chessboard(*corner).gray[None])
             assert subpixel or not (xy % 1.0).any()
-            reported.append(np.linalg.norm(xy[0] - (60 + dx, 50 + dy)))
+            reported.append(np.linalg.norm(xy[0] - (60, 50) - corner))
     assert np.mean(error[True]) < 0.5 * np.mean(error[False])
 
 
-def brute_force_suppression(xy, response, count):
-    """The ``count`` corners that keep longest as the circle around each shrinks that no clearly stronger one
-    may enter."""
-    radius = np.full(len(xy), np.inf)
-    for i in range(len(xy)):
-        for j in range(len(xy)):
-            if 0.9 * response[j] > response[i]:
-                radius[i] = min(radius[i], float(np.hypot(*(xy[i] - xy[j]))))
-    return set(np.argsort(-radius, kind="stable")[:count].tolist())
-
-
-def test_spread_selection_is_adaptive_non_maximal_suppression():
-    rng = np.random.default_rng(5)
-    xy, response = rng.uniform(0, 300, (68, 2)), np.sort(rng.exponential(size=68))[::-1]
-    kept = select_spread(xy, response.astype(np.float32), 40)
-    assert set(kept.tolist()) == brute_force_suppression(xy, response, 40)
-    assert (np.diff(kept) > 0).all()
-
-
-@pytest.mark.parametrize("selection", ["spacing", "spread"])
-def test_each_selection_keeps_the_number_and_the_strongest(selection):
-    image = photograph(texture(300, 400))
-    features = HarrisCorners(max_corners=100, selection=selection).detect(image)
-    everything = with_constants(HarrisCorners, spacing_rel=0.0)(10**6, 0.0).detect(image)
-    assert len(features.xy) == 100 < len(everything.xy)
-    assert np.array_equal(features.xy[0], everything.xy[0])
-
-
-@pytest.mark.parametrize(
-    ("kind", "field", "value"),
-    [
+def test_a_detector_or_measure_that_cannot_be_is_refused():
+    for kind, field, value in (
         (HarrisCorners, "max_corners", 0), (HarrisCorners, "threshold_rel", 2.0),
         (HarrisCorners, "threshold_rel", np.nan), (MultiScaleCorners, "full_corners", -1),
         (MultiScaleCorners, "levels", 0), (MultiScaleCorners, "levels", 2),
         (CornerMeasure, "integration_sigma_px", 0.0),
-    ],
-)  # fmt: skip
-def test_a_detector_or_measure_that_cannot_be_is_refused(kind, field, value):
-    refuses(ValueError, field, kind, **{field: value})
+    ):  # fmt: skip
+        refuses(ValueError, field, kind, **{field: value})
 
 
 @pytest.mark.parametrize("enlargement", [1.0, 2.0])
@@ -232,24 +185,18 @@ def test_a_simulated_view_shows_each_pixel_where_it_says(enlargement):
     assert np.linalg.det(view.to_view) == pytest.approx(0.5 * enlargement**2)
 
 
-def moments_twin(channels, derivative, taps):
-    """(3, H, W): M11, M12, M22 by convolutions, summed over the channels."""
-    total = np.zeros((3, *channels.shape[1:]))
-    for channel in channels.astype(np.float64):
-        gx, gy = (correlate1d(channel, derivative, axis=axis) for axis in (1, 0))
-        for m, product in enumerate((gx * gx, gx * gy, gy * gy)):
-            total[m] += convolve1d(convolve1d(product, taps, axis=0), taps, axis=1)
-    return total
-
-
 @pytest.mark.parametrize("trace_weight", [0.0, 0.04])
 @pytest.mark.parametrize("derivative", [(-0.5, 0.0, 0.5), (0.1, -0.8, 0.0, 0.8, -0.1)])
 @pytest.mark.parametrize("count", [1, 3])
-def test_corner_response_equals_its_numpy_twin(trace_weight, derivative, count):
+def test_corner_response_is_that_of_the_moments_summed_over_the_channels(trace_weight, derivative, count):
     channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
     taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
     found = corner_response(channels, along, taps, trace_weight)
-    a, m, c = moments_twin(channels, along, taps)
+    gx, gy = (correlate1d(channels.astype(np.float64), along, axis=axis) for axis in (2, 1))
+    a, m, c = (
+        convolve1d(convolve1d(product.sum(axis=0), taps, axis=0), taps, axis=1)
+        for product in (gx * gx, gx * gy, gy * gy)
+    )
     noble = (a * c - m * m) / (a + c + 1e-6)
     twin = a * c - m * m - trace_weight * (a + c) ** 2 if trace_weight else noble
     border = len(taps) // 2 + len(along) // 2
@@ -280,23 +227,17 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
         assert np.abs(step * inside - (x - column, y - row)).max() < 1e-3
 
 
-def test_patches_are_turned_and_clamped_at_the_border():
-    row, column = np.mgrid[:80, :90].astype(np.float32)
-    image, xy = 2.0 * column + row, np.array([[40.3, 35.7], [3.0, 4.0]])
-    b, a = np.mgrid[:8, :8] - 3.5
-    for angle in (0.0, 0.7):
-        c, s = 4.0 * np.cos(angle), 4.0 * np.sin(angle)
-        found = sample_patches(image, xy, np.full(2, angle, np.float32), 8, 4.0).reshape(2, 8, 8)
-        for patch, (x, y) in zip(found, xy, strict=True):
-            u, v = np.clip(x + c * a - s * b, 0, 89), np.clip(y + s * a + c * b, 0, 79)
-            assert np.abs(patch - (2.0 * u + v)).max() < 1e-2
-    assert sample_patches(image, xy[:0], np.zeros(0, np.float32), 8, 4.0).shape == (0, 64)
-
-
-def test_selected_corners_are_apart_and_none_is_dropped_without_reason():
+def test_selected_corners_are_apart_or_spread():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
     kept = enforce_spacing(xy, np.arange(400), 6.0)
-    distance = np.linalg.norm(xy[:, None] - xy[kept][None], axis=2)
-    assert (np.sort(distance[kept], axis=1)[:, 1] >= 6.0).all()
+    assert pdist(xy[kept]).min() >= 6.0
     for dropped in np.setdiff1d(np.arange(400), kept):
-        assert (distance[dropped, kept < dropped] < 6.0).any()
+        assert np.linalg.norm(xy[kept[kept < dropped]] - xy[dropped], axis=1).min() < 6.0
+    # Corners that keep longest as the circle around each shrinks that no clearly stronger one may enter.
+    rng = np.random.default_rng(5)
+    xy, response = rng.uniform(0, 300, (68, 2)), np.sort(rng.exponential(size=68))[::-1]
+    distance = np.linalg.norm(xy[:, None] - xy[None], axis=2)
+    radius = np.where(0.9 * response[None] > response[:, None], distance, np.inf).min(axis=1)
+    kept = select_spread(xy, response.astype(np.float32), 40)
+    assert set(kept.tolist()) == set(np.argsort(-radius, kind="stable")[:40].tolist())
+    assert (np.diff(kept) > 0).all()

@@ -1,17 +1,23 @@
-"""Photographs that corners and correlation cannot relate, and odd ones that they can, by the front door."""
+"""Photographs that corners and correlation cannot relate, odd ones that they can, and many of them."""
 
 import numpy as np
+import PIL.Image
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
+from tests.conftest import refuses, same_pairs
 from tests.synthetic import disparity, photograph, sideways_fundamental, stereo_scene, texture
-from thesisrecon import match_pair
+from thesisrecon import load, match_pair, reconstruct
 from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.errors import StageFailure
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
+from thesisrecon.io._images import demo_images
+from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.strength import StrengthOfMatch
+from thesisrecon.pipeline import matching
+from thesisrecon.records import Features
 
 SHAPE = (300, 420)
 PRESETS = pytest.mark.parametrize("name", ["default", "thesis"])
@@ -37,17 +43,14 @@ def related(first, second, name):
 
 
 @PRESETS
-@pytest.mark.parametrize("level", [0, 128, 255])
-def test_a_photograph_without_texture_is_named(name, level):
-    with pytest.raises(StageFailure, match="blank"):
-        match_pair(np.full(SHAPE, level, np.uint8), stereo()[1], config=preset(name))
-
-
-@PRESETS
-def test_an_image_of_32_pixels_is_rejected_with_the_required_size(name):
+def test_photographs_that_cannot_be_matched_are_named(name):
     left, right = stereo()
-    with pytest.raises(StageFailure, match="32 x 32 pixels; the minimum is 64 x 64"):
-        match_pair(left[:32, :32].copy(), right[:32, :32].copy(), config=preset(name))
+    for error, words, images in (
+        *((StageFailure, "blank", (np.full(SHAPE, level, np.uint8), right)) for level in (0, 128, 255)),
+        (StageFailure, "32 x 32 pixels; the minimum is 64 x 64", (left[:32, :32], right[:32, :32])),
+        (ValueError, "uint8", (np.full(SHAPE, np.nan), right)),
+    ):
+        refuses(error, words, match_pair, *images, config=preset(name))
 
 
 @pytest.mark.parametrize("growth", [True, False])
@@ -127,6 +130,57 @@ def test_photographs_of_different_sizes_match():
     assert np.median(np.abs(upright.xy1[:, 0] - whole[:, 0] - disparity(whole))) < 0.1
 
 
-def test_float_arrays_are_rejected_as_images():
-    with pytest.raises(ValueError, match="uint8"):
-        match_pair(np.full(SHAPE, np.nan), stereo()[1])
+def test_the_strongest_corners_of_each_scale_and_seeds_of_each_level_are_kept():
+    features = MultiScaleCorners().detect(photograph(texture(200, 260)))
+    fewer, rows = strongest_share(features, 0.5), strongest_corners(features, 0.5)
+    assert np.array_equal(fewer.xy, features.xy[rows])
+    assert (np.diff(rows) > 0).all()
+    for scale in np.unique(features.scale):
+        every, kept = (f.response[f.scale == scale] for f in (features, fewer))
+        assert len(kept) == (len(every) + 1) // 2
+        assert kept.min() >= np.sort(every)[-len(kept)]
+    levels, kept = (
+        np.unique(np.where(s.angle == 0.0, s.scale, -s.scale), return_counts=True)[1]
+        for s in (features.seeds, fewer.seeds)
+    )
+    assert np.array_equal(kept, (levels + 1) // 2)
+    assert len(fewer.seeds.patches) == len(fewer.seeds.xy) == kept.sum()
+
+
+def test_pairs_of_many_images_have_fewer_matches_unless_all_are_needed(tmp_path, monkeypatch):
+    def pairs(name, many_images):
+        config = PipelineConfig(matching=SeedsAndGrowth(many_images=many_images))
+        result = reconstruct(
+            demo_images()[:3], tmp_path / name, config=config, max_size=480, until="matches", threads=2
+        )
+        assert same_pairs(load(tmp_path / name), result)
+        return result
+
+    every, fewer = pairs("all", 3), pairs("fewer", 2)
+    for whole, part in zip(every.pairs, fewer.pairs, strict=True):
+        assert part.accepted
+        assert 240 <= part.inliers < 0.65 * whole.inliers
+        # The numbers are those of all corners.
+        assert np.array_equal(part.xy1, every.features[part.i].xy[part.index1])
+        assert np.abs(part.xy2 - every.features[part.j].xy[part.index2]).max() < 10.0
+    for name, value in (("MIN_VERIFIED", 10**6), ("has_narrow_cut", lambda _: True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(matching, name, value)
+            again = pairs(name, 2).pairs
+        for whole, pair in zip(every.pairs, again, strict=True):
+            assert np.array_equal(whole.index1, pair.index1)
+            assert np.array_equal(whole.xy2, pair.xy2)
+
+
+def test_images_of_nothing_in_common_are_a_failure_for_any_number(tmp_path):
+    """More images than `many_images`, one of them without corners, and no accepted pair."""
+    none = np.zeros(0, np.float32)
+    assert len(strongest_share(Features(np.zeros((0, 2)), none, none), 0.5).xy) == 0
+    smooth = np.tile(np.linspace(60.0, 190.0, 128), (96, 1))
+    paths = []
+    for k, gray in enumerate([*(texture(96, 128, seed=k) for k in range(3)), smooth]):
+        paths.append(tmp_path / f"{k}.png")
+        PIL.Image.fromarray(photograph(gray).rgb).save(paths[-1])
+    config = PipelineConfig(matching=SeedsAndGrowth(many_images=2))
+    with pytest.raises(StageFailure, match="no two images could be matched"):
+        reconstruct(paths, tmp_path / "out", config=config, until="metric", threads=2)

@@ -44,10 +44,6 @@ def errors(matches):
     return np.asarray(np.linalg.norm(found, axis=1))
 
 
-def no_fundamental(xy1, xy2, rng):
-    raise StageFailure("no geometry", f"{len(xy1)} matches of {len(xy2)}, {rng}")
-
-
 @BOTH
 def test_matches_are_right_one_to_one_and_reproducible(detector, variant):
     one, two = views(detector, variant, *stereo_scene())
@@ -76,32 +72,14 @@ def test_blank_tiny_and_noisy_images_give_an_empty_result(detector, variant, siz
     images = [photograph(np.full(size, 9.0)), photograph(noise), photograph(noise[::-1])]
     prepared = views(detector, variant, *images)
     if isinstance(detector, MultiScaleCorners):
-        oblique = [
-            replace(view.features, oblique=detector.oblique_seeds(image))
-            for view, image in zip(prepared, images, strict=True)
-        ]
-        prepared += [
-            variant.prepare(image, features) for image, features in zip(images, oblique, strict=True)
-        ]
+        for view, image in zip(prepared[:], images, strict=True):
+            oblique = replace(view.features, oblique=detector.oblique_seeds(image))
+            prepared.append(variant.prepare(image, oblique))
     for one in prepared:
         matches = run(variant, one, prepared[0])
         assert len(matches.xy1) == 0
         assert matches.affine.shape == (0, 2, 2)
         run(variant, one, prepared[2])
-
-
-def test_no_fundamental_matrix_leaves_no_matches():
-    variant = SeedsAndGrowth()
-    one, two = views(MultiScaleCorners(), variant, *stereo_scene())
-    rng = np.random.default_rng(0)
-    matches = variant.match(one, two, pair=(0, 1), estimate_fundamental=no_fundamental, rng=rng)
-    assert len(matches.xy1) == 0
-
-
-def test_corners_without_seeds_are_refused():
-    variant = SeedsAndGrowth()
-    one, two = views(HarrisCorners(), variant, *stereo_scene(120, 160))
-    refuses(UsageError, r"features\.kind=multi-scale-corners", run, variant, one, two)
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
@@ -120,41 +98,39 @@ def test_seeds_find_a_photograph_that_was_turned(quarter_turns):
 
 
 def test_seeds_of_simulated_views_lead_to_matches_of_an_oblique_and_turned_photograph():
-    gray, detector, variant = (
-        texture(300, 420, 5),
-        with_constants(MultiScaleCorners, upsample_below_px=0)(),
-        SeedsAndGrowth(),
-    )
+    gray, variant = texture(300, 420, 5), SeedsAndGrowth()
+    detector = with_constants(MultiScaleCorners, upsample_below_px=0)()
     c, s = np.cos(0.6), np.sin(0.6)
     A = np.array([[c, -s], [s, c]]) @ np.diag([0.3, 0.95]) @ np.array([[c, s], [-s, c]])
     B, centre = np.linalg.inv(A), np.array([209.5, 149.5])
     fine = gaussian_filter(gray, 0.8)
     seen = affine_transform(fine, B[::-1, ::-1], (centre - B @ centre)[::-1], order=1, cval=128.0)
-    images = photograph(gray), photograph(seen)
     one, two = (
         variant.prepare(image, replace(detector.detect(image), oblique=detector.oblique_seeds(image)))
-        for image in images
+        for image in (photograph(gray), photograph(seen))
     )
+
+    def off(xy1, xy2):
+        return np.linalg.norm(xy2 - ((xy1 - centre) @ A.T + centre), axis=1)
+
     ((found, support),) = seed_matches(one.features, two.features, (0, 1), orientation="auto", ratio=0.8)
-    right = np.linalg.norm(found.xy2 - ((found.xy1 - centre) @ A.T + centre), axis=1) < 4.0
-    off = np.linalg.norm(found.affine[right] - A, axis=(1, 2))
+    right, supported = off(found.xy1, found.xy2) < 4.0, support(found) >= 2.0
     assert right.sum() > 60
-    supported = support(found) >= 2.0
     assert right[supported].mean() > 0.8 > 0.6 > right.mean()
     assert supported[right].mean() > 0.5
-    assert np.median(off) < 0.35
+    assert np.median(np.linalg.norm(found.affine[right] - A, axis=(1, 2))) < 0.35
 
     def fit(xy1, xy2, rng):
         del rng
-        near = np.linalg.norm(xy2 - ((xy1 - centre) @ A.T + centre), axis=1) < 4.0
         # Any F = [e]x H explains a plane.
         H = np.eye(3)
         H[:2, :2], H[:2, 2] = A, centre - A @ centre
-        return FundamentalFit(cross_matrix(np.array([1.0, 0.3, 0.0])) @ H, near, 0.1, np.zeros((9, 9)))
+        F = cross_matrix(np.array([1.0, 0.3, 0.0])) @ H
+        return FundamentalFit(F, off(xy1, xy2) < 4.0, 0.1, np.zeros((9, 9)))
 
     rng = np.random.default_rng(0)
     matches = variant.match(one, two, pair=(0, 1), estimate_fundamental=fit, rng=rng)
-    error = np.linalg.norm(matches.xy2 - ((matches.xy1 - centre) @ A.T + centre), axis=1)
+    error = off(matches.xy1, matches.xy2)
     assert len(error) > 60
     assert np.median(error) < 0.15
     assert (error < 1.0).mean() > 0.95
@@ -162,32 +138,35 @@ def test_seeds_of_simulated_views_lead_to_matches_of_an_oblique_and_turned_photo
 
 @pytest.fixture(scope="module")
 def stereo():
-    one, two = views(MultiScaleCorners(), SeedsAndGrowth(), *stereo_scene())
-    return one, two
+    return views(MultiScaleCorners(), SeedsAndGrowth(), *stereo_scene())
 
 
 @pytest.mark.parametrize("variant", SWITCHED, ids=repr)
 def test_every_switch_leaves_right_matches_one_to_one(stereo, variant):
-    if isinstance(variant, StrengthOfMatch):
-        one, two = views(HarrisCorners(), variant, *stereo_scene())
-    else:
-        one, two = stereo
+    strength = isinstance(variant, StrengthOfMatch)
+    one, two = views(HarrisCorners(), variant, *stereo_scene()) if strength else stereo
     matches = run(variant, one, two)
     assert len(matches.xy1) > 100
     assert (errors(matches) < 1.5).mean() > 0.9
     assert len(np.unique(matches.index1)) == len(np.unique(matches.index2)) == len(matches.index1)
-    if not variant.align:
-        assert np.array_equal(matches.xy2, two.features.xy[matches.index2])
-    else:
+    if variant.align:
         assert np.median(errors(matches)) < 0.05
         assert (errors(matches) < 0.5).mean() > 0.9
+    else:
+        assert np.array_equal(matches.xy2, two.features.xy[matches.index2])
 
 
-def test_growth_multiplies_the_matches_and_alignment_makes_them_finer(stereo):
+def test_growth_multiplies_the_matches_and_alignment_makes_them_finer_but_not_without_f(stereo):
     whole = run(SeedsAndGrowth(), *stereo)
     seeds, corners = run(SeedsAndGrowth(growth=False), *stereo), run(SeedsAndGrowth(align=False), *stereo)
     assert len(whole.xy1) > 1.5 * len(seeds.xy1)
     assert np.median(errors(corners)) > 3.0 * np.median(errors(whole))
+
+    def fails(xy1, xy2, rng):
+        raise StageFailure("no geometry", f"{len(xy1)} matches of {len(xy2)}, {rng}")
+
+    rng = np.random.default_rng(0)
+    assert len(SeedsAndGrowth().match(*stereo, pair=(0, 1), estimate_fundamental=fails, rng=rng).xy1) == 0
 
 
 def test_growth_reaches_where_f_is_uncertain(stereo):
@@ -228,16 +207,15 @@ def test_relative_difference_and_thresholds_drop_wrong_matches():
     assert wrong[2] < 0.2 * wrong[1]
 
 
-WRONG_STRENGTH = {"window": 8, "radius_rel": 0.0, "candidates": 0, "min_strength": 5.0}
-WRONG_GROWTH = {"neighbours": 0, "ratio": 0.0, "oblique_pairs": -1}
-
-
-@pytest.mark.parametrize(
-    ("kind", "wrong"), [(StrengthOfMatch, WRONG_STRENGTH), (SeedsAndGrowth, WRONG_GROWTH)]
-)
-def test_settings_that_cannot_be_are_refused(kind, wrong):
-    for field, value in wrong.items():
-        refuses(ValueError, field, kind, **{field: value})
+def test_settings_that_cannot_be_and_corners_without_seeds_are_refused():
+    for kind, wrong in (
+        (StrengthOfMatch, {"window": 8, "radius_rel": 0.0, "candidates": 0, "min_strength": 5.0}),
+        (SeedsAndGrowth, {"neighbours": 0, "ratio": 0.0, "oblique_pairs": -1}),
+    ):
+        for field, value in wrong.items():
+            refuses(ValueError, field, kind, **{field: value})
+    corners = views(HarrisCorners(), SeedsAndGrowth(), *stereo_scene(120, 160))
+    refuses(UsageError, r"features\.kind=multi-scale-corners", run, SeedsAndGrowth(), *corners)
 
 
 def test_corners_of_seeds_are_one_to_one_and_follow_the_map():

@@ -1,7 +1,7 @@
 """Pair selection: lists and windows of the user, and the estimate of the overlap."""
 
+from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -18,8 +18,8 @@ from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching import pair_selection
-from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.matching.pair_selection import (
+    FEW_VIEWS,
     AllPairs,
     ListedPairs,
     OverlapEstimate,
@@ -32,6 +32,7 @@ from thesisrecon.matching.pair_selection import (
     _ranks,
     _subset_seeds,
     pairs_to_connect,
+    reject_repeated_structure,
     word_weights,
 )
 from thesisrecon.records import Features, TwoView
@@ -54,11 +55,6 @@ def choose(selector, n, features=None, map_all=one_by_one):
 
 def as_set(pairs):
     return {(int(i), int(j)) for i, j in pairs}
-
-
-def pair_of(i, j, accepted):
-    none, xy = np.zeros(0, np.int64), np.zeros((0, 2))
-    return TwoView(i, j, np.eye(3), 1.0, none, none, xy, xy, np.zeros((0, 2, 2)), 0, 0.0, accepted)
 
 
 # ---------------------------------------------------------------- what the user can say
@@ -84,56 +80,41 @@ def test_a_window_takes_the_next_ones(n, window):
     assert looped == {(i, j) for i, j in combinations(range(n), 2) if min(j - i, n - j + i) <= window}
 
 
-def test_listed_pairs_in_any_order_and_without_those_left_out():
+def test_listed_pairs_are_taken_and_what_cannot_be_is_refused():
+    for words, listed in (
+        (r"names 'nope.jpg', which is not among the 5 images", (("00.jpg", "nope.jpg"),)),
+        (r"names 'nope.jpg' and 3 more", (("zz", "nope.jpg"), ("x", "y"))),
+        ("leaves no pair to match", ()),
+        ("images were left out", (("00.jpg", "blank.jpg"),)),
+    ):
+        refuses(UsageError, words, choose, ListedPairs(listed), 4)
+    for words, kind, options in (
+        ("pairs 'a' with itself", ListedPairs, {"listed": (("a", "a"),)}),
+        ("'b', 'a' twice", ListedPairs, {"listed": (("a", "b"), ("b", "a"))}),
+        ("window .* must be at least 1", SequenceWindow, {"window": 0}),
+        ("must be at least 1; got -3", SequenceWindow, {"window": -3}),
+        ("nearest must be at least 1", OverlapEstimate, {"nearest": 0}),
+        ("most must be at least 1", OverlapEstimate, {"most": 0}),
+    ):
+        refuses(ValueError, words, kind, **options)
+    features = [HarrisCorners(max_corners=20).detect(photograph(texture(80, 90, k))) for k in range(4)]
+    with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners, or pairs\.kind=all-pairs"):
+        choose(ESTIMATE, 4, features)
     listed = (("03.jpg", "00.jpg"), ("01.jpg", "02.jpg"), ("blank.jpg", "02.jpg"))
     assert choose(ListedPairs(listed), 4).pairs.tolist() == [[0, 3], [1, 2]]
-
-
-@pytest.mark.parametrize(
-    ("listed", "words"),
-    [
-        ((("00.jpg", "nope.jpg"),), r"names 'nope.jpg', which is not among the 5 images"),
-        ((("zz", "nope.jpg"), ("x", "y")), r"names 'nope.jpg' and 3 more"),
-        ((), "leaves no pair to match"),
-        ((("00.jpg", "blank.jpg"),), "images were left out"),
-    ],
-)
-def test_a_list_that_does_not_fit_the_photographs_is_refused(listed, words):
-    with pytest.raises(UsageError, match=words):
-        choose(ListedPairs(listed), 4)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: ListedPairs((("a", "a"),)), "pairs 'a' with itself"),
-        (lambda: ListedPairs((("a", "b"), ("b", "a"))), "'b', 'a' twice"),
-        (lambda: SequenceWindow(0), "window .* must be at least 1"),
-        (lambda: SequenceWindow(-3), "must be at least 1; got -3"),
-        (lambda: OverlapEstimate(nearest=0), "nearest must be at least 1"),
-        (lambda: OverlapEstimate(most=0), "most must be at least 1"),
-    ],
-)
-def test_meaningless_options_are_rejected(make, words):
-    refuses(ValueError, words, make)
 
 
 # ---------------------------------------------------------------- the estimate of the overlap
 
 
-@dataclass(frozen=True)
-class Windows:
-    """Windows of two walls: features, which wall, and where (left, top) px."""
+Windows = namedtuple("Windows", "features wall place")
+"""Windows of two walls: features, which wall, and where (left, top) px."""
 
-    features: list[Features]
-    wall: list[int]
-    place: np.ndarray
 
-    def shared(self, i, j):
-        """The part of a window that two of them share."""
-        if self.wall[i] != self.wall[j]:
-            return 0.0
-        return float(np.prod(np.maximum(1.0 - np.abs(self.place[i] - self.place[j]) / SIDE, 0.0)))
+def shared(windows, i, j):
+    """The part of a window that two of them share."""
+    part = np.prod(np.maximum(1.0 - np.abs(windows.place[i] - windows.place[j]) / SIDE, 0.0))
+    return float(part) * (windows.wall[i] == windows.wall[j])
 
 
 @pytest.fixture(scope="module")
@@ -148,17 +129,21 @@ def windows():
 
 
 def test_only_pairs_between_groups_are_tried_again_the_likeliest_first(windows):
-    alone, features = 0, windows.features
-    # All but one image are linked to the next of their wall, and the walls to each other.
+    def pair(i, j, accepted):
+        none, xy = np.zeros(0, np.int64), np.zeros((0, 2))
+        return TwoView(i, j, np.eye(3), 1.0, none, none, xy, xy, np.zeros((0, 2, 2)), 0, 0.0, accepted)
+
+    features = windows.features
+    # All but image 0 are linked to the next of their wall, and the walls to each other.
     linked = {(k, k + 2) for k in range(1, CROPS - 2)} | {(1, 2)}
-    pairs = [pair_of(i, j, (i, j) in linked) for i, j in combinations(range(CROPS), 2)]
+    pairs = [pair(i, j, (i, j) in linked) for i, j in combinations(range(CROPS), 2)]
     tried = pairs_to_connect(features, pairs, CROPS)
     assert sorted(tried) == list(range(CROPS - 1))
     (best,) = pairs_to_connect(features, pairs, 1)
     assert best == tried[0]
-    assert windows.wall[pairs[best].j] == windows.wall[alone]
+    assert windows.wall[pairs[best].j] == windows.wall[0]
     assert not pairs_to_connect(features, pairs, 0)
-    assert not pairs_to_connect(features, [pair_of(0, 4, True), *pairs], CROPS)
+    assert not pairs_to_connect(features, [pair(0, 4, True), *pairs], CROPS)
 
 
 ESTIMATE = with_constants(OverlapEstimate, all_up_to=2, shortlist=10, words=256)(nearest=1)
@@ -167,8 +152,8 @@ ESTIMATE = with_constants(OverlapEstimate, all_up_to=2, shortlist=10, words=256)
 def test_pairs_that_overlap_are_chosen_and_few_others(windows):
     choice = choose(ESTIMATE, CROPS, windows.features)
     chosen, every = as_set(choice.pairs), list(combinations(range(CROPS), 2))
-    much = {pair for pair in every if windows.shared(*pair) > 0.15}
-    apart = {pair for pair in every if windows.shared(*pair) == 0.0}
+    much = {pair for pair in every if shared(windows, *pair) > 0.15}
+    apart = {pair for pair in every if shared(windows, *pair) == 0.0}
     assert len(much) > 10
     assert much <= chosen
     assert len(chosen & apart) <= 0.3 * len(apart)
@@ -194,13 +179,16 @@ def test_of_many_pairs_the_best_and_some_of_the_rest_are_taken(windows, monkeypa
         assert len(chosen) <= CROPS * (most + spread) + CROPS
 
 
-def test_every_photograph_is_paired_and_all_hang_together(windows):
+def test_every_photograph_is_paired_and_all_hang_together_with_blank_ones_too(windows):
     strict = with_constants(type(ESTIMATE), min_evidence=1e9)(nearest=1)
     pairs = choose(strict, CROPS, windows.features).pairs
     assert set(pairs.ravel().tolist()) == set(range(CROPS))
     assert len(pairs) <= 2 * CROPS
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(CROPS, CROPS))
-    assert connected_components(graph, directed=False)[0] == 1
+    assert _parts(CROPS, pairs)[0] == 1
+    blank = MultiScaleCorners().detect(photograph(np.full((SIDE, SIDE), 90.0)))
+    choice = choose(ESTIMATE, CROPS, [*windows.features[:-1], blank])
+    assert CROPS - 1 in choice.pairs
+    assert len(choose(ESTIMATE, 5, [blank] * 5).pairs) >= 4
 
 
 def test_the_number_of_threads_changes_nothing(windows):
@@ -210,19 +198,6 @@ def test_the_number_of_threads_changes_nothing(windows):
 
     alone, together = (choose(ESTIMATE, CROPS, windows.features, m) for m in (one_by_one, in_threads))
     assert alone.pairs.tolist() == together.pairs.tolist()
-
-
-def test_images_without_structure_do_no_harm(windows):
-    blank = MultiScaleCorners().detect(photograph(np.full((SIDE, SIDE), 90.0)))
-    choice = choose(ESTIMATE, CROPS, [*windows.features[:-1], blank])
-    assert CROPS - 1 in choice.pairs
-    assert len(choose(ESTIMATE, 5, [blank] * 5).pairs) >= 4
-
-
-def test_features_without_seeds_are_refused_with_the_way_out():
-    features = [HarrisCorners(max_corners=20).detect(photograph(texture(80, 90, k))) for k in range(4)]
-    with pytest.raises(UsageError, match=r"features\.kind=multi-scale-corners, or pairs\.kind=all-pairs"):
-        choose(ESTIMATE, 4, features)
 
 
 def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
@@ -249,9 +224,9 @@ def test_photographs_of_one_wall_use_the_same_words(windows):
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)
     np.testing.assert_allclose(np.diag(alike), 1.0)
     pairs = list(combinations(range(CROPS), 2))
-    shared = np.array([windows.shared(i, j) for i, j in pairs])
+    common = np.array([shared(windows, i, j) for i, j in pairs])
     value = np.array([alike[i, j] for i, j in pairs])
-    assert np.median(value[shared > 0.4]) > np.quantile(value[shared == 0.0], 0.9)
+    assert np.median(value[common > 0.4]) > np.quantile(value[common == 0.0], 0.9)
 
 
 def test_views_of_places_with_the_same_windows_are_told_apart_by_the_rest():
@@ -285,13 +260,10 @@ def test_the_most_alike_of_each(n, count, seed):
         others = sorted((j for j in range(n) if j != i), key=lambda j: -alike[i, j])[:count]
         assert {(min(i, j), max(i, j)) for j in others} <= pairs
     assert len(pairs) <= n * count
-
-
-def test_the_similarities_of_many_images_are_never_in_memory_at_once(monkeypatch):
-    words = csr_array(np.random.default_rng(3).random((50, 8)))
-    whole = _most_similar(words, 5)
-    monkeypatch.setattr(pair_selection, "ROWS_AT_ONCE", 7)
-    assert _most_similar(words, 5).tolist() == whole.tolist()
+    with pytest.MonkeyPatch.context() as patch:
+        # The similarities of many images are never in memory at once.
+        patch.setattr(pair_selection, "ROWS_AT_ONCE", 2)
+        assert as_set(_most_similar(csr_array(words), count)) == pairs
 
 
 @given(st.integers(2, 9), st.integers(0, 2**31), st.floats(0.0, 1.0))
@@ -320,30 +292,6 @@ def _parts(n, pairs):
     return connected_components(graph, directed=False)
 
 
-def mutual_best_numpy(correlation, xy2, apart2):
-    best = correlation.argmax(axis=1)
-    mutual = correlation.max(axis=1) == correlation.max(axis=0)[best]
-    first = {column: row for row, column in reversed(list(enumerate(best))) if mutual[row]}
-    mutual = np.array([first.get(column) == row for row, column in enumerate(best)])
-    apart = ((xy2[None] - xy2[best][:, None]) ** 2).sum(axis=2) > apart2[best][:, None]
-    second_best = np.where(apart, correlation, -1.0).max(axis=1)
-    return np.where(mutual, best, -1), np.where(mutual, second_best, -1.0)
-
-
-@given(st.integers(1, 12), st.integers(1, 300), st.integers(0, 2**31), st.booleans())
-def test_mutual_best_is_its_numpy_twin(rows, columns, seed, equal):
-    rng = np.random.default_rng(seed)
-    correlation = rng.uniform(-1.0, 1.0, (rows, columns)).astype(np.float32)
-    if equal:
-        correlation = np.round(correlation)
-    xy2 = rng.uniform(0.0, 10.0, (columns, 2)).astype(np.float32)
-    apart2 = rng.uniform(0.0, 40.0, columns).astype(np.float32)
-    index, _, second_best = mutual_best([correlation[:3], correlation[3:]], xy2, apart2)
-    wanted, wanted_second = mutual_best_numpy(correlation, xy2, apart2)
-    assert index.tolist() == wanted.tolist()
-    np.testing.assert_array_equal(second_best, wanted_second.astype(np.float32))
-
-
 def test_matches_that_one_similarity_predicts_are_counted():
     rng = np.random.default_rng(0)
     xy1 = rng.uniform(0.0, 300.0, (9, 2))
@@ -356,3 +304,33 @@ def test_matches_that_one_similarity_predicts_are_counted():
     scale[1], angle[2] = 3.0, 1.5
     assert _count_agreeing(xy1, xy2, scale, angle, limits) == 5
     assert _count_agreeing(xy1[:1], xy2[:1], scale[:1], angle[:1], limits) == 0
+
+
+def pair(i, j, inliers, accepted=True):
+    xy = np.zeros((inliers, 2))
+    index, affine = np.zeros(inliers, np.int64), np.zeros((inliers, 2, 2))
+    return TwoView(i, j, np.eye(3), 0.1, index, index, xy, xy, affine, inliers, 0.2, accepted)
+
+
+def street(n, reach=3):
+    return [pair(i, j, 900 // (j - i)) for i in range(n) for j in range(i + 1, min(i + reach + 1, n))]
+
+
+def test_only_weak_pairs_of_far_views_that_nothing_supports_are_rejected():
+    pairs = [*street(60), pair(5, 50, 80)]
+    (last,) = [p for p in reject_repeated_structure(pairs, 60) if not p.accepted]
+    assert (last.i, last.j) == (5, 50)
+    assert last.reason.startswith("its 80 matches are few")
+    two = [p for p in street(60) if not p.i < 30 <= p.j]
+    for pairs, gone in (
+        # A loop that closes strongly stays and brings its weak pairs.
+        ([*street(60), pair(0, 59, 500), pair(1, 58, 70)], []),
+        ([*street(60), pair(5, 17, 70)], []),
+        ([*street(60), pair(5, 22, 70)], [(5, 22)]),
+        # Groups without a strong pair between them stay connected.
+        ([*two, pair(29, 31, 70)], []),
+    ):
+        assert [(p.i, p.j) for p in reject_repeated_structure(pairs, 60) if not p.accepted] == gone
+    pairs = [*street(FEW_VIEWS), pair(2, 30, 60), pair(1, 20, 0, accepted=False)]
+    assert reject_repeated_structure(pairs, FEW_VIEWS) == pairs
+    assert reject_repeated_structure([], 100) == []

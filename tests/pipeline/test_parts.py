@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import scipy
 
-from tests.matching.test_repeated_structure import pair
-from tests.matching.test_repeated_structure import street as street_pairs
+from tests.matching.test_pair_selection import pair
+from tests.matching.test_pair_selection import street as street_pairs
 from tests.metric.test_metric_refinement import centre_error
 from tests.pipeline.test_core_and_windows import street, with_repeated_windows
 from tests.synthetic import make_scene, true_pairs

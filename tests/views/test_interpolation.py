@@ -1,8 +1,8 @@
-"""View interpolation and its kernels."""
+"""View interpolation, warping and their kernels."""
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
@@ -10,8 +10,10 @@ from tests.synthetic import texture
 from thesisrecon.camera import compose_camera
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.raster import sample_texture
 from thesisrecon.records import DisparityMap
 from thesisrecon.views import interpolation as kernels
+from thesisrecon.views._warping import DIRECTIONS, fill_holes, forward_map, sample
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
     _with_all_rows,
@@ -42,9 +44,9 @@ def calibration(focal, rng):
     return np.array([[focal, rng.normal(), x], [0.0, 1.03 * focal, y], [0.0, 0.0, 1.0]])
 
 
-def points_between(H, xy1, xy2, s):
+def points_between(H, xy, s):
     """Image points of the view at s."""
-    left, right = (dehomogenize(homogenize(xy) @ side.T) for xy, side in zip((xy1, xy2), H, strict=True))
+    left, right = (dehomogenize(homogenize(one) @ side.T) for one, side in zip(xy, H, strict=True))
     return dehomogenize(homogenize((1.0 - s) * left + s * right) @ original_from_rectified(H, SIZE, s).T)
 
 
@@ -56,10 +58,9 @@ def test_interpolation_along_the_baseline_is_the_projection_of_a_parallel_camera
     centres = rng.normal(0, 0.5, (2, 3))
     # Along the image plane, in any direction within it.
     centres[1] += (R[2] @ (centres[0] - centres[1])) * R[2]
-    K = [calibration(focal, rng) for focal in (300.0, 340.0)]
-    P = [compose_camera(k, R, -R @ c) for k, c in zip(K, centres, strict=True)]
+    P = [compose_camera(calibration(f, rng), R, -R @ c) for f, c in zip((300.0, 340.0), centres, strict=True)]
     for s in SHIFTS:
-        found = points_between(np.stack([np.eye(3)] * 2), project(P[0], X), project(P[1], X), float(s))
+        found = points_between(np.stack([np.eye(3)] * 2), [project(p, X) for p in P], float(s))
         np.testing.assert_allclose(found, project((1 - s) * P[0] + s * P[1], X), atol=1e-9)
 
 
@@ -68,30 +69,18 @@ def test_turned_cameras_are_seen_from_the_baseline_up_to_a_homography_and_exactl
     rng = np.random.default_rng(200 + seed)
     X, K = cloud(rng), calibration(320.0, rng)
     centres = np.array([[-0.5, 0.1, 0.0], [0.5, -0.1, 0.1]])
-    x = centres[1] - centres[0]
-    x /= np.linalg.norm(x)
-    y = np.cross([0.0, 0.0, 1.0], x)
-    y /= np.linalg.norm(y)
-    common = np.stack([x, y, np.cross(x, y)])
+    common = np.cross([0.0, 0.0, 1.0], centres[1] - centres[0])
+    common = np.stack([centres[1] - centres[0], common, np.cross(centres[1] - centres[0], common)])
+    common /= np.linalg.norm(common, axis=1, keepdims=True)
     turns = [Rotation.from_rotvec(rng.normal(0, 0.12, 3)).as_matrix() for _ in range(2)]
-    P = [compose_camera(K, R, -R @ c) for R, c in zip(turns, centres, strict=True)]
+    xy = [project(compose_camera(K, R, -R @ c), X) for R, c in zip(turns, centres, strict=True)]
     H = np.stack([K @ common @ np.linalg.inv(K @ R) for R in turns])
-    xy = [project(p, X) for p in P]
     for s in SHIFTS:
         rectified = compose_camera(K, common, -common @ ((1 - s) * centres[0] + s * centres[1]))
         expected = project(original_from_rectified(H, SIZE, float(s)) @ rectified, X)
-        np.testing.assert_allclose(points_between(H, *xy, float(s)), expected, atol=1e-9)
+        np.testing.assert_allclose(points_between(H, xy, float(s)), expected, atol=1e-9)
     for k in (0, 1):
-        np.testing.assert_allclose(points_between(H, *xy, float(k)), xy[k], atol=1e-9)
-
-
-def test_corners_behind_a_camera_are_left_out_of_the_frame():
-    H = np.eye(3)
-    H[2, 0] = -1.0 / 100.0
-    G = original_from_rectified(np.stack([H, np.eye(3)]), SIZE, 0.0)
-    np.testing.assert_allclose(G / G[2, 2], np.linalg.inv(H) / np.linalg.inv(H)[2, 2], atol=1e-9)
-    H[2] = [0.0, 0.0, -1.0]
-    refuses(ValueError, "infinity", original_from_rectified, np.stack([H, np.eye(3)]), SIZE, 0.5)
+        np.testing.assert_allclose(points_between(H, xy, float(k)), xy[k], atol=1e-9)
 
 
 class Stage:
@@ -100,11 +89,19 @@ class Stage:
     def __init__(self):
         layers = [gaussian_filter(texture(200, 320, seed), 1.0) for seed in range(6)]
         self.wall, self.box = np.stack(layers[:3], axis=-1), np.stack(layers[3:], axis=-1)
+        (left, d0), (right, d1) = self.at(0.0), self.at(1.0)
+        self.left, self.right = (np.clip(np.rint(a), 0, 255).astype(np.uint8) for a in (left, right))
+        # Disparities of both photographs, NaN where the other one does not see the pixel.
+        self.maps = []
+        for here, there, sign in ((d0, d1, -1), (d1, d0, 1)):
+            at = np.rint(np.arange(SIZE[0]) + sign * here).astype(int)
+            other = np.take_along_axis(there, np.clip(at, 0, SIZE[0] - 1), axis=1)
+            seen = (at >= 0) & (at < SIZE[0]) & (np.abs(other - here) < 1.0)
+            self.maps.append(sure(np.where(seen, here, np.nan).astype(np.float32)))
 
     def at(self, s):
         """Colours (120, 160, 3) and disparities of the view at s."""
-        width, height = SIZE
-        y, x = np.mgrid[0:height, 0:width].astype(float)
+        y, x = np.indices(SIZE[::-1]).astype(float)
         # The wall: d = 4 + 0.02 x_0 where x_s = x_0 - s d.
         x0 = (x + 4.0 * s) / (1.0 - 0.02 * s)
         color, d = _sampled(self.wall, x0 + 60.0, y + 30.0), 4.0 + 0.02 * x0
@@ -115,11 +112,9 @@ class Stage:
         return color, d
 
 
-def _sampled(texture, x, y):
-    x0, y0 = x.astype(int), y.astype(int)
-    s, t = (x - x0)[..., None], (y - y0)[..., None]
-    top = (1 - s) * texture[y0, x0] + s * texture[y0, x0 + 1]
-    return np.asarray((1 - t) * top + t * ((1 - s) * texture[y0 + 1, x0] + s * texture[y0 + 1, x0 + 1]))
+def _sampled(image, x, y):
+    """Colours (H, W, 3) of an image at places."""
+    return np.stack([map_coordinates(image[..., k], [y, x], order=1) for k in range(3)], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -127,89 +122,49 @@ def stage():
     return Stage()
 
 
-def disparities(stage):
-    """Of both photographs, NaN where the other one does not see the pixel."""
-    found = []
-    (_, d0), (_, d1) = stage.at(0.0), stage.at(1.0)
-    x = np.arange(SIZE[0])
-    for here, there, sign in ((d0, d1, -1), (d1, d0, 1)):
-        at = np.rint(x + sign * here).astype(int)
-        inside = (at >= 0) & (at < SIZE[0])
-        other = np.take_along_axis(there, np.clip(at, 0, SIZE[0] - 1), axis=1)
-        seen = inside & (np.abs(other - here) < 1.0)
-        found.append(sure(np.where(seen, here, np.nan).astype(np.float32)))
-    return found[0], found[1]
-
-
-def photographs(stage):
-    left, right = (np.clip(np.rint(stage.at(s)[0]), 0, 255).astype(np.uint8) for s in (0.0, 1.0))
-    return left, right
-
-
 def psnr(a, b):
     return float(10 * np.log10(255.0**2 / np.mean((a.astype(float) - b) ** 2)))
 
 
 def test_views_between_are_those_of_the_scene(stage):
-    left, right = photographs(stage)
-    pair = rectified_pair(left, right, disparities(stage))
+    left, right = stage.left, stage.right
+    pair = rectified_pair(left, right, stage.maps)
     for s in (0.25, 0.5, 0.8):
-        truth = stage.at(s)[0]
+        truth, disparity = stage.at(s)
         view = pair.view(s, threads=2)
         np.testing.assert_array_equal(view, pair.view(s))
         assert view.dtype == np.uint8
-        dissolved = (1 - s) * left + s * right
-        assert psnr(view, truth) > psnr(dissolved, truth) + 8.0
+        assert psnr(view, truth) > psnr((1 - s) * left + s * right, truth) + 8.0
         # Away from the rims of the box only rounding is left.
-        off = np.abs(view - truth).max(axis=-1)
-        assert np.quantile(off, 0.9) < 3.0
+        assert np.quantile(np.abs(view - truth).max(axis=-1), 0.9) < 3.0
         colors, near = pair._seen(s)
         assert np.isnan(colors[..., 0]).mean() < 0.02
-        known = np.isfinite(near)
         # At the left border lies what only the first photograph shows, at a guessed depth.
-        assert np.quantile(np.abs(near - stage.at(s)[1])[known], 0.9) < 0.1
+        assert np.nanquantile(np.abs(near - disparity), 0.9) < 0.1
     np.testing.assert_array_equal(pair.view(0.0), left)
     np.testing.assert_array_equal(pair.view(1), right)
 
 
 def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage):
     """The same pair, its second photograph seen through a homography: between them the frame is halfway."""
-    left, right = photographs(stage)
-    maps = disparities(stage)
     H = np.stack([np.eye(3), np.array([[1.0, 0.02, 3.0], [-0.02, 1.0, -2.0], [0.0, 0.0, 1.0]])])
-    y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
-    at = np.stack([x, y, np.ones_like(x)], axis=-1) @ H[1].T
-    turned = _sampled(
-        np.pad(right, ((8, 8), (8, 8), (0, 0)), mode="edge").astype(float), *(at[..., :2] + 8).T
-    )
-    turned = np.rint(turned.swapaxes(0, 1)).astype(np.uint8)
-    pair = InterpolatedPair((left, turned), H, *maps)
-    G = original_from_rectified(H, SIZE, 0.5)
-    back = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(G).T
-    rectified = back[..., :2] / back[..., 2:]
-    truth = stage.at(0.5)[0]
+    y, x = np.indices(SIZE[::-1]).astype(float)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    padded, at = np.pad(stage.right, ((8, 8), (8, 8), (0, 0)), mode="edge").astype(float), pixels @ H[1].T + 8
+    turned = np.rint(_sampled(padded, at[..., 0], at[..., 1])).astype(np.uint8)
+    pair = InterpolatedPair((stage.left, turned), H, *stage.maps)
+    rectified = dehomogenize(pixels @ np.linalg.inv(original_from_rectified(H, SIZE, 0.5)).T)
     inside = (rectified > 2).all(axis=-1) & (rectified < np.array(SIZE) - 4.0).all(axis=-1)
-    expected = _sampled(truth, *np.clip(rectified, 0, np.array(SIZE) - 2.0).transpose(2, 0, 1))
+    expected = _sampled(stage.at(0.5)[0], rectified[..., 0], rectified[..., 1])
     off = np.abs(pair.view(0.5) - expected).max(axis=-1)[inside]
     assert inside.mean() > 0.85
     assert np.quantile(off, 0.85) < 6.0
     np.testing.assert_array_equal(pair.view(1.0), turned)
 
 
-def test_exposures_are_interpolated_too(stage):
-    left, right = photographs(stage)
-    factor = np.array([0.8, 0.7, 0.75])
-    darker = np.rint(right * factor).astype(np.uint8)
-    pair = rectified_pair(left, darker, disparities(stage))
-    np.testing.assert_allclose(pair.gain, factor, rtol=0.02)
-    view = pair.view(0.5)
-    off = np.abs(view - stage.at(0.5)[0] * np.sqrt(factor)).max(axis=-1)
-    assert np.quantile(off, 0.85) < 4.0
-
-
 def test_monotonicity_fails_with_a_thin_thing_in_front(stage):
-    assert not detect_monotonicity_violations(np.full((20, 50), 3.0, np.float32)).any()
     d = np.full((20, 50), 3.0, np.float32)
+    assert not detect_monotonicity_violations(d).any()
     d[:, 30:33] = 13.0
     violated = detect_monotonicity_violations(d)
     # Its left rim passes nine pixels and meets the tenth.
@@ -218,104 +173,76 @@ def test_monotonicity_fails_with_a_thin_thing_in_front(stage):
     slanted = (3.0 + 0.3 * np.arange(50) * np.ones((20, 1))).astype(np.float32)
     assert not detect_monotonicity_violations(slanted).any()
     # What both photographs see of a broad thing keeps its order; with what it hides it does not.
-    assert not detect_monotonicity_violations(disparities(stage)[0].disparity).any()
+    assert not detect_monotonicity_violations(stage.maps[0].disparity).any()
     assert detect_monotonicity_violations(stage.at(0.0)[1].astype(np.float32)).any()
 
 
-def test_the_right_side_follows_from_the_left(stage):
-    both = disparities(stage)
-    implied = disparity_of_right(both[0]).disparity
-    known = np.isfinite(implied) & np.isfinite(both[1].disparity)
-    assert known.mean() > 0.75
-    assert np.quantile(np.abs(implied - both[1].disparity)[known], 0.98) < 0.6
+def test_the_right_side_follows_from_the_left_and_exposures_are_interpolated(stage):
+    off = np.abs(disparity_of_right(stage.maps[0]).disparity - stage.maps[1].disparity)
+    assert np.isfinite(off).mean() > 0.75
+    assert np.nanquantile(off, 0.98) < 0.6
+    factor = np.array([0.8, 0.7, 0.75])
+    pair = rectified_pair(stage.left, np.rint(stage.right * factor).astype(np.uint8), stage.maps)
+    np.testing.assert_allclose(pair.gain, factor, rtol=0.02)
+    off = np.abs(pair.view(0.5) - stage.at(0.5)[0] * np.sqrt(factor)).max(axis=-1)
+    assert np.quantile(off, 0.85) < 4.0
 
 
-def test_a_pair_of_which_nothing_is_known_dissolves():
+def test_a_pair_of_which_nothing_is_known_dissolves_and_empty_rows_take_the_nearest():
     rng = np.random.default_rng(0)
     left, right = (rng.integers(0, 256, (20, 30, 3), dtype=np.uint8) for _ in range(2))
     nothing = sure(np.full((20, 30), np.nan, np.float32))
     view = rectified_pair(left, right, (nothing, nothing)).view(0.25)
     np.testing.assert_allclose(view, 0.75 * left + 0.25 * right, atol=0.6)
-
-
-def test_wrong_calls_are_refused():
-    image, nothing = np.zeros((20, 30, 3), np.uint8), sure(np.zeros((20, 30), np.float32))
-    pair = rectified_pair(image, image, (nothing, nothing))
-    for s in (-0.1, 1.01, np.nan):
-        refuses(ValueError, "from 0", pair.view, s)
-    refuses(ValueError, "the same size", rectified_pair, image, image[:-1], (nothing, nothing))
-    with pytest.raises(ValueError, match="the same shape"):
-        rectified_pair(image, image, (nothing, sure(np.zeros((20, 29), np.float32))))
-
-
-def field(seed, shape=(14, 23), holes=0.1):
-    rng = np.random.default_rng(seed)
-    y, x = np.mgrid[0 : shape[0], 0 : shape[1]].astype(float)
-    d = 4.0 + np.sin(x / 6.0) + 0.3 * y
-    d[4:9, 7:13] += 6.0
-    d[rng.random(shape) < holes] = np.nan
-    return d.astype(np.float32)
-
-
-def test_crossings_are_those_of_all_pairs():
-    d = field(0)
-    found = detect_monotonicity_violations(d)
-    plain = np.zeros(d.shape, dtype=bool)
-    for y, row in enumerate(d):
-        at = np.arange(len(row)) - row
-        for i in range(len(row)):
-            for j in range(i + 1, len(row)):
-                if at[i] > at[j] + 0.5:
-                    plain[y, i] = plain[y, j] = True
-    np.testing.assert_array_equal(found, plain)
-    assert 0 < plain.sum() < plain.size
-
-
-def test_empty_rows_take_the_nearest():
     d = np.arange(8.0, dtype=np.float32)[:, None] * np.ones((1, 5), np.float32)
     d[[0, 3, 4, 7]] = np.nan
     np.testing.assert_array_equal(_with_all_rows(d)[:, 0], [1, 1, 2, 2, 5, 5, 6, 6])
-    nothing = np.full((3, 4), np.nan, np.float32)
-    assert np.isnan(_with_all_rows(nothing)).all()
+    assert np.isnan(_with_all_rows(np.full((3, 4), np.nan, np.float32))).all()
 
 
-def neighbours(at, shape, reach, step=1):
-    """Index of the pixels of a picture up to ``reach`` rows and columns away."""
-    offsets = range(-reach, reach + 1, step)
-    return np.ix_(*([a + k for k in offsets if 0 <= a + k < n] for a, n in zip(at, shape, strict=True)))
+def test_corners_behind_a_camera_are_left_out_and_wrong_calls_refused():
+    image, nothing = np.zeros((20, 30, 3), np.uint8), sure(np.zeros((20, 30), np.float32))
+    narrow = sure(np.zeros((20, 29), np.float32))
+    for s in (-0.1, 1.01, np.nan):
+        refuses(ValueError, "from 0", rectified_pair(image, image, (nothing, nothing)).view, s)
+    refuses(ValueError, "the same size", rectified_pair, image, image[:-1], (nothing, nothing))
+    refuses(ValueError, "the same shape", rectified_pair, image, image, (nothing, narrow))
+    H = np.eye(3)
+    H[2, 0] = -1.0 / 100.0
+    G = original_from_rectified(np.stack([H, np.eye(3)]), SIZE, 0.0)
+    np.testing.assert_allclose(G / G[2, 2], np.linalg.inv(H) / np.linalg.inv(H)[2, 2], atol=1e-9)
+    H[2] = [0.0, 0.0, -1.0]
+    refuses(ValueError, "infinity", original_from_rectified, np.stack([H, np.eye(3)]), SIZE, 0.5)
+
+
+def test_crossings_are_those_of_all_pairs():
+    rng = np.random.default_rng(0)
+    y, x = np.indices((14, 23)).astype(float)
+    d = (4.0 + np.sin(x / 6.0) + 0.3 * y).astype(np.float32)
+    d[4:9, 7:13] += 6.0
+    d[rng.random(d.shape) < 0.1] = np.nan
+    at = x.astype(np.float32) - d
+    crossed = np.triu(at[:, :, None] > at[:, None, :] + 0.5)
+    plain = crossed.any(axis=1) | crossed.any(axis=2)
+    np.testing.assert_array_equal(detect_monotonicity_violations(d), plain)
+    assert 0 < plain.sum() < plain.size
 
 
 def test_guesses_become_medians_of_pixels_of_their_colour():
-    rng = np.random.default_rng(6)
-    shape = (20, 31)
-    d = np.where(np.arange(31) < 15, 4.0, 12.0) + rng.uniform(0, 0.3, shape)
+    rng, shape, x = np.random.default_rng(6), (20, 31), np.arange(31)
+    d = (np.where(x < 15, 4.0, 12.0) + rng.uniform(0, 0.3, shape)).astype(np.float32)
     d[rng.random(shape) < 0.1] = np.nan
-    d = d.astype(np.float32)
     sure = rng.choice([0.0, 0.7], shape).astype(np.float32)
-    levels = np.where(np.arange(31) < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
-    levels = levels.astype(np.float32)
-    out = np.empty_like(d)
-    kernels.filter_extrapolated_by_colour(levels, d, sure, (0, 9), (30.0, 0.5), out)
-    kernels.filter_extrapolated_by_colour(levels, d, sure, (9, 20), (30.0, 0.5), out)
-    for y, x in np.ndindex(shape):
-        if sure[y, x] > 0.0 or np.isnan(d[y, x]):
-            np.testing.assert_array_equal(out[y, x], d[y, x])
-            continue
-        part = neighbours((y, x), shape, kernels.REACH, kernels.STEP)
-        apart = np.abs(levels[part] - levels[y, x]).sum(axis=-1)
-        weight = np.exp(-apart / 30.0) * np.where(sure[part] > 0.0, 1.0, 0.5)
-        values, weight = d[part].ravel(), weight.ravel()
-        kept = np.isfinite(values)
-        values, weight = values[kept], weight[kept]
-        if np.ptp(np.append(values, d[y, x])) <= kernels.ONE_SURFACE_PX:
-            assert out[y, x] == d[y, x]
-            continue
-        order = np.argsort(values)
-        below = np.cumsum(weight[order])
-        assert out[y, x] == values[order][np.searchsorted(below, 0.5 * weight.sum() - 1e-9)]
-    # Between 15 and 18 the colours are those of the left surface.
-    guessed = sure[:, 15:18] == 0.0
-    assert np.median(out[:, 15:18][guessed & np.isfinite(d[:, 15:18])]) < 5.0
+    levels = np.where(x < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
+    levels, out = levels.astype(np.float32), np.empty_like(d)
+    for rows in ((0, 9), (9, 20)):
+        kernels.filter_extrapolated_by_colour(levels, d, sure, rows, (30.0, 0.5), out)
+    known = (sure > 0.0) | np.isnan(d)
+    np.testing.assert_array_equal(out[known], d[known])
+    # Guesses are depths that occur; between 15 and 18 the colours are those of the left surface.
+    assert np.isin(out[~known], d).all()
+    assert np.median(out[:, 15:18][~known[:, 15:18]]) < 5.0
+    assert (out[:, 21:][~known[:, 21:]] > 11.0).all()
 
 
 def test_two_pictures_become_one_by_the_rules():
@@ -327,24 +254,168 @@ def test_two_pictures_become_one_by_the_rules():
     sources = tuple(rng.uniform(-0.5, 8.5, (*shape, 2)).astype(np.float32) for _ in range(2))
     out = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
     kernels.blend(colors, fronts, sources, weights, (0.5, 0.015, s), out)
-    for y, x in np.ndindex(shape):
-        n, w, c = ([float(f[y, x]) for f in fronts], [], [color[y, x].astype(float) for color in colors])
-        for k in (0, 1):
-            u, v = np.clip(np.rint(sources[k][y, x]), 0, 8).astype(int)
-            w.append(float(weights[k][v, u]))
+    for at in np.ndindex(shape):
+        n, c = [float(f[at]) for f in fronts], [color[at].astype(float) for color in colors]
+        places = [tuple(np.clip(np.rint(source[at]), 0, 8).astype(int)[::-1]) for source in sources]
+        w = [float(weight[place]) for weight, place in zip(weights, places, strict=True)]
         sure = [weight > 0.015 for weight in w]
         if np.isnan(n).all():
-            assert np.isnan(out[0][y, x]).all()
-            assert np.isnan(out[1][y, x])
+            assert np.isnan([*out[0][at], out[1][at]]).all()
             continue
         if np.isnan(n).any():
             expected = c[int(np.isnan(n[0]))]
         elif abs(n[0] - n[1]) <= 0.5:
-            a, b = (1 - s) * w[0], s * w[1]
-            expected = (a * c[0] + b * c[1]) / (a + b)
+            expected = np.average(c, axis=0, weights=[(1 - s) * w[0], s * w[1]])
         elif all(sure):
             expected = c[int(np.argmax(n))]
         else:
-            expected = c[int(np.argmin(n))] if not any(sure) else c[sure.index(True)]
-        np.testing.assert_allclose(out[0][y, x], expected, rtol=1e-5)
-        assert float(out[1][y, x]) in n
+            expected = c[sure.index(True) if any(sure) else int(np.argmin(n))]
+        np.testing.assert_allclose(out[0][at], expected, rtol=1e-5)
+        assert float(out[1][at]) in n
+
+
+def forward_warp(image, target, near, **more):
+    """Levels and inverse depth of an image seen from elsewhere."""
+    source, front = forward_map(target, near, **more)
+    return sample(image, source), front
+
+
+def test_strips_include_contributions_from_far_above():
+    y, x = np.mgrid[0:14, 0:14].astype(float)
+    target = np.stack([1.4 * x, 2.8 * y], axis=-1)
+    # Every third pixel is elsewhere, so that the triangle opposite to it stands alone.
+    target[::3, ::3, 1] -= 9.0
+    near, options = (x + 0.01 * y).astype(np.float32), {"size": (20, 40), "step": 2.0}
+    whole = forward_map(target, near, **options)
+    for threads in (2, 7, 40):
+        for part, again in zip(whole, forward_map(target, near, **options, threads=threads), strict=True):
+            np.testing.assert_array_equal(again, part)
+
+
+def test_a_linear_photograph_is_moved_exactly():
+    y, x = np.mgrid[0:20, 0:30].astype(float)
+    image = np.stack([3.0 * x + 2.0 * y, 255.0 - 5.0 * x, x * 0 + 7.0], axis=-1)
+    angle = 0.1
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shift = np.array([3.3, -1.6])
+    target = np.stack([x, y], axis=-1) @ (1.1 * R).T + shift
+    rgb, near = forward_warp(image, target, np.ones((20, 30)), size=(40, 26), threads=2)
+    gy, gx = np.mgrid[0:26, 0:40].astype(float)
+    back = (np.stack([gx, gy], axis=-1) - shift) @ np.linalg.inv(1.1 * R).T
+    inside = ((back >= 0.0) & (back <= [29.0, 19.0])).all(axis=-1)
+    beyond = ((back < -0.6) | (back > [29.6, 19.6])).any(axis=-1)
+    assert inside.sum() > 300
+    expected = np.stack([3.0 * back[..., 0] + 2.0 * back[..., 1], 255.0 - 5.0 * back[..., 0]], axis=-1)
+    np.testing.assert_allclose(rgb[inside][:, :2], expected[inside], atol=1e-3)
+    np.testing.assert_allclose(rgb[inside][:, 2], 7.0, atol=1e-5)
+    np.testing.assert_array_equal(near[inside], 1.0)
+    assert np.isnan(rgb[beyond]).all()
+    assert np.isnan(near[beyond]).all()
+
+
+@pytest.mark.parametrize("zoom", [2.0, 6.0, 16.0])
+def test_enlarged_surfaces_have_no_holes_and_stay_apart(zoom):
+    y, x = np.mgrid[0:24, 0:32].astype(float)
+    near = np.where(x < 16, 1.0, 5.0)
+    # The right half is in front and has moved away from the left one.
+    target = zoom * np.stack([x - 12.0 + np.where(x < 16, 0.0, 2.0), y - 4.0], axis=-1)
+    source, front = forward_map(target, near, size=(40, 30), step=1.0)
+    at = np.arange(40) / zoom + 12.0
+    left, right = at <= 15.0, (at >= 18.0) & (at <= 33.0)
+    assert left.any()
+    for seen, places in ((left, at), (right, at - 2.0)):
+        np.testing.assert_allclose(source[..., 0][:, seen], np.tile(places[seen], (30, 1)), atol=1e-4)
+    between = (at > 15.0 + 0.51 + 0.5 / zoom) & (at < 18.0 - 0.51 - 0.5 / zoom)
+    assert np.isnan(front[:, between]).all()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_nearer_pixel_wins_in_any_order(order):
+    """A square in front of a wall; the photograph is also walked through from its other end."""
+    y, x = np.mgrid[0:24, 0:40].astype(float)
+    front = (np.abs(x - 20) <= 5) & (np.abs(y - 12) <= 6)
+    near, image = np.where(front, 8.0, 0.0), np.where(front, 200.0, 50.0)[..., None]
+    # Mirrored twice: the same orientation in the picture.
+    parts = [a[::order, ::order] for a in (image, np.stack([x + near, y], axis=-1), near)]
+    rgb, seen = forward_warp(*parts, size=(40, 24), step=1.0)
+    square = (np.abs(x - 28) <= 5) & (np.abs(y - 12) <= 6)
+    hole = front & ~square & (x <= 22)
+    np.testing.assert_array_equal(seen[square], 8.0)
+    np.testing.assert_allclose(rgb[square], 200.0, atol=1e-3)
+    assert np.isnan(rgb[hole & (x > 15) & (x < 22)]).all()
+    filled = fill_holes(rgb, seen, step=1.0)
+    # The cubic kernel rings beside the edge.
+    np.testing.assert_allclose(filled[hole], 50.0, atol=15.0)
+    assert np.isfinite(filled).all()
+
+
+def test_holes_take_the_mean_of_the_background():
+    rng = np.random.default_rng(3)
+    near = rng.choice([1.0, 1.2, 2.4, 3.0, 5.0, np.nan, np.nan], (14, 17)).astype(np.float32)
+    rgb = rng.uniform(0, 255, (14, 17, 3)).astype(np.float32)
+    rgb[np.isnan(near)] = np.nan
+    filled = fill_holes(rgb, near, step=0.5)
+    np.testing.assert_array_equal(filled[~np.isnan(near)], rgb[~np.isnan(near)])
+    for hole in np.argwhere(np.isnan(near)):
+        # The first pixel that is seen in each direction.
+        ways = [[tuple(hole + n * np.array(d)) for n in range(1, 18)] for d in DIRECTIONS]
+        ways = [
+            [at for at in way if 0 <= at[0] < 14 and 0 <= at[1] < 17 and near[at] == near[at]] for way in ways
+        ]
+        first = [way[0] for way in ways if way]
+        z, color = np.array([near[at] for at in first]), np.array([rgb[at] for at in first])
+        if not first:
+            assert np.isnan(filled[tuple(hole)]).all()
+            continue
+        kept = z <= z.min() + max(0.5, 0.4 * np.ptp(z))
+        weight = 1.0 / np.sum((np.array(first) - hole) ** 2, axis=1)
+        mean = np.average(color[kept], axis=0, weights=weight[kept])
+        np.testing.assert_allclose(filled[tuple(hole)], mean, rtol=1e-5)
+
+
+def test_samples_are_cubic_within_and_linear_at_the_border():
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[0:12, 0:15].astype(float)
+    image = np.stack([x * x - x * y, rng.uniform(0, 255, x.shape)], axis=-1).astype(np.float32)
+    at = rng.uniform(1.0, 9.9, (20, 30, 2)).astype(np.float32)
+    found = sample(image, at, threads=2)
+    # Cubic convolution has the quadratics right.
+    u, v = at[..., 0].astype(float), at[..., 1].astype(float)
+    np.testing.assert_allclose(found[..., 0], u * u - u * v, atol=2e-3)
+    whole = np.stack([x, y], axis=-1).astype(np.float32)
+    np.testing.assert_allclose(sample(image, whole), image, rtol=1e-6, atol=1e-5)
+    edge = np.array([[[-0.4, 3.0], [14.5, 11.5], [0.25, 0.0], [-0.6, 3.0], [np.nan, 1.0]]], dtype=np.float32)
+    seen = sample(image, edge)[0, :, 1]
+    linear = 0.75 * image[0, 0, 1] + 0.25 * image[0, 1, 1]
+    np.testing.assert_allclose(seen[:3], [image[3, 0, 1], image[11, 14, 1], linear], rtol=1e-5)
+    assert np.isnan(seen[3:]).all()
+    image[5, 5] = np.nan
+    holed = sample(image, np.array([[[4.5, 4.5], [3.5, 4.5], [9.5, 9.5]]], dtype=np.float32))[0, :, 1]
+    assert np.isnan(holed[0])
+    mean = image[4:6, 3:5, 1].mean()
+    assert holed[1] == pytest.approx(mean, rel=1e-5)
+    assert np.isfinite(holed[2])
+
+
+def test_a_single_pixel_and_nothing_at_all():
+    near = np.array([[1.0]])
+    rgb, seen = forward_warp(np.full((1, 1, 3), 9.0), np.array([[[2.2, 1.1]]]), near, size=(4, 3))
+    assert np.isfinite(seen).sum() == 1
+    np.testing.assert_allclose(rgb[1, 2], 9.0)
+    rgb, seen = forward_warp(np.full((1, 1, 3), 9.0), np.array([[[2.2, 1.1]]]), near * np.nan, size=(4, 3))
+    assert np.isnan(seen).all()
+    assert np.isnan(fill_holes(rgb, seen, step=0.0)).all()
+
+
+def test_bytes_and_floats_of_a_texture_are_sampled_alike():
+    rng = np.random.default_rng(4)
+    texture = rng.integers(0, 256, (9, 7, 3), dtype=np.uint8)
+    uv = rng.uniform(-2, 10, (20, 30, 2)).astype(np.float32)
+    drawn, seen = rng.integers(-1, 3, (20, 30)), np.zeros((2, 20, 30, 3), dtype=np.float32)
+    sample_texture(texture, uv, drawn, seen[0])
+    sample_texture(texture.astype(np.float32), uv, drawn, seen[1])
+    np.testing.assert_array_equal(*seen)
+    at = [uv[..., 1], uv[..., 0]]
+    plain = [map_coordinates(texture[..., k].astype(float), at, order=1, mode="nearest") for k in range(3)]
+    plain = np.where(drawn[..., None] < 0, 0.0, np.stack(plain, axis=-1))
+    np.testing.assert_allclose(seen[0], plain, atol=1e-2)

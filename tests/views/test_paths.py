@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from tests.surface.sphere import K, looking_at_origin
 from thesisrecon.camera import Camera
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.records import TexturedMesh
 from thesisrecon.views import paths
 
@@ -35,13 +36,13 @@ def moved(cameras, turn, shift):
     return [Camera(c.K, c.R @ turn.T, c.t - c.R @ turn.T @ shift, c.size) for c in cameras]
 
 
+def turns_of(path):
+    """Angles (rad) between neighbouring cameras."""
+    return [Rotation.from_matrix(b.R @ a.R.T).magnitude() for a, b in pairwise(path)]
+
+
 def centres_of(path):
     return np.array([camera.centre for camera in path])
-
-
-def project(camera, X):
-    x = camera.K @ (camera.R @ X + camera.t)
-    return np.asarray(x[:2] / x[2])
 
 
 def test_all_round_the_scene_the_orbit_is_a_circle_at_constant_speed():
@@ -70,7 +71,7 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     weighted = paths.TILT_WEIGHT * axis.T @ axis
     rolled = np.linalg.norm(weighted @ UP) / np.linalg.eigvalsh(rows.T @ rows + weighted)[1]
     for camera in path:
-        np.testing.assert_allclose(project(camera, middle), [79.5, 59.5], atol=1e-6)
+        np.testing.assert_allclose(project(camera.P, middle[None])[0], [79.5, 59.5], atol=1e-6)
         assert abs(camera.R[0] @ up) < rolled + 1e-9
         assert -camera.R[1] @ up > 0.1
         assert np.linalg.norm(camera.centre - shift) > 1.2
@@ -80,12 +81,9 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
 
 
 def test_an_orbit_of_one_side_stays_on_that_side_and_closes():
-    angles = np.radians([-50.0, -20.0, 5.0, 45.0])
-    path = paths.orbit(ring(angles), ball(), 61)
-    centres = centres_of(path)
+    centres = centres_of(paths.orbit(ring(np.radians([-50.0, -20.0, 5.0, 45.0])), ball(), 61))
     seen = np.degrees(np.arctan2(centres[:, 0], -centres[:, 2]))
-    assert seen.min() == pytest.approx(-50.0, abs=2.0)
-    assert seen.max() == pytest.approx(45.0, abs=2.0)
+    np.testing.assert_allclose([seen.min(), seen.max()], [-50.0, 45.0], atol=2.0)
     steps = np.linalg.norm(np.roll(centres, -1, axis=0) - centres, axis=1)
     assert steps[-1] < 1.1 * steps.max()
 
@@ -96,16 +94,23 @@ def test_an_orbit_avoids_obstacles_and_shows_the_model():
     cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
     for camera in paths.orbit(cameras, wall, 36):
         assert cKDTree(wall).query(camera.centre)[0] > 0.5
-        inside = np.array([project(camera, X) for X in wall[::50]])
-        front = (camera.R @ wall[::50].T + camera.t[:, None])[2] > 0
-        shown = front & (inside > -0.5).all(axis=1) & (inside < np.array(SIZE) - 0.5).all(axis=1)
+        xy, front = project(camera.P, wall[::50]), (camera.R @ wall[::50].T + camera.t[:, None])[2] > 0
+        shown = front & ((xy > -0.5) & (xy < np.array(SIZE) - 0.5)).all(axis=1)
         assert shown.mean() > 0.4
 
 
-def test_far_points_and_points_without_a_number_do_not_move_the_middle():
+def test_far_points_do_not_move_the_middle_and_points_lie_on_the_surface():
     X = np.vstack([ball(), np.full((300, 3), 500.0), np.full((5, 3), np.nan)])
-    path = paths.orbit(ring(np.linspace(0, 6, 9)), X, 5)
-    assert max(np.abs(project(camera, np.zeros(3)) - [79.5, 59.5]).max() for camera in path) < 25
+    for camera in paths.orbit(ring(np.linspace(0, 6, 9)), X, 5):
+        assert np.abs(project(camera.P, np.zeros((1, 3))) - [79.5, 59.5]).max() < 25
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
+    mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
+    X = paths.sample_surface(mesh, 1000)
+    small = X[:, 0] < 2
+    assert small.mean() == pytest.approx(0.1, abs=0.005)
+    assert (X[small, :2].sum(axis=1) <= 1.0 + 1e-12).all()
+    np.testing.assert_allclose(X[small].mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.02)
+    assert len(paths.sample_surface(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7])
@@ -121,19 +126,14 @@ def test_one_camera_swings_a_little(frames):
 
 def test_cameras_in_the_middle_that_look_away_see_their_surroundings():
     """Photographs from the middle of a room, outwards."""
-    room = 5.0 * ball()
     away = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 5, 7), 0.0)]
-    for camera in paths.orbit(away, room, 10):
+    for camera in paths.orbit(away, 5.0 * ball(), 10):
         assert 0.1 < np.linalg.norm(camera.centre) < 2.5
         assert abs(camera.R[0] @ UP) < 1e-6
-    behind = [
-        Camera(c.K, np.diag([-1.0, 1, -1]) @ c.R, np.diag([-1.0, 1, -1]) @ c.t, SIZE)
-        for c in ring(np.zeros(3))
-    ]
+    about = np.diag([-1.0, 1, -1])
+    behind = [Camera(c.K, about @ c.R, about @ c.t, SIZE) for c in ring(np.zeros(3))]
     for camera in paths.orbit(behind, ball(), 4):
-        np.testing.assert_allclose(
-            camera.R @ np.zeros(3) + camera.t, [0, 0, 1] @ np.diag([0, 0, np.linalg.norm(camera.t)]), atol=0.2
-        )
+        np.testing.assert_allclose(camera.t, [0, 0, np.linalg.norm(camera.t)], atol=0.2)
 
 
 def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled():
@@ -145,14 +145,11 @@ def test_up_is_that_of_the_scene_though_cameras_are_tilted_and_rolled():
     assert np.degrees(np.arccos(paths.estimate_up(cameras) @ UP)) < 4.0
     (one,) = ring(np.array([0.7]))
     np.testing.assert_allclose(paths.estimate_up([one]), -one.R[1], atol=1e-9)
-
-
-def test_of_cameras_that_look_straight_down_up_is_behind_them():
+    # Of cameras that look straight down it is behind them.
     down = []
-    for k in range(8):
-        a = 2 * np.pi * k / 8
-        R = np.array([[np.cos(a), 0, np.sin(a)], [np.sin(a), 0, -np.cos(a)], [0, 1.0, 0]])
-        down.append(Camera(K, R, -R @ np.array([0.5 * np.cos(a), -4.0, 0.5 * np.sin(a)]), SIZE))
+    for c, s in ((np.cos(a), np.sin(a)) for a in 2 * np.pi * np.arange(8) / 8):
+        R = np.array([[c, 0, s], [s, 0, -c], [0, 1.0, 0]])
+        down.append(Camera(K, R, -R @ np.array([0.5 * c, -4.0, 0.5 * s]), SIZE))
     np.testing.assert_allclose(paths.estimate_up(down), UP, atol=1e-9)
     assert all(camera.centre[1] < -3.0 for camera in paths.orbit(down, ball(), 6))
 
@@ -183,16 +180,11 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
 
 def test_turning_on_the_spot_takes_its_time():
     still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
-    path = paths.interpolate_cameras(still, 31)
-    turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
-    np.testing.assert_allclose(turns, 1.0 / 30, rtol=1e-6)
+    np.testing.assert_allclose(turns_of(paths.interpolate_cameras(still, 31)), 1.0 / 30, rtol=1e-6)
     # Half a turn at one place of a way: no frame jumps.
     far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
-    path = paths.interpolate_cameras(
-        [*far[:2], Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE), *far[2:]], 100
-    )
-    turns = [(Rotation.from_matrix(b.R @ a.R.T)).magnitude() for a, b in pairwise(path)]
-    assert max(turns) < 0.25
+    turned = Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE)
+    assert max(turns_of(paths.interpolate_cameras([*far[:2], turned, *far[2:]], 100))) < 0.25
 
 
 def test_coincident_cameras_and_one_camera_stand_still():
@@ -208,31 +200,16 @@ def test_coincident_cameras_and_one_camera_stand_still():
 
 
 def test_other_shapes_of_pictures_show_all_that_the_camera_saw():
-    camera = ring(np.array([0.3]))[0]
+    (camera,) = ring(np.array([0.3]))
+    corners = np.array([[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]])
     for size in ((320, 240), (400, 100), (30, 90)):
-        other = paths._fit_to_size(camera, size)
-        rays = np.linalg.inv(camera.K) @ np.array(
-            [[-0.5, 159.5, -0.5, 159.5], [-0.5, -0.5, 119.5, 119.5], [1, 1, 1, 1]]
-        )
-        x = other.K @ rays
-        assert (x[:2] > -0.5 - 1e-9).all()
-        assert (x[:2].T - size < -0.5 + 1e-9).all()
-        assert min(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) <= 1.0 + 1e-9
-        assert max(np.ptp(x[0]) / size[0], np.ptp(x[1]) / size[1]) == pytest.approx(1.0)
+        x = (paths._fit_to_size(camera, size).K @ np.linalg.inv(camera.K) @ corners)[:2]
+        assert (x > -0.5 - 1e-9).all()
+        assert (x.T - size < -0.5 + 1e-9).all()
+        assert (np.ptp(x, axis=1) / size).max() == pytest.approx(1.0)
     turned = Camera(K, camera.R, camera.t, (120, 160))
     assert {frame.size for frame in paths.interpolate_cameras([camera, turned], 5)} == {SIZE}
     assert {frame.size for frame in paths.orbit([camera, turned], ball(), 5, size=(70, 50))} == {(70, 50)}
-
-
-def test_points_lie_on_the_surface_by_its_area():
-    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0], [5, 3, 0], [8, 0, 0]])
-    mesh = TexturedMesh(vertices, np.array([[0, 1, 2], [3, 4, 5], [0, 0, 1]]))
-    X = paths.sample_surface(mesh, 1000)
-    small = X[:, 0] < 2
-    assert small.mean() == pytest.approx(0.1, abs=0.005)
-    assert (X[small, :2].sum(axis=1) <= 1.0 + 1e-12).all()
-    np.testing.assert_allclose(X[small].mean(axis=0), [1 / 3, 1 / 3, 0], atol=0.02)
-    assert len(paths.sample_surface(TexturedMesh(vertices, np.array([[0, 0, 1]])))) == 0
 
 
 def test_wrong_calls_are_refused():
@@ -240,6 +217,6 @@ def test_wrong_calls_are_refused():
     for path in (lambda c, n: paths.orbit(c, ball(), n), paths.interpolate_cameras):
         refuses(ValueError, "at least one camera", path, [], 5)
         refuses(ValueError, "at least one frame; got 0", path, cameras, 0)
-    refuses(ValueError, "none that is finite", paths.orbit, cameras, np.full((4, 3), np.nan), 5)
-    with pytest.raises(ValueError, match="all points and cameras coincide"):
-        paths.orbit(cameras, np.tile(cameras[0].centre, (4, 1)), 5)
+    nothing, here = np.full((4, 3), np.nan), np.tile(cameras[0].centre, (4, 1))
+    refuses(ValueError, "none that is finite", paths.orbit, cameras, nothing, 5)
+    refuses(ValueError, "all points and cameras coincide", paths.orbit, cameras, here, 5)

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import binary_erosion
 
 from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, photograph, sphere_map
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import RenderedView, TexturedMesh
 from thesisrecon.surface._mesh import surface_from_depth
@@ -33,29 +35,37 @@ K = np.array([[60.0, 0.0, 31.3], [0.0, 62.0, 22.7], [0.0, 0.0, 1.0]])
 SIZE = (64, 48)
 
 
+CAMERA = Camera(K, np.eye(3), np.zeros(3), SIZE)
+
+
+def corners(width, height):
+    """The corners (4, 2) of a picture."""
+    return np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+
+
 def wall(**more):
     """A wall at depth 2 that fills the picture, its corners at the picture's."""
-    corners = homogenize(np.array([[-0.5, -0.5], [63.5, -0.5], [63.5, 47.5], [-0.5, 47.5]]))
-    vertices = 2.0 * corners @ np.linalg.inv(K).T
+    vertices = 2.0 * homogenize(corners(64, 48)) @ np.linalg.inv(K).T
     return TexturedMesh(vertices, np.array([[0, 2, 1], [0, 3, 2]]), **more)
 
 
-def test_a_texture_is_shown_texel_for_pixel():
+def textured_wall(texture):
+    return wall(texture=texture, uv=corners(*texture.shape[1::-1])[np.array([[0, 2, 1], [0, 3, 2]])])
+
+
+def test_a_texture_is_shown_texel_for_pixel_a_finer_one_averaged_and_colours_run_between_corners():
     texture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-    corner = np.array([[-0.5, -0.5], [63.5, -0.5], [63.5, 47.5], [-0.5, 47.5]])
-    mesh = wall(texture=texture, uv=corner[np.array([[0, 2, 1], [0, 3, 2]])])
-    seen = render(mesh, Camera(K, np.eye(3), np.zeros(3), SIZE), samples=1)
+    seen = render(textured_wall(texture), CAMERA, samples=1)
     assert seen.valid.all()
     np.testing.assert_allclose(seen.depth, 2.0, rtol=1e-6)
     assert np.abs(seen.color.astype(int) - texture).max() <= 1
-
-
-def test_a_finer_picture_is_averaged():
     board = (np.indices((96, 128)).sum(axis=0) % 2 * 255).astype(np.uint8)
-    corner = np.array([[-0.5, -0.5], [127.5, -0.5], [127.5, 95.5], [-0.5, 95.5]])
-    mesh = wall(texture=np.repeat(board[..., None], 3, axis=2), uv=corner[np.array([[0, 2, 1], [0, 3, 2]])])
-    seen = render(mesh, Camera(K, np.eye(3), np.zeros(3), SIZE), samples=2)
+    seen = render(textured_wall(np.repeat(board[..., None], 3, axis=2)), CAMERA, samples=2)
     assert np.abs(seen.color.astype(int) - 128).max() <= 2
+    colors = np.array([[0, 0, 0], [255, 0, 0], [255, 255, 0], [0, 255, 0]], dtype=np.uint8)
+    seen = render(wall(colors=colors), CAMERA).color.astype(float)
+    assert np.abs(seen[20, :, 0] - (np.arange(64) + 0.5) / 64 * 255).max() < 1.0
+    assert (seen[..., 2] == 0).all()
 
 
 @pytest.mark.parametrize("samples", [1, 2])
@@ -78,53 +88,37 @@ def test_an_image_is_rasterised_in_parts_without_effect_on_it(monkeypatch, sampl
     assert peak < 12 * 1280 * 960
 
 
-def test_vertex_colours_run_from_corner_to_corner():
-    colors = np.array([[0, 0, 0], [255, 0, 0], [255, 255, 0], [0, 255, 0]], dtype=np.uint8)
-    seen = render(wall(colors=colors), Camera(K, np.eye(3), np.zeros(3), SIZE)).color.astype(float)
-    x = (np.arange(64) + 0.5) / 64 * 255
-    assert np.abs(seen[20, :, 0] - x).max() < 1.0
-    assert (seen[..., 2] == 0).all()
-
-
 def test_light_falls_by_the_cosine():
-    camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
+    def brightness(ambient, *lights):
+        shading = Shading(ambient=ambient, lights=lights)
+        return render(wall(), CAMERA, shading=shading).color[:, :, 0].astype(float)
 
-    def brightness(**shading):
-        return render(wall(), camera, shading=Shading(**shading)).color[:, :, 0].astype(float)
-
-    assert np.abs(brightness(ambient=0.5) - 100).max() <= 1
-    slanted = Light(direction=(0.0, np.sqrt(3.0), -1.0))
-    assert np.abs(brightness(ambient=0.0, lights=(slanted,)) - 100).max() <= 1
-    behind = Light(direction=(0.0, 0.0, 1.0))
-    assert brightness(ambient=0.0, lights=(behind,)).max() == 0.0
-    lamp = brightness(ambient=0.0, lights=(Light(position=(0.0, 0.0, 0.0)),))
+    assert np.abs(brightness(0.5) - 100).max() <= 1
+    assert np.abs(brightness(0.0, Light(direction=(0.0, np.sqrt(3.0), -1.0))) - 100).max() <= 1
+    assert brightness(0.0, Light(direction=(0.0, 0.0, 1.0))).max() == 0.0
+    lamp = brightness(0.0, Light(position=(0.0, 0.0, 0.0)))
     assert lamp[23, 31] == lamp.max() == 200
     assert lamp[0, 0] < 180
 
 
-def test_a_run_without_a_surface_has_nothing_to_render():
-    with pytest.raises(ValueError, match="a run until 'metric' has no mesh"):
-        render(None, Camera(np.eye(3), np.eye(3), np.zeros(3), (20, 20)))
-
-
 def test_nothing_is_seen_where_nothing_is():
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
-    seen = render(empty, camera, background=(1, 2, 3))
+    seen = render(empty, CAMERA, background=(1, 2, 3))
     assert not seen.valid.any()
     assert np.isnan(seen.depth).all()
     assert (seen.color == [1, 2, 3]).all()
     away = Camera(K, np.diag([-1.0, 1.0, -1.0]), np.zeros(3), SIZE)
     assert not render(wall(), away).valid.any()
     needle = TexturedMesh(np.array([[0.0, 0, 2], [1, 0, 2], [2, 0, 2]]), np.array([[0, 1, 2], [0, 0, 1]]))
-    assert render(needle, camera).valid.sum() <= 64
+    assert render(needle, CAMERA).valid.sum() <= 64
+    # A shape alone is grey.
+    assert (render(wall(), CAMERA).color == 200).all()
 
 
 @pytest.mark.parametrize("far", [1e9, np.inf, np.nan])
 def test_vertices_that_no_face_uses_have_no_effect(far):
-    camera, plain = Camera(K, np.eye(3), np.zeros(3), SIZE), wall()
-    more = replace(plain, vertices=np.vstack([plain.vertices, [[0.0, 0.0, far]]]))
-    np.testing.assert_array_equal(render(more, camera).depth, render(plain, camera).depth)
+    more = replace(wall(), vertices=np.vstack([wall().vertices, [[0.0, 0.0, far]]]))
+    np.testing.assert_array_equal(render(more, CAMERA).depth, render(wall(), CAMERA).depth)
 
 
 def test_light_does_not_depend_on_the_origin():
@@ -133,13 +127,10 @@ def test_light_does_not_depend_on_the_origin():
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-2.0, 2.0, size)]))
     vertices = np.column_stack([x, y, 4.0 + 0.3 * np.sin(3.0 * x)])
     at = np.arange(size * size).reshape(size, size)
-    corners = at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]
-    faces = np.concatenate(
-        [np.stack([corners[k].ravel() for k in face], 1) for face in ((0, 2, 1), (0, 3, 2))]
-    )
-    origin, lamp = np.array([5e5, 5e6, 100.0]), np.array([0.2, -0.3, 0.5])
-    seen = []
-    for shift in (np.zeros(3), origin):
+    a, b, c, d = (q.ravel() for q in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    lamp, seen = np.array([0.2, -0.3, 0.5]), []
+    for shift in (np.zeros(3), np.array([5e5, 5e6, 100.0])):
         camera = Camera(K, np.eye(3), -shift, SIZE)
         shading = Shading(ambient=0.2, lights=(Light(position=tuple(lamp + shift)),))
         seen.append(render(TexturedMesh(vertices + shift, faces), camera, shading=shading).color.astype(int))
@@ -147,22 +138,19 @@ def test_light_does_not_depend_on_the_origin():
     assert np.abs(seen[0] - seen[1]).max() <= 1
 
 
-def test_a_shape_alone_is_grey():
-    assert (render(wall(), Camera(K, np.eye(3), np.zeros(3), SIZE)).color == 200).all()
-
-
 def test_wrong_calls_are_refused():
-    camera = Camera(K, np.eye(3), np.zeros(3), SIZE)
-    refuses(ValueError, "at least one sample", render, wall(), camera, samples=0)
-    with pytest.raises(ValueError, match="vertices that do not exist"):
-        render(TexturedMesh(np.zeros((2, 3)), np.array([[0, 1, 2]])), camera)
-    with pytest.raises(ValueError, match="uv must be"):
-        render(wall(uv=np.zeros((1, 3, 2)), texture=np.zeros((2, 2, 3), np.uint8)), camera)
-    refuses(ValueError, "colors must be", render, wall(colors=np.zeros((1, 3), np.uint8)), camera)
-    hole = replace(wall(), vertices=np.where(np.arange(4)[:, None] == 2, np.nan, wall().vertices))
-    refuses(ValueError, "vertices of faces must be finite", render, hole, camera)
-    texture = {"texture": np.zeros((2, 2, 3), np.uint8)}
-    refuses(ValueError, "uv must be finite", render, wall(uv=np.full((2, 3, 2), np.nan), **texture), camera)
+    texture, uv = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 3, 2))
+    hole = np.where(np.arange(4)[:, None] == 2, np.nan, wall().vertices)
+    for words, mesh in (
+        ("a run until 'metric' has no mesh", None),
+        ("vertices that do not exist", TexturedMesh(np.zeros((2, 3)), np.array([[0, 1, 2]]))),
+        ("uv must be", wall(uv=uv[:1], texture=texture)),
+        ("colors must be", wall(colors=np.zeros((1, 3), np.uint8))),
+        ("vertices of faces must be finite", replace(wall(), vertices=hole)),
+        ("uv must be finite", wall(uv=np.full_like(uv, np.nan), texture=texture)),
+    ):
+        refuses(ValueError, words, render, mesh, CAMERA)
+    refuses(ValueError, "at least one sample", render, wall(), CAMERA, samples=0)
     refuses(ValueError, "either a direction or a position", Light)
 
 
@@ -172,8 +160,8 @@ SPHERE_SIZE = (160, 120)
 def textured_surface(depth_map):
     """The surface of a depth map with each pixel's place in the photograph as its place in the texture."""
     mesh = surface_from_depth(depth_map)
-    xyz = np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]) @ depth_map.P.T
-    return replace(mesh, uv=(xyz[:, :2] / xyz[:, 2:])[mesh.faces], texture=photograph(depth_map).rgb)
+    uv = project(depth_map.P, mesh.vertices)[mesh.faces]
+    return replace(mesh, uv=uv, texture=photograph(depth_map).rgb)
 
 
 @settings(max_examples=15, deadline=None)
@@ -197,55 +185,38 @@ def pictures():
     return real.round().astype(np.uint8), (real + rng.normal(0, 12, real.shape)).round().astype(np.uint8)
 
 
-def test_psnr_is_that_of_its_formula():
+def test_ssim_is_that_of_its_windows():
+    real, noisy = pictures()
+    y, x = 17, 21
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    window = np.outer(taps, taps) / taps.sum() ** 2
+    pair = np.stack([(image @ GREY)[y - 5 : y + 6, x - 5 : x + 6].ravel() for image in (real, noisy)])
+    mean = pair @ window.ravel()
+    (spread, common), (_, other) = np.cov(pair, aweights=window.ravel(), ddof=0)
+    c1, c2 = 2.55**2, 7.65**2
+    value = (2 * mean.prod() + c1) / (mean @ mean + c1) * (2 * common + c2) / (spread + other + c2)
+    everything = np.ones(real.shape[:2], bool)
+    assert _ssim_map(real, noisy, everything)[y, x] == pytest.approx(value, abs=1e-3)
+    assert ssim(real, real, everything) == pytest.approx(1.0)
+    assert 0.3 < ssim(real, noisy, everything) < 0.95
+    # Pixels that are not compared take no part.
+    mask = np.hypot(*(np.indices((40, 50)) - np.array([y, x])[:, None, None])) < 9
+    spoiled = np.where(mask[..., None], noisy, 0).astype(np.uint8)
+    assert ssim(real, spoiled, mask) == pytest.approx(ssim(real, noisy, mask))
+
+
+def test_psnr_is_that_of_its_formula_and_exposure_is_made_alike():
     real, noisy = pictures()
     mask = np.zeros((40, 50), bool)
     mask[5:20, 3:40] = True
     wanted = 10 * np.log10(255**2 / np.mean((real[mask].astype(float) - noisy[mask]) ** 2))
     assert psnr_db(real, noisy, mask) == pytest.approx(wanted)
     assert psnr_db(real, real, mask) == float("inf")
-
-
-def test_ssim_is_that_of_its_windows():
-    real, noisy = pictures()
-    a, b = real @ GREY, noisy @ GREY
-    y, x = 17, 21
-    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
-    w = np.outer(taps, taps) / taps.sum() ** 2
-    p, q = (image[y - 5 : y + 6, x - 5 : x + 6] for image in (a, b))
-    mean_p, mean_q = (w * p).sum(), (w * q).sum()
-    spread_p, spread_q = (w * p * p).sum() - mean_p**2, (w * q * q).sum() - mean_q**2
-    common = (w * p * q).sum() - mean_p * mean_q
-    c1, c2 = 2.55**2, 7.65**2
-    value = (2 * mean_p * mean_q + c1) / (mean_p**2 + mean_q**2 + c1)
-    value *= (2 * common + c2) / (spread_p + spread_q + c2)
-    everything = np.ones(a.shape, bool)
-    assert _ssim_map(real, noisy, everything)[y, x] == pytest.approx(value, abs=1e-3)
-    assert ssim(real, real, everything) == pytest.approx(1.0)
-    assert 0.3 < ssim(real, noisy, everything) < 0.95
-
-
-def test_uncompared_pixels_take_no_part():
-    real, noisy = pictures()
-    mask = np.hypot(*(np.indices((40, 50)) - np.array([17, 21])[:, None, None])) < 9
-    spoiled = np.where(mask[..., None], noisy, 0).astype(np.uint8)
-    assert ssim(real, spoiled, mask) == pytest.approx(ssim(real, noisy, mask))
-
-
-def test_exposure_is_made_alike():
-    real, _ = pictures()
     darker = np.rint(real * [0.5, 0.8, 1.0]).astype(np.uint8)
-    mask = np.ones(real.shape[:2], bool)
     assert psnr_db(real, match_exposure(real, darker, mask), mask) > 45.0
-
-
-def test_pixels_at_the_rim_are_not_whole():
-    valid = np.zeros((6, 7), bool)
-    valid[1:5, 2:6] = True
-    rendered = RenderedView(np.zeros((6, 7, 3), np.uint8), np.zeros((6, 7), np.float32), valid)
-    wanted = np.zeros((6, 7), bool)
-    wanted[2:4, 3:5] = True
-    np.testing.assert_array_equal(covered_pixels(rendered), wanted)
+    # Pixels at the rim are not whole.
+    rim = RenderedView(real, np.zeros((40, 50), np.float32), mask)
+    np.testing.assert_array_equal(covered_pixels(rim), binary_erosion(mask, np.ones((3, 3))))
 
 
 @pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
