@@ -1,5 +1,7 @@
 """Every variant on pairs whose disparity is known, and on pairs that have none."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -15,16 +17,14 @@ from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 
 VARIANTS = [SemiGlobalMatching(), PUBLISHED, MaximumLikelihoodScanline()]
 HEIGHT, WIDTH = 120, 180
-names = pytest.mark.parametrize(
-    "variant", VARIANTS, ids=lambda v: f"{type(v).__name__}-{getattr(v, 'paths', '')}"
-)
+names = pytest.mark.parametrize("variant", VARIANTS, ids=["default", "published", "thesis"])
 
 
-def pair_with_truth(seed=0):
-    """A slanted wall behind a square: left and right image, left disparities, which pixels both see."""
-    rng = np.random.default_rng(seed)
+@cache
+def _pair_with_truth():
+    rng = np.random.default_rng(0)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(float)
-    wall, square = texture(HEIGHT, 2 * WIDTH, seed), texture(HEIGHT, 2 * WIDTH, seed + 1)
+    wall, square = texture(HEIGHT, 2 * WIDTH, 0), texture(HEIGHT, 2 * WIDTH, 1)
     # Of the middle frame u a surface of disparity d is seen at u + d / 2 left and at u - d / 2 right.
     slope, offset, near = 0.03, 3.0, 14.0
 
@@ -34,15 +34,25 @@ def pair_with_truth(seed=0):
         v = x - sign * near / 2.0
         front = (np.abs(y - 60.0) < 30.0) & (np.abs(v - 90.0) < 35.0)
         image[front] = map_coordinates(square, [y, v + WIDTH / 2.0], order=3)[front]
-        return image + rng.normal(0.0, 1.0, image.shape), front, offset + slope * u
+        return (image + rng.normal(0.0, 1.0, image.shape)).astype(np.float32), front, offset + slope * u
 
-    left, front_l, back = seen(1.0)
-    right, front_r, _ = seen(-1.0)
+    (left, front_l, back), (right, front_r, _) = seen(1.0), seen(-1.0)
     truth = np.where(front_l, near, back)
     partner = np.rint(x - truth).astype(int)
-    inside = partner >= 0
     covered = front_r[y.astype(int), np.maximum(partner, 0)] & ~front_l
-    return left.astype(np.float32), right.astype(np.float32), truth, inside & ~covered
+    return left, right, truth, (partner >= 0) & ~covered
+
+
+def pair_with_truth():
+    """A slanted wall behind a square: left and right image, left disparities, which pixels both see."""
+    return [part.copy() for part in _pair_with_truth()]
+
+
+def require_right(found, truth, both, *, known):
+    """Most disparities that both images see are known, and hardly one of them is wrong."""
+    seen = np.isfinite(found.disparity) & both
+    assert seen.mean() > known
+    assert np.mean(np.abs(found.disparity - truth)[seen] > 1.0) < 0.03
 
 
 @names
@@ -55,8 +65,7 @@ def test_disparities_of_a_scene_are_found(variant):
     assert np.mean(error[known & both] > 1.0) < 0.02
     assert np.median(error[known & both]) < (0.3 if variant == VARIANTS[2] else 0.12)
     assert np.mean(np.abs(found.filled() - truth)[both] > 1.0) < 0.03
-    assert ((found.confidence >= 0.0) & (found.confidence <= 1.0)).all()
-    assert (found.confidence[~known] == 0.0).all()
+    assert ((found.confidence >= 0.0) & (found.confidence <= known)).all()
     assert found.disparity.dtype == found.confidence.dtype == np.float32
     assert np.median(error[known & both]) < 1.5 * found.sigma_px < 0.6
     hidden = ~both
@@ -70,10 +79,7 @@ def test_a_range_may_span_zero(variant):
     left, right, truth, both = pair_with_truth()
     shifted = np.full_like(right, np.nan)
     shifted[:, 10:] = right[:, :-10]
-    found = variant.match(left, shifted, disparity_range=(-12, 12))
-    known = np.isfinite(found.disparity) & both
-    assert known.mean() > 0.7
-    assert np.mean(np.abs(found.disparity - (truth - 10.0))[known] > 1.0) < 0.03
+    require_right(variant.match(left, shifted, disparity_range=(-12, 12)), truth - 10.0, both, known=0.7)
 
 
 @names
@@ -82,22 +88,19 @@ def test_invalid_pixels_have_no_disparity(variant):
     left[:20], left[100:, 90:] = np.nan, np.nan
     found = variant.match(left, right, disparity_range=(0, 24))
     assert np.isnan(found.disparity[np.isnan(left)]).all()
-    known = np.isfinite(found.disparity) & both
-    assert known.mean() > 0.5
-    assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.03
+    require_right(found, truth, both, known=0.5)
 
 
 @pytest.mark.parametrize("paths", [4, 8])
 def test_strips_change_little(paths):
     left, right, _, _ = pair_with_truth()
-    variant = SemiGlobalMatching(paths=paths)
-    whole = variant.match(left, right, disparity_range=(0, 24))
-    strips = with_constants(SemiGlobalMatching, memory_mb=1.2)(paths).match(
-        left, right, disparity_range=(0, 24)
+    whole, strips = (
+        kind(paths=paths).match(left, right, disparity_range=(0, 24)).disparity
+        for kind in (SemiGlobalMatching, with_constants(SemiGlobalMatching, memory_mb=1.2))
     )
-    known = np.isfinite(whole.disparity) & np.isfinite(strips.disparity)
-    assert (np.isfinite(whole.disparity) == np.isfinite(strips.disparity)).mean() > 0.99
-    assert np.mean(np.abs(whole.disparity - strips.disparity)[known] > 0.5) < 0.002
+    assert (np.isfinite(whole) == np.isfinite(strips)).mean() > 0.99
+    both = np.isfinite(whole) & np.isfinite(strips)
+    assert np.mean(np.abs(whole - strips)[both] > 0.5) < 0.002
 
 
 @names
@@ -139,10 +142,17 @@ def test_odd_images_do_no_harm(variant):
 
 @names
 def test_wrong_calls_are_refused(variant):
-    image = np.zeros((10, 12))
-    refuses(ValueError, "same shape", variant.match, image, np.zeros((10, 13)), disparity_range=(0, 4))
-    refuses(ValueError, "must be \\(H, W\\)", variant.match, np.zeros(5), np.zeros(5), disparity_range=(0, 4))
-    refuses(ValueError, "first <= last", variant.match, image, image, disparity_range=(4, 0))
+    image, row = np.zeros((10, 12)), np.zeros(5)
+    for words, left, right, limits in (
+        ("same shape", image, np.zeros((10, 13)), (0, 4)), (r"must be \(H, W\)", row, row, (0, 4)),
+        ("first <= last", image, image, (4, 0)),
+    ):  # fmt: skip
+        refuses(ValueError, words, variant.match, left, right, disparity_range=limits)
+    for kind, wrong in (
+        (SemiGlobalMatching, {"paths": 6}), (SemiGlobalMatching, {"census_share": 1.2}),
+        (MaximumLikelihoodScanline, {"radius": 9}), (MaximumLikelihoodScanline, {"cohesion": "both"}),
+    ):  # fmt: skip
+        refuses(ValueError, next(iter(wrong)), kind, **wrong)
 
 
 def test_rectified_images_are_matched_by_the_matcher_of_the_stage():
@@ -150,9 +160,7 @@ def test_rectified_images_are_matched_by_the_matcher_of_the_stage():
     color = [np.repeat(np.clip(image, 0, 255)[..., None], 3, axis=2) for image in (left, right)]
     stereo = MultiViewStereo()
     found = stereo.match_rectified(*[image.astype(np.uint8) for image in color], max_disparity_px=23.2)
-    known = np.isfinite(found.disparity) & both
-    assert known.mean() > 0.8
-    assert np.mean(np.abs(found.disparity - truth)[known] > 1.0) < 0.02
+    require_right(found, truth, both, known=0.8)
     thesis = MultiViewStereo(pairs=PairMatching(matcher=MaximumLikelihoodScanline()))
     disparity = thesis.match_rectified(left, right, max_disparity_px=24).disparity
     assert set(np.unique(disparity[np.isfinite(disparity)] % 1.0)) == {0.0}
@@ -160,25 +168,17 @@ def test_rectified_images_are_matched_by_the_matcher_of_the_stage():
         refuses(ValueError, "max_disparity_px", stereo.match_rectified, left, right, max_disparity_px=wrong)
 
 
-@pytest.mark.parametrize(
-    ("make", "rule"),
-    [
-        (lambda: SemiGlobalMatching(paths=6), "paths"),
-        (lambda: SemiGlobalMatching(census_share=1.2), "census_share"),
-        (lambda: MaximumLikelihoodScanline(radius=9), "radius"),
-        (lambda: MaximumLikelihoodScanline(cohesion="both"), "cohesion"),
-    ],
-)
-def test_parameters_are_checked(make, rule):
-    refuses(ValueError, rule, make)
-
-
-def test_the_cost_of_a_hidden_pixel_is_that_of_the_paper():
-    # ln(0.99 / 0.01 * 256 / sqrt(2 pi 4)), equation (9) with one grey level as measurement.
+def test_noise_and_the_cost_of_a_hidden_pixel():
     assert _occlusion_cost(1, 4.0) == pytest.approx(8.528, abs=1e-3)
+    rng = np.random.default_rng(2)
+    clean = texture(200, 300, 3)
+    for sigma in (0.0, 2.0, 5.0):
+        noisy = np.clip(clean + sigma * rng.normal(size=clean.shape), 0, 255)
+        side, _ = prepare_stereo_images(noisy, noisy)
+        assert estimate_noise(side) == pytest.approx(sigma, abs=1.2)
 
 
-def test_cohesion_takes_the_solution_with_fewer_discontinuities():
+def test_cohesion_has_fewer_discontinuities_and_strips_cover_every_row():
     left, right, _, _ = pair_with_truth()
     left, right = np.rint(left / 16.0) * 16.0, np.rint(right / 16.0) * 16.0
     breaks = []
@@ -189,18 +189,6 @@ def test_cohesion_takes_the_solution_with_fewer_discontinuities():
         breaks.append((int((np.diff(d, axis=1) != 0).sum()), int((np.diff(d, axis=0) != 0).sum())))
     assert breaks[1][0] < breaks[0][0]
     assert breaks[2][1] < breaks[1][1]
-
-
-def test_the_noise_of_an_image_is_found_beside_its_texture():
-    rng = np.random.default_rng(2)
-    clean = texture(200, 300, 3)
-    for sigma in (0.0, 2.0, 5.0):
-        noisy = np.clip(clean + sigma * rng.normal(size=clean.shape), 0, 255)
-        side, _ = prepare_stereo_images(noisy, noisy)
-        assert estimate_noise(side) == pytest.approx(sigma, abs=1.2)
-
-
-def test_strips_cover_every_row_once_and_fit():
     for height, per_row, memory in ((100, 10, 1e6), (500, 1000, 2e5), (333, 7, 1.0)):
         strips = row_strips(height, per_row, memory)
         assert [s[0] for s in strips] == [0, *[s[1] for s in strips[:-1]]]

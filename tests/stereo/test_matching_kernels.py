@@ -1,13 +1,16 @@
-"""Compiled loops against their plain twins."""
+"""Compiled loops of stereo matching and depth estimation against plain ones."""
 
 import itertools
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
-from tests.stereo import twins
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.stereo import _depth_fusion as kernels
 from thesisrecon.stereo import _postprocessing
-from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
+from thesisrecon.stereo._cost import census, split_channels
+from thesisrecon.stereo._plane_kernels import fit_planes
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, _solve_row
 from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
 
@@ -33,35 +36,10 @@ def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
 
 def test_census():
     bits, channels, _ = random_side(np.random.default_rng(1))
-    assert (bits == twins.census(channels.sum(axis=0))).all()
-
-
-@pytest.mark.parametrize(("first", "n"), [(0, 6), (-4, 9), (15, 12), (30, 3), (-40, 3)])
-def test_costs_of_pixels(first, n):
-    rng = np.random.default_rng(2)
-    left, right = random_side(rng), random_side(rng)
-    weights = np.array([400, 9, 300], np.int16)
-    volume = np.empty((13, n, 21), np.uint8)
-    none = np.empty((4, 0, 13, 21), np.uint8)
-    cost_volume(left, right, none, first, weights, np.uint8(33), volume)
-    assert (volume == twins.costs(left, right, first, n, weights, 33)).all()
-
-
-def test_costs_over_supports():
-    rng = np.random.default_rng(3)
-    left, right = random_side(rng), random_side(rng)
-    left[1][:] //= 8
-    masks = np.empty((4, 2, 13, 21), np.uint8)
-    support_masks(left[1], left[2], np.int16(12), masks)
-    arms = twins.arm_lengths(left[1], left[2], 12)
-    assert ((masks > 0).sum(axis=1) == arms).all()
-    assert set(np.unique(arms)) == {0, 1, 2}
-    weights = np.array([400, 9, 300], np.int16)
-    volume = np.empty((13, 7, 21), np.uint8)
-    cost_volume(left, right, masks, -2, weights, np.uint8(33), volume)
-    pixels = twins.costs(left, right, -2, 7, weights, 33)
-    assert np.abs(volume - twins.mean_over_support(pixels, arms)).max() <= 1
-    assert np.mean(volume == twins.mean_over_support(pixels, arms)) > 0.99
+    grey = channels.sum(axis=0)
+    around = sliding_window_view(np.pad(grey, 2, mode="edge"), (5, 5)).reshape(*grey.shape, 25)
+    darker = np.delete(around < grey[..., None], 12, axis=2)
+    assert (bits == darker @ (1 << np.arange(24)[::-1])).all()
 
 
 @pytest.mark.parametrize("pairs", [2, 4])
@@ -75,49 +53,16 @@ def test_sums_of_paths(shape, pairs):
     adaptive_P2(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
 
     def penalty(y, x, v, u):
-        apart = abs(int(grey[y, x]) - int(grey[v, u]))
-        return int(max(30.0, 70.0 * 200.0 / (200.0 + apart)))
+        return int(max(30.0, 70.0 * 200.0 / (200.0 + abs(int(grey[y, x]) - int(grey[v, u])))))
 
     total = np.empty((pairs, *shape), np.uint8)
-    scratch = np.empty((2, scratch_size(*shape)), np.uint8)
-    sum_paths(costs, jumps, np.uint8(20), total, scratch)
-    directions = [(0, 1), (1, 0), (1, 1), (1, -1)]
-    for k in range(pairs):
-        dy, dx = directions[k]
-        there = twins.path_sum(costs, penalty, 20, (dy, dx))
-        assert (total[k] == there + twins.path_sum(costs, penalty, 20, (-dy, -dx))).all()
+    sum_paths(costs, jumps, np.uint8(20), total, np.empty((2, scratch_size(*shape)), np.uint8))
+    for found, (dy, dx) in zip(total, [(0, 1), (1, 0), (1, 1), (1, -1)], strict=False):
+        there, back = (path_sum(costs, penalty, 20, (s * dy, s * dx)) for s in (1, -1))
+        assert (found == there + back).all()
 
 
-def test_best_disparities_of_both_sides():
-    rng = np.random.default_rng(6)
-    sums = rng.integers(0, 250, (2, 5, 7, 15)).astype(np.uint8)
-    left, right, confidence = (np.empty((3, 15), np.float32) for _ in range(3))
-    _postprocessing.best_disparities(sums, 1, -2, (left, right, confidence), 40.0)
-    total = sums.sum(axis=0, dtype=int)[1:4]
-    best = total.argmin(axis=1)
-    assert (np.abs(left - (best - 2)) <= 0.5).all()
-    for y, x in np.ndindex(3, 15):
-        mine = total[y, :, x]
-        rivals = [value for q, value in enumerate(mine) if abs(q - best[y, x]) > 1]
-        margin = min(rivals) - mine.min()
-        assert confidence[y, x] == pytest.approx(margin / (margin + 40.0))
-        seen = {q: total[y, q, x + q - 2] for q in range(7) if 0 <= x + q - 2 < 15}
-        assert right[y, x] == min(seen, key=lambda q: (seen[q], q)) - 2
-
-
-def test_sides_that_contradict_each_other():
-    left = np.array([[2.0, 1.0, 1.0, 1.2, np.nan, 3.0]], np.float32)
-    right = np.array([[1.0, 1.0, 3.0, 1.0, 1.0, np.nan]], np.float32)
-    confidence = np.ones((1, 6), np.float32)
-    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
-    np.testing.assert_array_equal(left, np.array([[np.nan, 1, 1, np.nan, np.nan, 3]], np.float32))
-    confidence[0, 1] = 0.05
-    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
-    assert np.isnan(left[0, 1])
-    assert left[0, 2] == 1.0
-
-
-def test_peaks_go_and_surfaces_stay_where_there_is_texture():
+def test_contradictions_and_peaks_go_and_pinholes_are_filled():
     disparity = np.zeros((9, 12), np.float32)
     disparity[2:4, 2:4] = 5.0
     disparity[:, 8:] += np.arange(1, 5, dtype=np.float32)
@@ -129,9 +74,6 @@ def test_peaks_go_and_surfaces_stay_where_there_is_texture():
     assert (disparity[~gone] == before[~gone]).all()
     _postprocessing.remove_speckles(disparity, np.zeros((9, 12), bool), np.float32(1.0), 5)
     assert np.isnan(disparity).all()
-
-
-def test_pinholes_take_the_median_and_large_holes_stay():
     disparity = np.arange(30, dtype=np.float32).reshape(5, 6)
     disparity[2, 2] = np.nan
     disparity[:, 5] = np.nan
@@ -140,6 +82,15 @@ def test_pinholes_take_the_median_and_large_holes_stay():
     assert np.isnan(out[:, 5]).all()
     known = ~np.isnan(disparity)
     assert (out[known] == disparity[known]).all()
+    left = np.array([[2.0, 1.0, 1.0, 1.2, np.nan, 3.0]], np.float32)
+    right = np.array([[1.0, 1.0, 3.0, 1.0, 1.0, np.nan]], np.float32)
+    confidence = np.ones((1, 6), np.float32)
+    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
+    np.testing.assert_array_equal(left, np.array([[np.nan, 1, 1, np.nan, np.nan, 3]], np.float32))
+    confidence[0, 1] = 0.05
+    _postprocessing.check_left_right(left, right, confidence, 1.0, 0.1)
+    assert np.isnan(left[0, 1])
+    assert left[0, 2] == 1.0
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -160,7 +111,7 @@ def test_rows_of_greatest_likelihood(first, n, seed):
     for prices in ((11, 5, 1, 1), (11, 11, 1, 0), (11, 5, 0, 0), (40, 5, 1, 1)):
         _solve_row(costs, first, prices, above, left, right)
         found = price_of(costs, first, prices, above, left, right)
-        assert found == twins.most_likely_row(costs, first, prices, above)
+        assert found == most_likely_row(costs, first, prices, above)
 
 
 def price_of(costs, first, prices, above, left, right):
@@ -174,4 +125,147 @@ def price_of(costs, first, prices, above, left, right):
     fixed = np.full_like(costs, NO_MATCH)
     for x, j in pairs:
         fixed[x - j - first, x] = costs[x - j - first, x]
-    return twins.most_likely_row(fixed, first, prices, above)
+    return most_likely_row(fixed, first, prices, above)
+
+
+def path_sum(costs, penalty, step, direction):
+    """Least costs (H, D, W) of paths that arrive by ``direction`` (dy, dx); ``penalty(y, x, v, u)``."""
+    height, _, width = costs.shape
+    out, (dy, dx) = costs.astype(np.int64), direction
+    rows, columns = (range(n)[:: -1 if d < 0 else 1] for n, d in ((height, dy), (width, dx)))
+    for y, x in itertools.product(rows, columns):
+        v, u = y - dy, x - dx
+        if 0 <= v < height and 0 <= u < width:
+            before = out[v, :, u]
+            padded = np.pad(before, 1, constant_values=10**6) + step
+            far = before.min() + penalty(y, x, v, u)
+            best = np.minimum(np.minimum(padded[:-2], padded[2:]), np.minimum(before, far))
+            out[y, :, x] += best - before.min()
+    return out
+
+
+def most_likely_row(costs, first, prices, above):
+    """(cost, discontinuities) of the best correspondence of a row, by recursion over whole solutions."""
+    n, width = costs.shape
+    hidden, border, along, across = prices
+    best, ends = {}, []
+    for i, j in itertools.product(range(width + 1), range(width + 1)):
+        q = i - j - first
+        if not 0 <= q < n:
+            continue
+        # A row begins with pixels beyond the border of one image: no state is a break there.
+        found = {0: [((i + j) * border, 0)] if 0 in (i, j) else [], 1: [], 2: []}
+        for state, (a, b) in enumerate(((i - 1, j - 1), (i - 1, j), (i, j - 1))):
+            if 0 in (i, j) or (state == 0 and costs[q, i - 1] == NO_MATCH):
+                continue
+            up, aside = above[0][i - 1], above[1][j - 1]
+            if state == 0:
+                price, breaks = int(costs[q, i - 1]), sum(d not in (OCCLUDED, i - j) for d in (up, aside))
+            else:
+                price, breaks = hidden, (up if state == 1 else aside) != OCCLUDED
+            for before in range(3):
+                if (a, b, before) in best:
+                    cost, count = best[a, b, before]
+                    found[state].append((cost + price, count + along * (before != state) + across * breaks))
+        for state, values in found.items():
+            if values:
+                best[i, j, state] = cost, count = min(values)
+                if width in (i, j):
+                    ends.append((cost + (2 * width - i - j) * border, count))
+    return min(ends)
+
+
+SHAPE = (23, 31)
+
+
+def pixels():
+    x, y = np.meshgrid(np.arange(float(SHAPE[1])), np.arange(float(SHAPE[0])))
+    return np.stack([x, y], axis=-1)
+
+
+def motion(rng):
+    return np.eye(3) + 1e-3 * rng.normal(size=(3, 3)), np.array([9.0, 2.0, 0.01])
+
+
+def holes(rng, values):
+    return np.where(rng.random(values.shape) < 0.2, np.nan, values).astype(np.float32)
+
+
+def test_inverse_depths_equal_least_squares_on_the_line():
+    rng = np.random.default_rng(0)
+    H, e = motion(rng)
+    truth = rng.uniform(0.5, 2.0, SHAPE)
+    q = homogenize(pixels()) @ H.T + truth[..., None] * e
+    xy = (q[..., :2] / q[..., 2:] + rng.normal(0.0, 0.1, (*SHAPE, 2))).astype(np.float32)
+    sigma = holes(rng, np.full(SHAPE, 0.3))
+    rho, std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
+    kernels.inverse_depths(xy, sigma, H, e, rho, std)
+    h = homogenize(pixels()) @ H.T
+    a, b = e[:2] - xy * e[2], xy * h[..., 2:] - h[..., :2]
+    wanted = (a * b).sum(-1) / (a * a).sum(-1)
+    wanted_std = sigma * (h[..., 2] + wanted * e[2]) / np.linalg.norm(a, axis=-1)
+    known = np.isfinite(sigma)
+    assert (np.isfinite(rho) == known).all()
+    np.testing.assert_allclose(rho[known], wanted[known], rtol=1e-5)
+    np.testing.assert_allclose(std[known], wanted_std[known], rtol=1e-5)
+    assert np.abs(rho[known] - truth[known]).max() < 0.06
+
+
+def test_fusion_is_the_weighted_mean_of_the_largest_party():
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(0.5, 2.0, SHAPE)
+    std = rng.uniform(0.005, 0.02, (5, *SHAPE)).astype(np.float32)
+    rho = truth + std * rng.normal(size=std.shape)
+    rho[rng.random(std.shape) < 0.25] += 0.7
+    rho = holes(rng, rho)
+    out, out_std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
+    support, rivals = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.uint8)
+    kernels.fuse_inverse_depths(rho, std, 3.0, out, out_std, support, rivals)
+    apart = np.abs(rho[:, None].astype(float) - rho[None])
+    agree = apart <= 3.0 * np.hypot(std[:, None].astype(float), std[None])
+    weight = 1.0 / std.astype(float) ** 2
+    votes, certain = agree.sum(1), np.where(agree, weight[None], 0.0).sum(1)
+    best = np.argmax(votes + certain / (certain.max() * 2.0), axis=0)
+    party = np.take_along_axis(agree, best[None, None], 0)[0] & np.isfinite(rho)
+    total = np.where(party, weight, 0.0).sum(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(party, weight * rho, 0.0).sum(0) / total
+        chi = np.where(party, weight * (rho - mean) ** 2, 0.0).sum(0) / (party.sum(0) - 1)
+        wanted_std = np.sqrt(np.where(party.sum(0) > 1, np.maximum(chi, 1.0), 1.0) / total)
+        wanted_std[total == 0.0] = np.nan
+    assert (support == party.sum(0)).all()
+    assert (rivals == np.isfinite(rho).sum(0) - party.sum(0)).all()
+    np.testing.assert_allclose(out, mean, rtol=1e-5)
+    np.testing.assert_allclose(out_std, wanted_std, rtol=1e-4)
+
+
+def test_the_filter_ends_at_the_first_outlier():
+    rng = np.random.default_rng(2)
+    rho, std = holes(rng, rng.uniform(1.0, 1.1, SHAPE)), np.full(SHAPE, 0.05, np.float32)
+    new, new_std = holes(rng, rng.uniform(0.8, 1.3, SHAPE)), np.full(SHAPE, 0.03, np.float32)
+    alive, support = (rng.random(SHAPE) < 0.8).astype(np.uint8), np.ones(SHAPE, np.uint8)
+    before, was = rho.copy(), alive.copy()
+    kernels.update_kalman(rho, std, new, new_std, 3.0, alive, support)
+    inside = np.abs(new - before) <= 3.0 * np.hypot(0.05, 0.03)
+    first, measured = np.isnan(before), np.isfinite(new)
+    taken = (was == 1) & measured & (first | inside)
+    assert (alive == taken).all()
+    gain = 0.05**2 / (0.05**2 + 0.03**2)
+    wanted = np.where(first, new, before + gain * (new - before))
+    np.testing.assert_allclose(rho, np.where(taken, wanted, before), rtol=1e-5)
+    assert (support == np.where(taken & ~first, 2, 1)).all()
+    np.testing.assert_allclose(std[taken & ~first], np.sqrt(1.0 - gain) * 0.05, rtol=1e-5)
+
+
+def test_planes_are_fitted_to_similar_pixels():
+    rng = np.random.default_rng(4)
+    xy = pixels()
+    rho = (1.0 + 1e-3 * xy[..., 0] - 2e-3 * xy[..., 1]).astype(np.float32)
+    rho[:, 20:] += 0.5
+    rho = holes(rng, rho)
+    gx, gy = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
+    fit_planes(rho, 3, 0.1, gx, gy)
+    known = np.isfinite(rho)
+    assert (np.isfinite(gx) == known).all()
+    np.testing.assert_allclose(gx[known], 1e-3, atol=2e-6)
+    np.testing.assert_allclose(gy[known], -2e-3, atol=2e-6)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tests.stereo.twins import Setting, squares
 from tests.synthetic import texture
 from thesisrecon.stereo import _plane_kernels as kernels
 
@@ -13,20 +12,19 @@ PLANE = np.array([1.0, 6e-3, -4e-3])
 """Inverse depth at (0, 0) and its gradient."""
 
 
-def arguments(setting, others):
-    """What the compiled loops take of a setting."""
+def arguments(gray, others, H, e):
+    """What the compiled loops take of a reference and its neighbours, windows of 5 x 5 samples."""
     words, layout, start = [], [], 0
     for other in others:
-        word = np.empty(other.shape, np.uint32)
-        kernels.pack_squares(other, word)
-        words.append(word.ravel())
+        words.append(np.empty(other.shape, np.uint32))
+        kernels.pack_squares(other, words[-1])
         layout.append((start, *other.shape[::-1]))
         start += other.size
-    packed = np.concatenate(words)
-    gray, H, e = setting.gray, setting.H, setting.e
-    return kernels.PatchViews(gray, packed, np.array(layout), H, e), kernels.PatchWindow(
-        setting.offsets, setting.likeness
-    )
+    packed = np.concatenate([word.ravel() for word in words])
+    sample = np.stack(np.meshgrid(np.arange(-4, 5, 2), np.arange(-4, 5, 2))).reshape(2, -1)
+    likeness = np.exp(-np.arange(256.0) / 15.0).astype(np.float32)
+    window = kernels.PatchWindow(sample.astype(np.float32), likeness)
+    return kernels.PatchViews(gray, packed, np.array(layout), H, e), window
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +44,7 @@ def scene():
         others.append(map_coordinates(gray if k < 2 else gray[::-1], at, order=1).astype(np.float32))
     one = map_coordinates(gray, [20.0 + y, 20.0 + x], order=1).astype(np.float32)
     one[:3, :2], others[0][:4, :5] = np.nan, np.nan
-    sample = np.stack(np.meshgrid(np.arange(-4, 5, 2), np.arange(-4, 5, 2))).reshape(2, -1)
-    likeness = np.exp(-np.arange(256.0) / 15.0).astype(np.float32)
-    setting = Setting(one, others, H, e, sample.astype(np.float32), likeness)
-    return setting, arguments(setting, others), (x, y)
+    return one, arguments(one, others, H, e), (x, y)
 
 
 def planes_about(places, spread, seed=0):
@@ -63,33 +58,47 @@ def planes_about(places, spread, seed=0):
 
 
 def test_squares_are_the_four_levels_of_an_interpolation(scene):
-    gray = scene[0].gray.copy()
+    gray = scene[0].copy()
     gray[5, 7] = 300.0
     packed = np.empty(SHAPE, np.uint32)
     kernels.pack_squares(gray, packed)
-    wanted = squares(gray)
+    level = np.floor(np.clip(gray + np.float32(0.5), 1.0, 255.0))
+    four = np.stack([level[:-1, :-1], level[:-1, 1:], level[1:, :-1], level[1:, 1:]], axis=-1)
+    four = np.where(np.isfinite(four).all(axis=-1, keepdims=True), four, 0.0)
     for k in range(4):
-        assert ((packed >> (8 * k)) & 255 == wanted[..., k]).all()
+        assert ((packed[:-1, :-1] >> (8 * k)) & 255 == four[..., k]).all()
     assert (packed[:3, :2] == 0).all()
-    assert (packed[-1] == 0).all()
-    assert (packed[3:-1, :-1] > 0).all()
+    assert not packed[-1].any()
+    assert not packed[:, -1].any()
 
 
-@pytest.mark.parametrize("spread", [0.3, 20.0])
-def test_costs_equal_weighted_correlations(scene, spread):
-    setting, given, places = scene
-    planes = planes_about(places, spread)
-    cost = np.empty(SHAPE, np.float32)
-    kernels.begin_planes(*given, planes, cost)
-    np.testing.assert_allclose(cost, setting.begin(planes), atol=2e-4)
-    least, slope = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
-    support = np.empty(SHAPE, np.uint8)
-    kernels.rate_planes(*given, planes, 0.4, least, support, slope)
-    wanted = setting.rate(planes, 0.4)
-    np.testing.assert_allclose(least, wanted[0], atol=2e-4)
-    assert (support == wanted[1]).all()
-    np.testing.assert_allclose(slope, wanted[2], rtol=1e-5, atol=1e-9)
-    assert len(np.unique(support)) >= 3
+def test_costs_vanish_at_the_true_plane_and_slopes_are_motions(scene):
+    _, given, places = scene
+    cost, least, slope = np.empty((3, *SHAPE), np.float32)
+    support, costs = np.empty(SHAPE, np.uint8), []
+    H, e = given[0].H.swapaxes(1, 2)[:, None], given[0].e[:, None, None]
+    for spread in (0.0, 0.5, 20.0):
+        planes = planes_about(places, spread)
+        kernels.begin_planes(*given, planes, cost)
+        kernels.rate_planes(*given, planes, 0.4, least, support, slope)
+        costs.append(np.median(least[least < kernels.UNKNOWN]))
+        known = np.isfinite(planes[..., 0]) & np.isfinite(scene[0])
+        assert (cost[~known] == kernels.UNKNOWN).all()
+        assert not support[~known].any()
+        # The second of the two best neighbours costs at most so much.
+        assert (cost >= least - 1e-5).all()
+        assert (cost <= least + 0.5 * kernels.MAX_EXCESS_COST + 1e-5).all()
+        # Pixels that places move per unit of inverse depth, in the views that support the plane.
+        q = np.stack([*places, np.ones(SHAPE)], axis=-1) @ H + planes[..., :1] * e
+        squares = np.sum(((e[..., :2] - q[..., :2] / q[..., 2:] * e[..., 2:]) / q[..., 2:]) ** 2, axis=-1)
+        for views, moved in ((1, squares), (2, squares.sum(axis=0) - squares)):
+            assert np.isclose(slope**2, moved, rtol=1e-4).any(axis=0)[support == views].all()
+        if spread == 0.0:
+            assert (support[known] >= 1).mean() > 0.5
+            assert (support == 2).any()
+    assert costs[0] < 0.05
+    assert costs[0] < costs[1] < costs[2]
+    assert costs[2] > 0.2
 
 
 def test_converged_planes_rest_until_a_neighbour_changes(scene):

@@ -1,10 +1,13 @@
 """Depth maps and photographs of the unit sphere."""
 
+from functools import cache
+
 import numpy as np
 
 from tests.synthetic import looking_along
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.records import DepthMap, PinholeView
+from thesisrecon.surface.fusion import VolumetricFusion
 
 K = np.array([[150.0, 0.0, 79.5], [0.0, 150.0, 59.5], [0.0, 0.0, 1.0]])
 SHAPE = (120, 160)
@@ -43,6 +46,12 @@ def ring_of(count=8):
     """Views from all round, above and below in turn."""
     turns = [looking_at_origin(2 * np.pi * k / count, 1.5 * (-1) ** k, 3.5) for k in range(count)]
     return [sphere_map(k, P) for k, P in enumerate(turns)]
+
+
+@cache
+def fused_sphere():
+    """The sphere of the ring as a fine mesh."""
+    return VolumetricFusion(tolerance=0.0).fuse(ring_of())
 
 
 def sphere_map(view, P, *, noise=0.0, seed=0):
