@@ -1,17 +1,16 @@
 """Motion and identifiability are those of the cameras and points that are returned, not of the beginning."""
 
 import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from tests.metric.test_population import true_calibration, with_few_points
-from tests.metric.verdict_scenes import looking, project
+from tests.conftest import real_data
+from tests.metric.metric_stage import true_calibration, with_few_points
+from tests.metric.test_verdicts import looking, project
 from tests.synthetic import looking_along, make_scene, projective_reconstruction, with_poses
 from thesisrecon import reconstruct, reconstruct_from_tracks
 from thesisrecon.config.intrinsics import prior_for
@@ -21,7 +20,6 @@ from thesisrecon.pipeline.large_sets import restrict_views
 from thesisrecon.records import IdentifiabilityReport
 from thesisrecon.selfcalibration._candidates import check_identifiability
 
-DATA = Path(os.environ.get("THESISRECON_DATA", Path(__file__).parents[3] / "shared" / "data"))
 SETS = (
     "truth/temple/images", "truth/lego/images", "truth/dino/images", "truth/kitti1/images",
     "truth/fern/images", "strecha/fountain-P11/images", "strecha/Herz-Jesus-P8/images", "kermit/images",
@@ -29,43 +27,11 @@ SETS = (
 WITHIN = 0.05
 
 
-def largest_rotation_deg(R):
-    trace = np.einsum("iab,jab->ij", R, R)
-    return float(np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)).max()))
-
-
-def rotation_axis(R):
-    """Direction of the common axis, and rms rotation (degrees) about the second of the three axes."""
-    vectors = [Rotation.from_matrix(b.T @ a).as_rotvec() for i, a in enumerate(R) for b in R[i + 1 :]]
-    value, vector = np.linalg.eigh(np.mean([np.outer(v, v) for v in vectors], axis=0))
-    return vector[:, 2], float(np.degrees(np.sqrt(max(value[1], 0.0))))
-
-
-def planarity(X):
-    """Thickness over width of all but 5 % of the farthest points, and 5 % farthest from their plane."""
-    distance = np.linalg.norm(X - np.median(X, axis=0), axis=1)
-    X = X[np.argsort(distance, kind="stable")[: int(0.95 * len(X))]]
-    part = X
-    for _ in range(3):
-        values, vectors = np.linalg.eigh(np.cov(part.T))
-        off = np.abs((X - part.mean(axis=0)) @ vectors[:, 0])
-        part = X[np.argsort(off, kind="stable")[: int(0.95 * len(X))]]
-    values = np.linalg.eigvalsh(np.cov(part.T))
-    return float(np.sqrt(values[0] / values[1]))
-
-
 def recomputed(R, C, X):
     """The measures that sentences state, from cameras and points alone."""
-    axis, spread = rotation_axis(R)
-    distance = np.median(np.linalg.norm(np.median(X, axis=0) - C, axis=1))
-    centred = C - C.mean(axis=0)
-    return {
-        "largest_rotation_deg": largest_rotation_deg(R),
-        "rotation_axis_spread_deg": spread,
-        "scene_planarity_ratio": planarity(X),
-        "centre_spread_over_distance": np.sqrt(np.mean(np.sum(centred**2, axis=1))) / distance,
-        "axial_translation_over_distance": np.sqrt(np.mean((centred @ axis) ** 2)) / distance,
-    }
+    measures = measure_motion(UpgradedCameras(np.ones(len(R)), R, C, X))
+    names = "largest_rotation_deg rotation_axis_spread_deg scene_planarity_ratio centre_spread_over_distance"
+    return {name: measures[name] for name in (*names.split(), "axial_translation_over_distance")}
 
 
 def assert_returned(summary, R, C, X):
@@ -113,27 +79,26 @@ def noisy(scene, sigma_px=0.3, seed=1):
     return replace(scene, tracks=replace(scene.tracks, xy=scene.tracks.xy + noise))
 
 
-def arc(*, views, still, degrees, roll_deg=0.0):
-    """Cameras of which the first ``still`` do not rotate and the others go round the scene."""
+def arc():
+    """Cameras of which the first five do not rotate and the others go round the scene."""
+    views, still = 14, 5
     scene = make_scene(views=views, points=500, seed=5)
-    angle = np.radians(np.concatenate([np.zeros(still), np.linspace(5.0, degrees, views - still)]))
+    angle = np.radians(np.concatenate([np.zeros(still), np.linspace(5.0, 104.0, views - still)]))
     C = np.column_stack([7.0 * np.sin(angle), np.linspace(-1.5, 1.5, views), -7.0 * np.cos(angle)])
     C[:still, 0] = np.linspace(-0.8, 0.8, still)
-    roll = Rotation.from_euler(
-        "z", np.radians(roll_deg) * np.linspace(0.0, 1.0, views)[:, None] ** 2
-    ).as_matrix()
-    R = np.array([looking_along(-c) for c in C])
-    R[:still] = R[0]
-    return noisy(with_poses(scene, np.concatenate([R[:still], (roll @ R)[still:]]), C))
+    roll = 20.0 * np.linspace(0.0, 1.0, views)[:, None] ** 2
+    R = Rotation.from_euler("z", roll, degrees=True).as_matrix() @ [looking_along(-c) for c in C]
+    R[:still] = looking_along(-C[0])
+    return noisy(with_poses(scene, R, C))
 
 
 def test_a_start_without_rotation_that_becomes_an_arc_is_described_as_an_arc():
-    scene = arc(views=14, still=5, degrees=104.0, roll_deg=20.0)
+    scene = arc()
     metric, start = grown(scene, range(5))
     found = metric.identifiability
     assert start.motion == "pure translation"
     assert not start.identifiable
-    truth = largest_rotation_deg(scene.R)
+    truth = recomputed(scene.R, scene.centres, scene.X)["largest_rotation_deg"]
     assert found.evidence["largest_rotation_deg"] == pytest.approx(truth, rel=WITHIN)
     assert found.identifiable
     assert metric.trusted, metric.failed_checks
@@ -142,13 +107,12 @@ def test_a_start_without_rotation_that_becomes_an_arc_is_described_as_an_arc():
 
 def test_a_flat_start_that_becomes_a_deep_scene_is_not_called_planar():
     scene = make_scene(views=12, points=600, seed=6)
-    X = scene.X.copy()
-    X[:350, 2] = 0.0
+    scene.X[:350, 2] = 0.0
     t = scene.tracks
     # The first five views see the flat part only.
     keep = (t.view_index >= 5) | (t.point_index < 350)
     tracks = replace(t, view_index=t.view_index[keep], point_index=t.point_index[keep], xy=t.xy[keep].copy())
-    scene = noisy(with_poses(replace(scene, X=X, tracks=tracks), scene.R, scene.centres))
+    scene = noisy(with_poses(replace(scene, tracks=tracks), scene.R, scene.centres))
     metric, start = grown(scene, range(5))
     assert start.motion == "planar scene"
     assert start.critical
@@ -223,9 +187,7 @@ def test_summary_and_warnings_are_about_the_returned_cameras():
     R = roll @ np.array([looking(rng.normal(0.0, 0.2, 3) - c) for c in C])
     xy = project(X, R, C, focal, size, np.tile((np.array(size) - 1) / 2, (9, 1)))
     result = reconstruct_from_tracks(xy + rng.normal(0.0, 0.3, xy.shape), [size] * 9)
-    cameras = list(result.cameras.values())
-    R = np.array([camera.R for camera in cameras])
-    C = np.array([camera.centre for camera in cameras])
+    R, C = (np.array([getattr(c, name) for c in result.cameras.values()]) for name in ("R", "centre"))
     assert_returned(result.summary, R, C, result.points)
     assert result.summary["identifiable"] is True
     start = result.summary["self_calibration"]
@@ -236,9 +198,7 @@ def test_summary_and_warnings_are_about_the_returned_cameras():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_stated_numbers_of_photographs_are_those_of_the_written_cameras(name, tmp_path):
-    if not (DATA / name).is_dir():
-        pytest.skip(f"{DATA / name} is missing")
-    result = reconstruct(DATA / name, tmp_path, until="metric", max_size=512)
+    result = reconstruct(real_data(name), tmp_path, until="metric", max_size=512)
     assert_written(tmp_path)
     assert_points_seen(result.metric.reconstruction)
     assert result.summary["motion"]["nearest_critical"] == result.metric.identifiability.motion

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from tests.metric.test_metric_refinement import centre_error
+from tests.metric.metric_stage import centre_error
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, true_pairs, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure

@@ -9,7 +9,7 @@ import scipy
 
 from tests.matching.test_pair_selection import pair
 from tests.matching.test_pair_selection import street as street_pairs
-from tests.metric.test_metric_refinement import centre_error
+from tests.metric.metric_stage import centre_error
 from tests.pipeline.test_core_and_windows import street, with_repeated_windows
 from tests.synthetic import make_scene, true_pairs
 from thesisrecon.config import ImageOptions, PipelineConfig
