@@ -22,9 +22,9 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, plane_homography
 from thesisrecon.io._images import read_image
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Image, Tracks
 from thesisrecon.report._data import point_colors
-from thesisrecon.runtime._run import stream
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 

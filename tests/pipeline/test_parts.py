@@ -28,8 +28,8 @@ from thesisrecon.pipeline.large_sets import (
     pairs_of_missing,
     reconstruct_part,
 )
+from thesisrecon.pipeline.run import _StageLog, start_run
 from thesisrecon.records import MetricResult
-from thesisrecon.runtime._run import _StageLog, start_run
 
 VIEWS, PART = 72, 45
 OBSERVED = ("view_index", "point_index", "xy")

@@ -20,7 +20,7 @@ from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically, write_json
 from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.pipeline import algorithm1
-from thesisrecon.runtime._run import run_position
+from thesisrecon.pipeline.run import run_position
 from thesisrecon.runtime._run_folder import (
     ChangedRecord,
     RunDirectory,

@@ -14,8 +14,8 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
-from thesisrecon.runtime._run import stream
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines, plane_from_vanishing_points

@@ -30,9 +30,9 @@ from thesisrecon.pipeline.inputs import (
     views_of,
 )
 from thesisrecon.pipeline.job import Job
+from thesisrecon.pipeline.run import Progress, RunOptions, start_run
 from thesisrecon.records import Tracks
 from thesisrecon.results import RunResult
-from thesisrecon.runtime._run import Progress, RunOptions, start_run
 from thesisrecon.runtime._run_folder import key_of
 
 

@@ -120,7 +120,7 @@ def _run(source: Any, out: Path, seed: int, options: Mapping[str, Any], *, match
 
 def inspect(out: Annotated[Path, folder_argument("OUT", "Output folder of a run.")]) -> None:
     """Print the summary of a run, or where it stands if it has not finished."""
-    from thesisrecon.runtime._run import run_position
+    from thesisrecon.pipeline.run import run_position
     from thesisrecon.runtime._run_folder import is_running
 
     summary = read_json(out / "summary.json")

@@ -30,10 +30,10 @@ from thesisrecon.io._files import is_partial, printable, read_json, write_json, 
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder
+from thesisrecon.pipeline.run import Progress
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
-from thesisrecon.runtime._run import Progress
 from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading

@@ -32,6 +32,7 @@ from thesisrecon.pipeline.outputs import (
     best_result,
     write_outputs,
 )
+from thesisrecon.pipeline.run import Run
 from thesisrecon.pipeline.stages import (
     build_model,
     estimate_depth_maps,
@@ -45,7 +46,6 @@ from thesisrecon.pipeline.stages import (
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
-from thesisrecon.runtime._run import Run
 from thesisrecon.runtime._run_folder import RunDirectory
 
 ATTEMPTS = 3

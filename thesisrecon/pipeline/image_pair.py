@@ -14,8 +14,8 @@ from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import StageFailure
 from thesisrecon.matching._prepared import select_found
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
-from thesisrecon.runtime._run import stream
 
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | np.ndarray | Image

@@ -24,8 +24,8 @@ from thesisrecon.pipeline.image_pair import values_at, verify_matches
 from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import tracks_of_part
 from thesisrecon.pipeline.matching import FromImages, report_choice, report_matches, report_tracks
+from thesisrecon.pipeline.run import Batch, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
-from thesisrecon.runtime._run import Batch, Run, stream
 from thesisrecon.runtime._run_folder import key_of
 
 PairMatches = I64 | tuple[F64, F64]

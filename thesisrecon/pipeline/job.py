@@ -15,8 +15,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
+from thesisrecon.pipeline.run import Run, Until
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, Tracks, TwoView
-from thesisrecon.runtime._run import Run, Until
 
 
 class FrontEnd(Protocol):

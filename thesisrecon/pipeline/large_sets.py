@@ -28,6 +28,7 @@ from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.matching.pair_selection import reject_repeated_structure, strong_pairs
 from thesisrecon.pipeline.job import Job
+from thesisrecon.pipeline.run import Batch, stream
 from thesisrecon.records import (
     IntrinsicsPrior,
     MetricResult,
@@ -38,7 +39,6 @@ from thesisrecon.records import (
     TwoView,
     Upgrade,
 )
-from thesisrecon.runtime._run import Batch, stream
 
 CORE_VIEWS, MAX_CORES = 5, 8
 """Views of a core, and number of cores that are tried."""

@@ -19,8 +19,8 @@ from thesisrecon.pipeline.large_sets import (
     reconstruct_part,
 )
 from thesisrecon.pipeline.matching import image_groups
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import IntrinsicsPrior, MetricResult, Reconstruction, SelfCalibration, TwoView
-from thesisrecon.runtime._run import stream
 
 NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1")
 """Intrinsics of a result in the columns of a prior."""

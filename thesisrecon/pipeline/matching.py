@@ -22,8 +22,8 @@ from thesisrecon.optimize.bundle.observations import cached_pair_order
 from thesisrecon.pipeline.image_pair import detect_features, match_views, oblique_pairs, prepare_oblique
 from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import has_narrow_cut
+from thesisrecon.pipeline.run import Batch, Run, stream
 from thesisrecon.records import Features, Image, PairChoice, Tracks, TwoView
-from thesisrecon.runtime._run import Batch, Run, stream
 
 FEWER, FINAL = "-fewer", "final"
 """Suffix of the records of pairs matched with part of the corners, and name of the record of final pairs."""

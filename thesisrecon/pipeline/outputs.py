@@ -27,11 +27,11 @@ from thesisrecon.io._meshes import box_in_file, glb_bytes
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.pipeline.job import name_images
 from thesisrecon.pipeline.matching import final_pairs
+from thesisrecon.pipeline.run import FOLDERS, Run, Until
 from thesisrecon.records import Image, Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult
-from thesisrecon.runtime._run import FOLDERS, Run, Until
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirectory, StageFolder
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._mesh import halve_surface

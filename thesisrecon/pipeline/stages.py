@@ -20,6 +20,7 @@ from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.pipeline.job import Job, name_images
 from thesisrecon.pipeline.large_sets import calibrate_with_core
+from thesisrecon.pipeline.run import Batch, stream
 from thesisrecon.records import (
     DepthMap,
     HeldOut,
@@ -33,7 +34,6 @@ from thesisrecon.records import (
     TwoView,
 )
 from thesisrecon.results import RunResult
-from thesisrecon.runtime._run import Batch, stream
 from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, render_mesh, ssim

@@ -29,7 +29,7 @@ from typing import Any
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import clear_folder
-from thesisrecon.runtime._run import FOLDERS
+from thesisrecon.pipeline.run import FOLDERS
 from thesisrecon.runtime._run_folder import RUN_FILE
 from validation.runs.processes import failure_of, last_line, own_cores, run_jobs, run_process
 from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task

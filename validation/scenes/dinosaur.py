@@ -10,8 +10,8 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification, homography_inlier_ratio
 from thesisrecon.errors import StageFailure
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Tracks, TwoView
-from thesisrecon.runtime._run import stream
 from validation.scenes.real import data_root
 
 SIZE = (720, 576)

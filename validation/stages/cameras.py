@@ -15,8 +15,8 @@ from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.config.text import config_from_tables
 from thesisrecon.errors import StageFailure
 from thesisrecon.io._files import read_json
+from thesisrecon.pipeline.run import FOLDERS
 from thesisrecon.records import Reconstruction
-from thesisrecon.runtime._run import FOLDERS
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from validation.metrics.cameras import focal_errors_pct, measure_cameras, measure_reprojection
 from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_colmap_model

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.pipeline import large_sets, matching, stages
 from thesisrecon.pipeline.matching import PreparedViews, batch_pairs
+from thesisrecon.pipeline.run import Until
 from thesisrecon.runtime._executors import AHEAD
-from thesisrecon.runtime._run import Until
 from validation.runs.processes import call_apart
 from validation.runs.study import Part
 from validation.runs.tables import text_table

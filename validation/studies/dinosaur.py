@@ -18,9 +18,9 @@ from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_points
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
+from thesisrecon.pipeline.run import stream
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks
-from thesisrecon.runtime._run import stream
 from validation.runs.study import Part
 from validation.runs.tables import Metric, Rows
 from validation.scenes.dinosaur import Dinosaur, load_dinosaur, pairs_from_tracks

@@ -22,8 +22,8 @@ from PIL import Image as PillowImage
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
+from thesisrecon.pipeline.run import Until
 from thesisrecon.records import Reconstruction
-from thesisrecon.runtime._run import Until
 from validation.metrics.cameras import measure_cameras, relative_centre_error
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.references.libraries import load

@@ -24,8 +24,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for, prior_from_options
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline.algorithm1 import ATTEMPTS
+from thesisrecon.pipeline.run import stream
 from thesisrecon.records import MetricResult, Tracks, TwoView
-from thesisrecon.runtime._run import stream
 from validation.metrics.cameras import LEVEL, holding_std, interval_scores, pose_scores
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import Metric, Rows, text_table

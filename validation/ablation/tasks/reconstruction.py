@@ -15,8 +15,8 @@ from thesisrecon._numba import code_digest
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.pipeline.run import Until
 from thesisrecon.results import RunResult
-from thesisrecon.runtime._run import Until
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
