@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from tests.processors import NATIVE, environment, processors
 from thesisrecon import load
-from thesisrecon.api.compare import compare_models
+from thesisrecon.api.models import compare_models
 
 RUN = """
 import sys

@@ -12,12 +12,8 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
-_MODULES = {
-    name: module
-    for module, name in re.findall(
-        r"^from (\S+) import (\w+) as", Path(__file__).with_suffix(".pyi").read_text("utf-8"), re.MULTILINE
-    )
-}
+_STUB = Path(__file__).with_suffix(".pyi").read_text("utf-8")
+_MODULES = {name: module for module, name in re.findall(r"(?m)^from (\S+) import (\w+) as", _STUB)}
 __all__ = sorted([*_MODULES, "__version__"])
 
 

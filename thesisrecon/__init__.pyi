@@ -43,8 +43,8 @@ from thesisrecon.api.calibrate import absolute_dual_quadric as absolute_dual_qua
 from thesisrecon.api.calibrate import kruppa as kruppa
 
 # Stereo and surfaces
-from thesisrecon.api.stereo import rectify as rectify
-from thesisrecon.api.stereo import match_rectified as match_rectified
+from thesisrecon.api.surface import rectify as rectify
+from thesisrecon.api.surface import match_rectified as match_rectified
 from thesisrecon.records import DisparityMap as DisparityMap
 from thesisrecon.api.surface import depth_maps as depth_maps
 from thesisrecon.records import DepthMap as DepthMap
@@ -63,7 +63,7 @@ from thesisrecon.api.export import export as export
 from thesisrecon.api.export import write_mesh as write_mesh
 from thesisrecon.api.models import align_to_positions as align_to_positions
 from thesisrecon.api.models import scaled as scaled
-from thesisrecon.api.compare import compare_models as compare_models
+from thesisrecon.api.models import compare_models as compare_models
 from thesisrecon.results import ModelComparison as ModelComparison
 
 # Errors

@@ -167,10 +167,7 @@ def _warn_once(folder: Path, reason: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: NUMBA_CACHE_DIR, or the first of these that can be written to.
-
-    They are one beside the package, one in the user's cache, and an own one for temporary files.
-    """
+    """Folder of the compiled kernels: NUMBA_CACHE_DIR, or the first of some that can be written to."""
     if os.environ.get(CACHE_VARIABLE):
         return Path(os.environ[CACHE_VARIABLE]) / "thesisrecon"
     beside = PACKAGE / "__pycache__" / "kernels"

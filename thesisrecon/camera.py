@@ -190,10 +190,7 @@ def compose_camera(K: F64, R: F64, t: F64) -> F64:
 
 
 def decompose_camera(P: F64) -> tuple[F64, F64, F64]:
-    """Decompose P (3, 4) of any scale and sign into K, R and t with K33 = 1 and det R = 1 (3.21).
-
-    A singular left 3x3 part is a ``ValueError``.
-    """
+    """Decompose P (3, 4) of any scale and sign into K, R and t with K33 = 1 and det R = 1 (3.21)."""
     P = P * np.sign(_left_determinant(P, "decompose_camera"))
     K, R = rq(P[:, :3])
     t = np.linalg.solve(K, P[:, 3])
@@ -210,10 +207,7 @@ def _left_determinant(P: F64, caller: str) -> F64:
 
 
 def finite_cameras(P: F64) -> B8:
-    """Whether the centres of cameras (..., 3, 4) are finite: left 3x3 parts not singular to rounding.
-
-    The scale of each row, and so the unit of the pixels, has no influence.
-    """
+    """Whether the centres of cameras (..., 3, 4) are finite, in any unit of the pixels."""
     rows = np.linalg.norm(P[..., :3], axis=-1)
     return np.asarray(np.abs(np.linalg.det(P[..., :3])) > 1e-14 * rows.prod(axis=-1))
 
@@ -229,19 +223,13 @@ def rq(M: F64) -> tuple[F64, F64]:
 
 
 def distort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """Apply radial distortion (x, y) (1 + k1 r^2 + k2 r^4 + ...) to normalised points (N, 2).
-
-    ``distortion`` is k1, or k1, k2, ... (C,) or (N, C).
-    """
+    """Apply radial distortion k (C,) or (N, C) to points (N, 2): (x, y) (1 + k1 r^2 + k2 r^4 + ...)."""
     r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     return np.asarray(xy_normalized * _radial_factor(distortion, r2))
 
 
 def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """Invert :func:`distort` by Newton's method on r^2 (1 + k1 r^2 + ...)^2 = r_d^2.
-
-    Points beyond the largest radius that the distortion reaches have no inverse and are not changed.
-    """
+    """Invert :func:`distort` by Newton's method; points without an inverse, far outside, are not changed."""
     distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
     k = np.atleast_1d(distortion)
     slopes = k * np.arange(1, k.shape[-1] + 1)

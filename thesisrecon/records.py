@@ -137,10 +137,7 @@ class FundamentalFit:
 
 @dataclass(frozen=True)
 class TwoView:
-    """A pair of views with its epipolar geometry and its verified matches.
-
-    A pair may be accepted with an undetermined F: its matches are valid all the same.
-    """
+    """A pair of views with its epipolar geometry and its verified matches, which are valid for any F."""
 
     i: int
     j: int
@@ -238,29 +235,16 @@ INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
 
 @dataclass(frozen=True)
 class IntrinsicsPrior:
-    """Gaussian prior of the intrinsics of V views or cameras.
+    """Gaussian prior of the intrinsics of V views or cameras, in pixels at working size."""
 
-    Parameters
-    ----------
-    mean, std : ndarray (V, C)
-        C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3. Pixels at working size for focal, skew
-        and principal point; the focal's std is relative (the prior acts on log f). std 0: known, the value
-        does not move; std inf: unknown, and the mean is only a starting value (NaN for a focal without one).
-    shared : ndarray (V, C) of int
-        Rows with equal numbers in a column share the value of this column. Bundle adjustment takes the
-        sharing from its cameras instead.
-    kind : ndarray (V,) of int
-        Rows with equal numbers are cameras of the same kind (the same lens model); -1 for none.
-    spread : ndarray (C,) or (V, C), optional
-        Hierarchical prior: standard deviation of the values of a kind about their unknown common mean
-        (relative for the focal; inf = no such prior; the first row of a kind is used). None: not yet
-        estimated.
-    """
-
+    #: (V, C), C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3; NaN: a focal without initial value
     mean: F64
+    #: (V, C), relative for the focal (the prior acts on log f); 0: known, does not move; inf: only initial
     std: F64
-    shared: I64
-    kind: I64
+    shared: I64  #: (V, C) rows with equal numbers in a column share its value; unused in bundle adjustment
+    kind: I64  #: (V,) rows with equal numbers are cameras of the same kind (the same lens model); -1: none
+    #: (C,) or (V, C) hierarchical prior: standard deviation of a kind's values about their unknown mean (of
+    #: its first row; relative for the focal; inf: no such prior); None: not yet estimated
     spread: F64 | None = None
 
     @classmethod
@@ -342,15 +326,11 @@ class IntrinsicInterval:
 
 @dataclass(frozen=True)
 class MetricResult:
-    """Result of the metric stage.
-
-    ``intrinsics`` has per view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
-    "k1", "k2", "k3" (std 0: as assumed), and nothing where the view is not registered. ``pose_std`` (V, 6):
-    standard deviations of the rotation about the x, y, z axes of the camera in rad, and of the centre along
-    the axes of the model in its units, after the similarity that aligns the cameras best; NaN where unknown.
-    """
+    """Result of the metric stage."""
 
     reconstruction: Reconstruction
+    #: per registered view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
+    #: "k1", "k2", "k3" (std 0: as assumed)
     intrinsics: tuple[Mapping[str, IntrinsicInterval], ...]
     self_check: Mapping[str, float]
     trusted: bool  #: whether the self-check passed
@@ -359,6 +339,8 @@ class MetricResult:
     limitations: tuple[str, ...] = ()  #: differences between the images and the simplest camera model
     #: of the returned cameras and points; None: not tested
     identifiability: IdentifiabilityReport | None = None
+    #: (V, 6) of the rotation about the axes of the camera, rad, and of the centre along those of the model,
+    #: after the similarity that aligns the cameras best; NaN where unknown
     pose_std: F64 | None = None
 
 
@@ -458,10 +440,7 @@ class StageReport:
 
 
 def require_mesh(caller: str, mesh: TexturedMesh) -> None:
-    """``ValueError`` unless it is a mesh whose faces, colours and texture coordinates fit its vertices.
-
-    Vertices that no face uses need not be finite.
-    """
+    """``ValueError`` unless faces, colours and texture coordinates fit the vertices, finite where used."""
     if not isinstance(mesh, TexturedMesh):
         given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
         raise ValueError(f"{caller} needs a TexturedMesh; {given}")

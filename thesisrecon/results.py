@@ -242,6 +242,14 @@ class SparseView:
         """Camera centre (3,)."""
         return np.asarray(-self.R.T @ self.t)
 
+    @property
+    def intrinsics(self) -> tuple[F64, tuple[int, int], F64]:
+        """K, size and distortion of a view in which they are known."""
+        assert self.K is not None
+        assert self.size is not None
+        assert self.distortion is not None
+        return self.K, self.size, self.distortion
+
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
@@ -260,14 +268,17 @@ class SparseModel:
         """Names of the V images."""
         return [view.name for view in self.views]
 
+    @property
+    def point_colors(self) -> U8:
+        """Colours (N, 3) of the points; mid-grey if they are not known."""
+        return np.full((len(self.X), 3), 128, np.uint8) if self.colors is None else self.colors
+
     def transformed(self, similarity: Similarity) -> SparseModel:
         """Return the model in another world: y = scale R x + t of its points and camera centres."""
-        rotations = [view.R @ similarity.R.T for view in self.views]
-        shifts = [similarity.scale * view.t for view in self.views]
-        views = [
-            replace(view, R=R, t=t - R @ similarity.t)
-            for view, R, t in zip(self.views, rotations, shifts, strict=True)
-        ]
+        views = []
+        for view in self.views:
+            R = view.R @ similarity.R.T
+            views.append(replace(view, R=R, t=similarity.scale * view.t - R @ similarity.t))
         return replace(self, views=views, X=similarity.apply(self.X))
 
 
@@ -313,9 +324,8 @@ class ModelComparison:
         for name in ERRORS:
             errors = np.abs(getattr(self, name))
             if np.isfinite(errors).all():
-                rms = float(np.sqrt(np.mean(errors**2)))
-                mean, largest = float(np.mean(errors)), float(np.max(errors))
-                found[name] = {"median": float(np.median(errors)), "mean": mean, "rms": rms, "max": largest}
+                values = np.median(errors), np.mean(errors), np.sqrt(np.mean(errors**2)), np.max(errors)
+                found[name] = dict(zip(("median", "mean", "rms", "max"), map(float, values), strict=True))
         return found
 
     def as_table(self) -> dict[str, Any]:
@@ -325,9 +335,8 @@ class ModelComparison:
         -------
         dict
         """
-        columns = {"name": self.names, "name_b": self.names_b} | {
-            name: getattr(self, name) for name in ERRORS
-        }
+        columns = {"name": self.names, "name_b": self.names_b}
+        columns |= {name: getattr(self, name) for name in ERRORS}
         rows = zip(*columns.values(), strict=True)
         return {
             "cameras": [dict(zip(columns, row, strict=True)) for row in rows],

@@ -219,6 +219,6 @@ def test_wrong_input_gets_one_sentence(walled, tmp_path):
     away = [first, Camera(second.K, np.diag([-1.0, 1, -1]) @ second.R, second.t, SIZE)]
     refuses(StageFailure, "no depth was found", depth_maps, images[:2], away)
     refuses(StageFailure, "no depths", fuse_depth_maps, [np.full((180, 240), np.nan)], cameras[:1])
-    refuses(UsageError, "needs a TexturedMesh; got a NoneType", write_mesh, tmp_path / "model.glb", None)
+    refuses(ValueError, "needs a TexturedMesh; got a NoneType", write_mesh, tmp_path / "model.glb", None)
     mesh = fuse_depth_maps([ones], cameras[:1])
     refuses(UsageError, r"ending \.glb", write_mesh, tmp_path / "model.ply", mesh)

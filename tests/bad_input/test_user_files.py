@@ -115,7 +115,7 @@ def patched():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_frames, "_decoded", decoded)
         patch.setattr(
-            "thesisrecon.cli.runs._run",
+            "thesisrecon.cli.commands._run",
             lambda _, out, __, options: reconstruct(
                 photographs(2), out, config=fake_config(), threads=1, overwrite=options["overwrite"]
             ),

@@ -11,7 +11,7 @@ from tests.bad_input import files
 from tests.conftest import refuses
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
-from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_image
+from thesisrecon.io._exports import frame_name, write_animation, write_image
 from thesisrecon.io._images import list_images, read_images, scene_name
 from thesisrecon.records import Image
 
@@ -259,9 +259,8 @@ def frames(folder, count):
     return paths
 
 
-@pytest.mark.parametrize(("suffix", "apart"), [(".webp", 4.0), (".png", 0.0)])
-def test_an_animation_plays_all_frames_for_ever(suffix, apart, tmp_path):
-    path = write_animation(tmp_path / f"all{suffix}", frames(tmp_path, 4), milliseconds=50)
+def test_an_animation_plays_all_frames_for_ever(tmp_path):
+    path = write_animation(tmp_path / "all.webp", frames(tmp_path, 4), milliseconds=50)
     with PIL.Image.open(path) as image:
         assert image.n_frames == 4
         assert image.info["loop"] == 0
@@ -269,9 +268,8 @@ def test_an_animation_plays_all_frames_for_ever(suffix, apart, tmp_path):
             image.seek(k)
             image.load()
             assert image.info["duration"] == 50
-            assert np.abs(np.asarray(image.convert("RGB")).astype(int) - solid(k)).mean() <= apart
-    again = write_animation(tmp_path / f"again{suffix}", frames(tmp_path, 4), milliseconds=50)
+            assert np.abs(np.asarray(image.convert("RGB")).astype(int) - solid(k)).mean() <= 4.0
+    again = write_animation(tmp_path / "again.webp", frames(tmp_path, 4), milliseconds=50)
     assert again.read_bytes() == path.read_bytes()
-    assert animation_suffix() in (".webp", ".png")
-    with PIL.Image.open(write_animation(tmp_path / f"one{suffix}", frames(tmp_path, 1))) as image:
+    with PIL.Image.open(write_animation(tmp_path / "one.webp", frames(tmp_path, 1))) as image:
         assert image.size == (64, 48)

@@ -15,7 +15,7 @@ from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_by
 from tests.pipeline.given_scene import SIZE, given_scene
 from thesisrecon import load, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.api import reconstruct as api
-from thesisrecon.cli.runs import summary_text
+from thesisrecon.cli.commands import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure
 from thesisrecon.pipeline import matching

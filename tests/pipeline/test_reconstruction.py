@@ -17,7 +17,7 @@ from thesisrecon import load
 from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.api.views import render
 from thesisrecon.camera import Camera
-from thesisrecon.cli.runs import summary_text
+from thesisrecon.cli.commands import summary_text
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._meshes import read_mesh

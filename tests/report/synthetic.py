@@ -62,6 +62,12 @@ def made_up_pair(i, j, cameras, xy, seen):
     )  # fmt: skip
 
 
+def report_data(images=(), **more):
+    """A page of these images, without a folder."""
+    given = {"unread": {}, "features": (), "pairs": (), "groups": np.zeros(len(images), int), "settings": {}}
+    return ReportData(None, images, **(given | more))
+
+
 def made_up_run(*, names=None, points=1500, seed=4):
     """A whole run with one refused view (the last) and one file that is no photograph."""
     rng = np.random.default_rng(seed)
@@ -89,9 +95,9 @@ def made_up_run(*, names=None, points=1500, seed=4):
     pairs = [
         made_up_pair(i, j, cameras, xy, seen) for i in range(count) for j in range(i + 1, min(i + 7, count))
     ]
-    return ReportData(
-        title="Courtyard wall", images=images, reports=_reports(), config_text=CONFIG,
-        summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5}, version="0.1.0",
+    return report_data(
+        images, title="Courtyard wall", reports=_reports(), config_text=CONFIG,
+        summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
         unread={"notes.jpg": "it is no image that Pillow can read"}, pairs=pairs, metric=metric,
         affine=replace(metric.reconstruction, stratum="affine"), colors=colors,
     )  # fmt: skip
@@ -102,7 +108,7 @@ def projective_run():
     data = made_up_run()
     before = data.metric.reconstruction
     undistorted = replace(before, stratum="projective", K=None, distortion=None)
-    return replace(data, metric=None, colors=None, reconstruction=undistorted, until="projective")
+    return replace(data, metric=None, colors=None, projective=undistorted, until="projective")
 
 
 def _reconstruction(X, cameras, xy, seen, rng):
@@ -200,11 +206,11 @@ def sphere_run():
     rgb = [photograph(m).rgb for m in maps]
     seen = np.isfinite(maps[2].depth)
     shifted = np.roll(rgb[2], 1, axis=1)
-    return ReportData(
-        title="Sphere", images=tuple(map(Image, SPHERE_NAMES, rgb, [SPHERE_SIZE] * len(rgb))),
-        reports=(StageReport("dense", 2.0), StageReport("model", 1.0)), config_text="", summary={},
-        version="0.1.0", metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
-        model=sphere_model(), depth_maps={m.view: m.depth for m in maps[:-1]},
+    return report_data(
+        tuple(map(Image, SPHERE_NAMES, rgb, [SPHERE_SIZE] * len(rgb))), title="Sphere",
+        reports=(StageReport("dense", 2.0), StageReport("model", 1.0)),
+        metric=MetricResult(sphere_reconstruction(), ({},) * len(maps), {}, trusted=True),
+        model=sphere_model(), depths={m.view: m.depth for m in maps[:-1]},
         held_out=HeldOut(2, rgb[2], shifted, seen, psnr_db=27.3456, ssim=0.9123),
     )  # fmt: skip
 

@@ -14,7 +14,6 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.records import IntrinsicInterval, TexturedMesh
 from thesisrecon.report import _assessment
 from thesisrecon.report._data import (
-    ReportData,
     ResidualSummary,
     reprojection_distances,
     summarize_distances,
@@ -60,12 +59,12 @@ def test_runs_that_stopped_early_say_how_far_they_got():
     assert "Stopped early" in page
     assert 'id="scene-figure"' not in page
     assert synthetic.Structure(page).count("svg") == 8
-    only_features = replace(early, reconstruction=None, pairs=(), until="features")
+    only_features = replace(early, projective=None, pairs=(), until="features")
     page = render_report(only_features)
     assert "corners were detected" in page
     assert 'id="plotly"' not in page  # nothing to draw, nothing to carry
     failure = StageFailure("no photograph was found", "", "put JPEG files in the folder")
-    page = render_report(ReportData("empty", (), (), "", {}, "0.1.0", failure=failure))
+    page = render_report(synthetic.report_data(title="empty", end=failure))
     for text in ("No photograph was found.", "No stage finished.", "Put JPEG files in the folder."):
         assert text in page
 
@@ -108,7 +107,7 @@ def test_affine_cameras_at_infinity_are_left_out_by_number(count, offset):
 
 
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
-    data = replace(synthetic.projective_run(), reconstruction=None, until="matches")
+    data = replace(synthetic.projective_run(), projective=None, until="matches")
     nothing = replace(
         data.pairs[0], F=np.zeros((3, 3)), sigma_px=float("nan"), homography_inlier_ratio=float("nan"),
         xy1=np.zeros((0, 2)), xy2=np.zeros((0, 2)), accepted=False, reason="too few matches for an F",
@@ -143,7 +142,7 @@ def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     texture = np.repeat(np.repeat(rng.integers(60, 190, (512, 512, 3), dtype=np.uint8), 4, 0), 4, 1)
     model = TexturedMesh(vertices, faces, uv=uv[faces], texture=texture)
     summary, maps = data.summary | {"cameras": cameras}, dict.fromkeys(range(1000), depth)
-    page = render_report(replace(data, model=model, summary=summary, depth_maps=maps))
+    page = render_report(replace(data, model=model, summary=summary, depths=maps))
     structure = synthetic.Structure(page)
     # 25,000 coloured points take 0.7 MB more than those of this run.
     assert len(page.encode()) < 9_300_000
@@ -166,7 +165,7 @@ def test_a_page_with_a_model_holds_its_viewer_depth_and_comparison():
     assert "<b>.jpg" not in page
     assert render_report(synthetic.sphere_run()) == page
     empty = replace(data.model, faces=np.zeros((0, 3), dtype=np.int64))
-    bare = render_report(replace(data, model=empty, held_out=None, depth_maps={}))
+    bare = render_report(replace(data, model=empty, held_out=None, depths={}))
     for trace in ("model-data", 'id="model"', 'id="depth"', 'id="held-out"'):
         assert trace not in bare
 
@@ -181,7 +180,7 @@ def test_only_the_scripts_of_the_page_may_run():
         digests = [hashlib.sha256(body.encode()).digest() for body in bodies]
         assert len(allowed) == len(bodies) == scripts
         assert sorted(allowed) == sorted("sha256-" + base64.b64encode(d).decode() for d in digests)
-    nothing = render_report(replace(synthetic.projective_run(), reconstruction=None, pairs=()))
+    nothing = render_report(replace(synthetic.projective_run(), projective=None, pairs=()))
     assert "script-src 'none'" in html.unescape(nothing)
     assert "<script" not in nothing
 
@@ -245,7 +244,7 @@ def test_the_assessment_is_honest():
 
 def test_a_failure_states_reason_evidence_and_advice():
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
-    data = replace(synthetic.projective_run(), reconstruction=None, until=None, failure=failure)
+    data = replace(synthetic.projective_run(), projective=None, until=None, end=failure)
     assessment = _assessment.assess(replace(data, reports=data.reports[:2]))
     assert assessment.level == "bad"
     assert assessment.sentence == "No pair overlaps."
@@ -259,7 +258,7 @@ def test_the_head_of_the_page_summarises_the_run():
     facts = _assessment.key_facts(synthetic.made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
-    early = replace(synthetic.projective_run(), reconstruction=None)
+    early = replace(synthetic.projective_run(), projective=None)
     assert [fact.label for fact in _assessment.key_facts(early, None)] == [
         "Images",
         "Pairs accepted",

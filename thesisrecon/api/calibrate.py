@@ -31,24 +31,16 @@ METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
 
 
 def self_calibrate(
-    reconstruction: Reconstruction | F64,
-    sizes: I64 | None = None,
-    *,
-    X: F64 | None = None,
-    xy: F64 | None = None,
-    method: str | SelfCalibrator | None = None,
-    config: Config | None = None,
-    images: Sequence[Image] = (),
-    seed: int = 0,
-) -> SelfCalibration:
+    reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
+    xy: F64 | None = None, method: str | SelfCalibrator | None = None, config: Config | None = None,
+    images: Sequence[Image] = (), seed: int = 0,
+) -> SelfCalibration:  # fmt: skip
     """Estimate the metric frame and the intrinsics of a projective reconstruction (chapter 7).
 
     Parameters
     ----------
-    reconstruction : Reconstruction or ndarray (V, 3, 4)
-        Projective reconstruction of at least three views, or their cameras P alone.
-    sizes : array_like (V, 2) or (2,)
-        Image width and height, for plain P.
+    reconstruction, sizes : Reconstruction or ndarray (V, 3, 4), array_like (V, 2) or (2,)
+        Projective reconstruction of at least three views, or P alone with image width and height.
     X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
         Points and their pixels for plain P, as in :func:`thesisrecon.reconstruction_from_cameras`. Without
         them the world may be mirrored, and noise is not considered.
@@ -69,8 +61,7 @@ def self_calibrate(
     Raises
     ------
     ValueError, StageFailure
-        If the reconstruction is not projective, the method is unknown or the seed is invalid; if no
-        calibration is determined.
+        If an argument is invalid; if no calibration is determined.
 
     Examples
     --------
@@ -100,33 +91,22 @@ def self_calibrate(
 
 
 def absolute_dual_quadric(
-    reconstruction: Reconstruction | F64,
-    sizes: I64 | None = None,
-    *,
-    X: F64 | None = None,
-    xy: F64 | None = None,
-    config: Config | None = None,
-    method: str = "nonlinear",
-) -> SelfCalibration:
+    reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
+    xy: F64 | None = None, config: Config | None = None, method: str = "nonlinear",
+) -> SelfCalibration:  # fmt: skip
     """Estimate the absolute dual quadric Q of projective cameras, P Q P' ~ K K' (7.3, direct; HZ 19.3).
 
     Parameters
     ----------
     reconstruction, sizes, X, xy, config
-        As for :func:`self_calibrate`.
+        As for :func:`self_calibrate`, which raises the same.
     method : {"nonlinear", "linear"}
-        Nonlinear least squares over all unknown intrinsics, or linear equations, which are biased for most
-        lenses.
+        Least squares over all unknown intrinsics, or linear equations, which are biased for most lenses.
 
     Returns
     -------
     SelfCalibration
         ``Q`` (4, 4), ``K`` (V, 3, 3), ``identifiable``, ``reasons`` and the rest.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        As :func:`self_calibrate`.
 
     Examples
     --------
@@ -144,17 +124,10 @@ def absolute_dual_quadric(
 
 
 def plane_at_infinity(
-    reconstruction: Reconstruction | F64,
-    sizes: I64 | None = None,
-    *,
-    X: F64 | None = None,
-    xy: F64 | None = None,
-    config: Config | None = None,
-    images: Sequence[Image] = (),
-    seed: int = 0,
-    vanishing_points: F64 | None = None,
-    method: str | SelfCalibrator | None = None,
-) -> F64:
+    reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
+    xy: F64 | None = None, config: Config | None = None, images: Sequence[Image] = (), seed: int = 0,
+    vanishing_points: F64 | None = None, method: str | SelfCalibrator | None = None,
+) -> F64:  # fmt: skip
     """Locate the plane at infinity of a projective frame (chapter 7, stratified).
 
     Parameters
@@ -204,46 +177,33 @@ def plane_at_infinity(
 
 
 def upgrade_affine(
-    reconstruction: Reconstruction,
-    plane: F64 | None = None,
-    *,
-    config: Config | None = None,
-    images: Sequence[Image] = (),
-    seed: int = 0,
-) -> Reconstruction:
+    reconstruction: Reconstruction, plane: F64 | None = None, *, config: Config | None = None,
+    images: Sequence[Image] = (), seed: int = 0,
+) -> Reconstruction:  # fmt: skip
     """Upgrade a projective reconstruction to an affine one (3.4.3, chapter 7).
-
-    Parallel lines and ratios of lengths along them are then those of the scene.
 
     Parameters
     ----------
-    reconstruction : Reconstruction
-        Projective reconstruction.
-    plane : ndarray (4,), optional
-        Plane at infinity in the projective frame; None: located by :func:`plane_at_infinity`.
+    reconstruction, plane : Reconstruction, ndarray (4,)
+        Projective reconstruction, and its plane at infinity (None: located by :func:`plane_at_infinity`).
     config, images, seed
         As for :func:`self_calibrate`.
 
     Returns
     -------
     Reconstruction
-        The same cameras and points in an affine frame.
+        Parallel lines, and ratios of lengths along them, are those of the scene.
 
     Raises
     ------
     ValueError, StageFailure
-        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid; if
-        the plane at infinity cannot be located.
+        If an argument is invalid; if the plane at infinity cannot be located.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
-    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
-    >>> projective = Reconstruction(
-    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
-    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
-    ... )
+    ``projective`` as in the example of `thesisrecon.self_calibrate`:
+
+    >>> from thesisrecon import upgrade_affine
     >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
     >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
     ('affine', True)
@@ -261,9 +221,8 @@ def _projective(
     if not isinstance(given, Reconstruction):
         if sizes is None:
             way = "reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
-            raise ValueError(
-                f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
-            )
+            message = f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
+            raise ValueError(message)
         return reconstruction_from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
     if given.stratum == "projective":
         return given
@@ -277,11 +236,9 @@ def _projective(
 
 
 def _method(
-    projective: Reconstruction,
-    method: str | SelfCalibrator | None,
-    config: Config | None,
+    projective: Reconstruction, method: str | SelfCalibrator | None, config: Config | None,
     images: Sequence[Image],
-) -> tuple[SelfCalibrator, PipelineConfig]:
+) -> tuple[SelfCalibrator, PipelineConfig]:  # fmt: skip
     settings = as_config(config)
     if isinstance(method, str):
         if method not in METHODS:
@@ -304,15 +261,12 @@ def _method(
 def kruppa(F: F64, sizes: I64) -> F64:
     """Calibrate one constant camera from fundamental matrices alone, by the Kruppa equations (section 7.3).
 
-    Square pixels without skew and a principal point within about 1 % of the image centre are assumed. F is
-    normalised first; :class:`KruppaEquations` also allows different cameras.
+    Square pixels without skew and a principal point within about 1 % of the image centre are assumed.
 
     Parameters
     ----------
-    F : ndarray (M, 3, 3) or (3, 3)
-        Fundamental matrices of M pairs of images of the camera, px.
-    sizes : array_like (2,) or (V, 2)
-        Width and height of the images, all equal.
+    F, sizes : ndarray (M, 3, 3) or (3, 3), array_like (2,) or (V, 2)
+        Fundamental matrices of M pairs of images of the camera, px; their width and height, all equal.
 
     Returns
     -------
@@ -321,10 +275,8 @@ def kruppa(F: F64, sizes: I64) -> F64:
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
-    StageFailure
-        If the equations do not determine the focal length, or have several solutions.
+    ValueError, StageFailure
+        If an argument is invalid; if the focal length is not determined, or has several solutions.
 
     Examples
     --------

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon.api.arguments import (
-    CameraInput,
-    as_cameras,
-    checked_cameras,
-    checked_points,
-    radial_coefficients,
-    require_inside,
+from thesisrecon.arrays import (
+    B8,
+    F64,
+    I64,
+    Stratum,
+    require_calibration,
+    require_finite,
+    require_rotations,
+    require_shapes,
 )
-from thesisrecon.arrays import B8, F64, I64, Stratum, require_calibration, require_finite, require_shapes
-from thesisrecon.camera import Camera
+from thesisrecon.camera import Camera, compose_camera, decompose_camera
 from thesisrecon.errors import unknown_word
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
@@ -27,6 +29,8 @@ from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate
 from thesisrecon.optimize.robust_resection import Resection, resect_robust
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 
+CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
+"""Cameras, (K, R, t), cameras by image name, or a metric reconstruction."""
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
     "k3": (7,),
@@ -72,19 +76,11 @@ class BundleAdjustment:
 
 
 def bundle_adjust(
-    cameras: CameraInput,
-    X: F64 | None = None,
-    xy: F64 | Tracks | Observations | None = None,
-    *,
-    sizes: I64 | None = None,
-    shared: bool | I64 = True,
-    free: Sequence[str] = ("focal", "k1"),
-    prior: Mapping[str, float] | None = None,
-    loss: str = "huber",
-    loss_px: float | None = None,
-    sigma_px: float | None = None,
-    max_iterations: int = 200,
-) -> BundleAdjustment:
+    cameras: CameraInput, X: F64 | None = None, xy: F64 | Tracks | Observations | None = None, *,
+    sizes: I64 | None = None, shared: bool | I64 = True, free: Sequence[str] = ("focal", "k1"),
+    prior: Mapping[str, float] | None = None, loss: str = "huber", loss_px: float | None = None,
+    sigma_px: float | None = None, max_iterations: int = 200,
+) -> BundleAdjustment:  # fmt: skip
     """Refine cameras and points together, with their covariances (6.7, HZ 18.1 and A6.3).
 
     Minimises sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - q0) / std)^2 over poses, points and the free
@@ -95,44 +91,31 @@ def bundle_adjust(
     cameras : sequence of Camera, tuple (K, R, t) or Reconstruction
         Initial cameras; or K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
         reconstruction: its registered views and, if X and xy are not given, its valid points and inliers.
-    X : ndarray (N, 3)
-        Initial points.
-    xy : ndarray (V, N, 2), Tracks or Observations
-        Pixels of the points, NaN = not seen; or a list with ``view_index``, ``point_index`` and ``xy``.
-    sizes : array_like (V, 2) or (2,), optional
-        Image width and height, for plain arrays.
+    X, xy, sizes : ndarray (N, 3), ndarray (V, N, 2) or Tracks or Observations, array_like (V, 2) or (2,)
+        Initial points; their pixels, NaN = not seen, or a list with ``view_index``, ``point_index`` and
+        ``xy``; image width and height, for plain arrays.
     shared : bool or ndarray (V,) of int
-        True: images of the same size share their free intrinsics, which start at their mean; False: each
-        image has its own; or a camera number per image.
-    free : sequence of str
-        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
-    prior : mapping of str to float, optional
-        Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
-        relative for "focal", in pixels for "principal_point" and "skew".
-    loss, loss_px : {"huber", "squared"}, float
-        Loss, and the residual at which Huber's loss becomes linear (None: two standard deviations of the
-        noise).
-    sigma_px : float, optional
-        Standard deviation of one image coordinate. None: estimated from the residuals.
+        Whether images of the same size share their free intrinsics, from their mean; or camera numbers.
+    free, prior : sequence of str, mapping of str to float
+        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3"; and standard
+        deviations of these about the given cameras: relative for "focal", px for "principal_point", "skew".
+    loss, loss_px, sigma_px : {"huber", "squared"}, float, float
+        Loss; the residual at which Huber's becomes linear (None: two standard deviations of the noise); the
+        standard deviation of one image coordinate (None: estimated from the residuals).
     max_iterations : int
         Maximum number of linear solves; if they do not suffice, ``converged`` is false.
 
     Returns
     -------
     BundleAdjustment
-        Cameras, points, residuals and covariances; poses and points without observations are unchanged.
+        Cameras, points, residuals, and covariances of the linearised problem at the minimum; poses and points
+        without observations are unchanged.
 
     Raises
     ------
     ValueError
         If the arrays do not fit together, pixels lie far outside their images, most points lie behind the
         cameras, there are fewer equations than unknowns, or an option is invalid.
-
-    Notes
-    -----
-    The covariances are those of the linearised problem at the minimum, with the noise estimated from the
-    residuals (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the
-    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
 
     Examples
     --------
@@ -158,7 +141,7 @@ def bundle_adjust(
     start = _start(views, shared, chosen)
     knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
     _check(start, X, observed, chosen, bool(prior))
-    require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
+    _require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
     noise = weight = 1.0 if sigma_px is None else sigma_px
     # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
     for last in (True,) if sigma_px is not None else (False, True):
@@ -192,11 +175,8 @@ def bundle_adjust(
 
 
 def _problem(
-    cameras: CameraInput,
-    X: F64 | None,
-    xy: F64 | Tracks | Observations | None,
-    sizes: I64 | None,
-) -> tuple[list[Camera], F64, Observations, tuple[int, ...] | None]:
+    cameras: CameraInput, X: F64 | None, xy: F64 | Tracks | Observations | None, sizes: I64 | None,
+) -> tuple[list[Camera], F64, Observations, tuple[int, ...] | None]:  # fmt: skip
     """Cameras, points and observations, and the shape of xy if it was dense."""
     views = as_cameras("bundle_adjust", cameras, sizes)
     if isinstance(cameras, Reconstruction) and X is None and xy is None:
@@ -278,26 +258,22 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
     behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
     # Of most points only if the poses use another convention.
     if behind > 0.5:
-        raise ValueError(
-            f"{behind:.0%} of the observed points lie behind their cameras; R is world to camera and "
-            "t = -R centre"
-        )
+        rule = "R is world to camera and t = -R centre"
+        raise ValueError(f"{behind:.0%} of the observed points lie behind their cameras; {rule}")
     seen = np.unique(view)
     assert start.shared is not None
     own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
     unknowns = POSE_DOF * len(seen) + 3 * len(np.unique(point)) + own - 7  # those of a similarity
     if 2 * len(view) < unknowns or len(seen) < 2:
-        raise ValueError(
-            f"bundle_adjust needs two views and as many equations as unknowns; {len(view)} observations in "
-            f"{len(seen)} views give {2 * len(view)} equations for {unknowns} unknowns"
-        )
+        given = f"{len(view)} observations in {len(seen)} views give {2 * len(view)} equations"
+        rule = "bundle_adjust needs two views and as many equations as unknowns"
+        raise ValueError(f"{rule}; {given} for {unknowns} unknowns")
 
 
 def cheirality(P: F64, X: F64) -> F64:
     """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
 
-    The scales of X and P do not matter, negative ones included. The magnitude is an inverse depth (the thesis
-    takes it for a depth), without a unit if P is not normalised.
+    The scales of X and P do not matter; the magnitude is an inverse depth (the thesis takes it for a depth).
 
     Parameters
     ----------
@@ -329,14 +305,11 @@ def resect(
 
     Parameters
     ----------
-    X, xy : array_like (N, 3) and (N, 2)
-        Points, N >= 6 (N >= 4 with K), and their pixels.
-    K : ndarray (3, 3), optional
-        Calibration matrix; None: estimated, which needs points off one plane.
-    threshold_px : float or None
-        Reprojection error of an inlier during the search; None: all points are inliers.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
+    X, xy, K : array_like (N, 3), (N, 2) and (3, 3)
+        Points, N >= 6 (N >= 4 with K), and their pixels; the calibration matrix (None: estimated, which needs
+        points off one plane).
+    threshold_px, seed : float or None, int or numpy.random.Generator
+        Reprojection error of an inlier during the search (None: all points are inliers); the random seed.
 
     Returns
     -------
@@ -345,12 +318,9 @@ def resect(
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
-        lengths and K33 = 1.
-    StageFailure
-        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
-        behind the camera that fits them, as in left-handed coordinates.
+    ValueError, StageFailure
+        If an argument is invalid; if there are too few points or inliers, all points lie in one plane and K
+        is not given, or points are behind the camera that fits them, as in left-handed coordinates.
 
     Examples
     --------
@@ -370,9 +340,8 @@ def resect(
         require_calibration("resect", K)
     require_finite("resect", X, xy)
     if threshold_px is not None and not 0.0 < threshold_px < np.inf:
-        raise ValueError(
-            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
-        )
+        rule = "threshold_px must be positive and finite, or None for no search"
+        raise ValueError(f"{rule}; got {threshold_px}")
     return resect_robust(X, xy, K, threshold_px, np.random.default_rng(seed))
 
 
@@ -397,7 +366,7 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     Raises
     ------
     ValueError
-        Unknown method, wrong shapes, infinite pixels, or unsuitable cameras.
+        If an argument is invalid or infinite.
 
     Examples
     --------
@@ -426,24 +395,22 @@ def reconstruction_from_cameras(
     *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
     stratum: Stratum = "metric", sigma_px: float = 1.0,
 ) -> Reconstruction:  # fmt: skip
-    """Return the reconstruction of plain arrays.
+    """Return the reconstruction of plain arrays, in which all views are registered.
 
     Parameters
     ----------
     *cameras : ndarray
         P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
-    sizes : array_like (V, 2) or (2,)
-        Image width and height.
-    X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
-        Points, and their pixels, NaN where not observed; X None: triangulated from xy.
+    sizes, X, xy : array_like (V, 2) or (2,), ndarray (N, 3) or (N, 4), ndarray (V, N, 2)
+        Image width and height; points (None: triangulated), and their pixels, NaN where not observed.
     stratum, sigma_px : {"metric", "affine", "projective"}, float
         Frame of P, and the noise of one image coordinate.
 
     Returns
     -------
     Reconstruction
-        All views registered; ``ValueError`` if the arrays do not fit together, K is no calibration matrix
-        or R no rotation as in :class:`thesisrecon.Camera`, or pixels lie far outside their images.
+        ``ValueError`` if the arrays do not fit together, K is no calibration matrix or R no rotation as in
+        :class:`thesisrecon.Camera`, or pixels lie far outside their images.
 
     Examples
     --------
@@ -453,11 +420,132 @@ def reconstruction_from_cameras(
     >>> reconstruction_from_cameras(K, R, t, sizes=(640, 480)).P[1].tolist()
     [[800.0, 0.0, 0.0, -800.0], [0.0, 800.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
     """
-    P, K, sizes = checked_cameras(cameras, sizes, metric=stratum == "metric")
-    Xh, view, point, pixels = checked_points(P, sizes, X, xy, finite=stratum == "metric")
+    P, K, sizes = _checked_cameras(cameras, sizes, metric=stratum == "metric")
+    Xh, view, point, pixels = _checked_points(P, sizes, X, xy, finite=stratum == "metric")
     tracks = Tracks(view, point, pixels, len(P), len(Xh))
     valid = np.any(Xh != 0.0, axis=1)
     return Reconstruction(
         stratum, P, Xh, np.ones(len(P), dtype=bool), valid, valid[point], tracks, sizes, sigma_px,
         ("",) * len(P), K, None if K is None else np.zeros((len(P), 3)),
     )  # fmt: skip
+
+
+def _calibrated(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F64]:
+    """K (V, 3, 3), also of one camera, R (V, 3, 3) and t (V, 3)."""
+    K, R, t = (np.asarray(one, dtype=np.float64) for one in (K, R, t))
+    K = np.broadcast_to(K, (len(R), 3, 3)) if K.ndim == 2 else K
+    require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
+    return K, R, t
+
+
+def _checked_sizes(caller: str, sizes: I64, n: int) -> I64:
+    """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
+    given = np.asarray(sizes)
+    if given.shape not in ((2,), (n, 2)) or not np.isin(given.dtype.kind, ("i", "u", "f")):
+        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height; got {given.shape}, V = {n}")
+    if not (np.isfinite(given).all() and (given >= 1).all() and (given == np.round(given)).all()):
+        raise ValueError(f"{caller} needs sizes of whole numbers above 0; got {given.tolist()}")
+    return np.broadcast_to(given, (n, 2)).astype(np.int64)
+
+
+def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tuple[F64, F64 | None, I64]:
+    """P (V, 3, 4), K (V, 3, 3) of a metric frame, and sizes (V, 2), of P alone or of K, R and t."""
+    caller = "reconstruction_from_cameras"
+    K: F64 | None = None
+    if len(cameras) == 1:
+        P = np.asarray(cameras[0], dtype=np.float64)
+        require_shapes(caller, P=(P, ("V", 3, 4)))
+        require_finite(caller, P)
+        if metric:
+            K, R, t = (np.stack(part) for part in zip(*map(decompose_camera, P), strict=True))
+            P = compose_camera(K, R, t)
+    elif len(cameras) == 3 and metric:
+        K, R, t = _calibrated(caller, *cameras)
+        require_finite(caller, K, R, t)
+        for one in K:
+            require_calibration(caller, one)
+        require_rotations(caller, R)
+        P = compose_camera(K, R, t)
+    else:
+        raise ValueError(f"{caller} needs P, or K, R and t of a metric frame; got {len(cameras)} arrays")
+    return P, K, _checked_sizes(caller, sizes, len(P))
+
+
+def _require_inside(view: I64, xy: F64, sizes: I64) -> None:
+    """Raise ``ValueError`` if pixels (K, 2) lie far outside the images of their views; ``sizes`` (V, 2)."""
+    size = sizes[view]
+    reach = (np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1)
+    # Pixels this far outside show that the size is wrong, for example height x width.
+    if len(reach) and reach.max() > 0.1:
+        k = int(reach.argmax())
+        what = f"its size {tuple(size[k].tolist())} by {reach[k]:.0%} of the long side"
+        raise ValueError(f"pixels of view {view[k]} lie outside {what}; sizes are (width, height)")
+
+
+def _checked_points(
+    P: F64, sizes: I64, X: F64 | None, xy: F64 | None, *, finite: bool
+) -> tuple[F64, I64, I64, F64]:
+    """Points (N, 4), zeros where unknown, and view, point and pixels (K,), (K,), (K, 2) of observations."""
+    caller = "reconstruction_from_cameras"
+    if xy is None:
+        xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)
+    xy = np.asarray(xy, dtype=np.float64)
+    require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
+    _require_inside(views, xy[views, point], sizes)
+    if X is None:
+        X = triangulate_points(P, xy) if xy.shape[1] else np.zeros((0, 4))
+    X = np.asarray(X, dtype=np.float64)
+    X = homogenize(X) if X.ndim == 2 and X.shape[1] == 3 else X
+    require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
+    require_finite(caller, X)
+    if finite:
+        near = np.abs(X[:, 3:]) > 1e-12 * np.linalg.norm(X, axis=1, keepdims=True)
+        X = np.where(near, X / np.where(near, X[:, 3:], 1.0), 0.0)
+    return X, views, point, xy[views, point]
+
+
+def as_cameras(
+    caller: str, cameras: CameraInput, sizes: I64 | None = None, names: Sequence[str] = ()
+) -> list[Camera]:
+    """The cameras in order; the registered ones of a reconstruction; of a mapping those of ``names``."""
+    if isinstance(cameras, Reconstruction):
+        return _registered_cameras(caller, cameras)
+    if isinstance(cameras, Mapping):
+        missing = [name for name in names if name not in cameras]
+        if missing:
+            first = next(iter(cameras), None)
+            raise ValueError(f"{caller} got no camera for {missing[0]}; the first camera is that of {first}")
+        return [cameras[name] for name in names or cameras]
+    given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
+    if given and all(isinstance(one, Camera) for one in given):
+        return given
+    if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
+        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
+        raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
+    if sizes is None:
+        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")
+    K, R, t = _calibrated(caller, *given)
+    return [Camera(*one) for one in zip(K, R, t, _checked_sizes(caller, sizes, len(R)), strict=True)]
+
+
+def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
+    if r.stratum != "metric" or r.K is None:
+        raise ValueError(f"{caller} needs a metric reconstruction with K; got {r.stratum}")
+    lenses = np.zeros((len(r.P), 3)) if r.distortion is None else r.distortion
+    views = []
+    for i in np.flatnonzero(r.registered):
+        Rt = np.linalg.solve(r.K[i], r.P[i])
+        views.append(Camera(r.K[i], Rt[:, :3], Rt[:, 3], tuple(r.sizes[i].tolist()), lenses[i]))
+    return views
+
+
+def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
+    """Distortion k1, k2, k3 (V, 3) of cameras; ``ValueError`` if one has further coefficients."""
+    table = np.zeros((len(views), 3))
+    for row, view in zip(table, views, strict=True):
+        lens = np.zeros(0) if view.distortion is None else view.distortion
+        if np.any(lens[3:]):
+            raise ValueError(f"{caller} takes distortion by k1, k2, k3; got {len(lens)} coefficients")
+        row[: len(lens[:3])] = lens[:3]
+    return table

@@ -19,7 +19,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io import _exports as formats
 from thesisrecon.io._colmap import COLMAP_FILES, has_skew, write_sparse_model
-from thesisrecon.io._exports import calibration, coefficients, write_image
+from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import first_repeated, read_json, require_image_name, write_atomically
 from thesisrecon.io._images import (
     MAX_DECODED_BYTES,
@@ -82,36 +82,25 @@ FORMATS = (*_PINHOLE, *_DISTORTED)
 
 
 def export(
-    model: SparseModel | RunResult | str | Path,
-    out: str | Path,
-    *,
-    to: str,
-    images: str | Path | None = None,
-    masks: str | Path | None = None,
-    threads: int = 0,
+    model: SparseModel | RunResult | str | Path, out: str | Path, *, to: str,
+    images: str | Path | None = None, masks: str | Path | None = None, threads: int = 0,
     overwrite: bool = False,
-) -> ExportReport:
+) -> ExportReport:  # fmt: skip
     """Write a model for another program.
 
     Parameters
     ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
-    out : path
-        Folder of the export; created if missing.
+    model, out : SparseModel or RunResult or path, path
+        A model, a run or its output folder, or a COLMAP model; the folder of the export, created if missing.
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
         of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
-    images : path, optional
-        Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
-        are used as stored, without EXIF rotation.
-    masks : path, optional
-        Folder of the masks of the original images; None: that of the run, if it had masks. Transparent pixels
-        of the images are masked too.
-    threads : int
-        Number of images that are undistorted at the same time; 0: one per processor.
-    overwrite : bool
-        Replace files of the same names that thesisrecon did not write, or that were changed since.
+    images, masks : path, optional
+        Folders of the original images (those of a COLMAP model are used as stored, without EXIF rotation) and
+        of their masks; None: those that the run was made from. Transparent pixels are masked too.
+    threads, overwrite : int, bool
+        Number of images that are undistorted at the same time (0: one per processor); replace files of the
+        same names that thesisrecon did not write, or that were changed since.
 
     Returns
     -------
@@ -169,18 +158,14 @@ def export(
         # Programs want a mask for every image or for none.
         for view, name, there in zip(undistorted.views, names if masked else (), has_mask, strict=False):
             if not there:
-                write_image(folder / name, np.full(calibration(view)[1][::-1], 255, dtype=np.uint8))
+                write_image(folder / name, np.full(view.intrinsics[1][::-1], 255, dtype=np.uint8))
         return ExportReport(_PINHOLE[to](folder, undistorted, masked), tuple(notes))
 
 
 def require_separate(
-    folder: Path,
-    to: str,
-    *,
-    model: str | Path | None = None,
-    images: str | Path | None = None,
+    folder: Path, to: str, *, model: str | Path | None = None, images: str | Path | None = None,
     masks: str | Path | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Raise ``UsageError`` if an export would replace the model, images or masks that it reads."""
     written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
@@ -189,9 +174,8 @@ def require_separate(
     there = [path for path in written if path.exists()]
     lost = next((path for path in given if path.exists() and any(map(path.samefile, there))), None)
     if lost is not None:
-        raise UsageError(
-            f"the export to {folder} would replace the originals in {lost}; export to another folder"
-        )
+        message = f"the export to {folder} would replace the originals in {lost}; export to another folder"
+        raise UsageError(message)
 
 
 def _require_cameras(model: SparseModel, to: str) -> None:
@@ -249,16 +233,14 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
     views, xy = list[SparseView](), model.xy.copy()
     rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
-        K, size = calibration(view)
-        key = (K.tobytes(), coefficients(view).tobytes(), size)
+        K, size, distortion = view.intrinsics
+        key = (K.tobytes(), distortion.tobytes(), size)
         if key not in frames:
             frames[key] = _pinhole_frame(view, centred=bundler)
         K, size = frames[key]
-        here = rows[i]
+        here, name = rows[i], _file_name(view.name, plain=bundler)
         xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
-        views.append(
-            replace(view, name=_file_name(view.name, plain=bundler), K=K, size=size, distortion=np.zeros(3))
-        )
+        views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
     _require_distinct([view.name for view in views], "be written as")
     return replace(model, views=views, xy=xy)
 
@@ -266,9 +248,8 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
 def _require_distinct(names: Sequence[str], what: str) -> None:
     twice = first_repeated(names, as_files=True)
     if twice is not None:
-        raise UsageError(
-            f"two images of the model would {what} {twice} (regardless of case); rename one of them"
-        )
+        message = f"two images of the model would {what} {twice} (regardless of case); rename one of them"
+        raise UsageError(message)
 
 
 def _file_name(name: str, *, plain: bool) -> str:
@@ -280,42 +261,39 @@ def _file_name(name: str, *, plain: bool) -> str:
 
 def _normalized(view: SparseView, xy: F64) -> F64:
     """Undistorted normalised points (N, 2) of pixels."""
-    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(calibration(view)[0]).T), coefficients(view))
+    K, _, distortion = view.intrinsics
+    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(K).T), distortion)
 
 
 def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:
     """K of the same focal lengths, without skew, and size of the largest pinhole image in the original."""
-    original, (width, height) = calibration(view)
-    x, y = np.arange(float(width)), np.arange(float(height))
-    sides = [(np.zeros(height), y), (np.full(height, width - 1.0), y), (x, np.zeros(width))]
-    borders = [
-        _normalized(view, np.column_stack(side)) for side in (*sides, (x, np.full(width, height - 1.0)))
-    ]
+    original, sides, distortion = view.intrinsics
+    x, y = (np.arange(float(side)) for side in sides)
+    borders = [(0.0 * y, y), (0.0 * y + x[-1], y), (x, 0.0 * x), (x, 0.0 * x + y[-1])]
+    left, right, top, bottom = (_normalized(view, np.column_stack(border)) for border in borders)
     focal = np.array([original[0, 0], original[0, 0] if centred else original[1, 1]])
-    low = focal * [borders[0][:, 0].max(), borders[2][:, 1].max()]
-    high = focal * [borders[1][:, 0].min(), borders[3][:, 1].min()]
+    low, high = focal * [left[:, 0].max(), top[:, 1].max()], focal * [right[:, 0].min(), bottom[:, 1].min()]
     corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
-    inner = min(1.0, 0.99 * _growing_radius(coefficients(view)) / corner)
+    inner = min(1.0, 0.99 * _growing_radius(distortion) / corner)
     low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
     # The image extends beyond the original by at most half of each side.
-    max_growth, rounding_px = 0.5, 1e-6
+    growth, rounding_px = 0.5 * np.array(sides), 1e-6
     if centred:
-        reach = np.minimum(np.minimum(-low, high), np.array([width, height]) * (0.5 + max_growth))
+        reach = np.minimum(np.minimum(-low, high), 2.0 * growth)
         size = np.floor(2.0 * reach + rounding_px).astype(np.int64) + 1
         K[:2, 2] = (size - 1) / 2
     else:
-        centre, growth = original[:2, 2], max_growth * np.array([width, height])
+        centre = original[:2, 2]
         first = np.ceil(np.maximum(low + centre, -growth) - rounding_px)
-        last = np.floor(np.minimum(high + centre, np.array([width, height]) - 1 + growth) + rounding_px)
+        last = np.floor(np.minimum(high + centre, np.array(sides) - 1 + growth) + rounding_px)
         size = (last - first).astype(np.int64) + 1
         K[:2, 2] = centre - first
     if not (np.isfinite(K).all() and size.min() >= 16):
-        k = ", ".join(f"{value:.3g}" for value in coefficients(view))
+        k = ", ".join(f"{value:.3g}" for value in distortion)
         place = f"distortion {k}, principal point {original[0, 2]:.0f}, {original[1, 2]:.0f}"
-        raise UsageError(
-            f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px ({place}); "
-            "the camera is not plausible, so export the model as colmap"
-        )
+        advice = "the camera is not plausible, so export the model as colmap"
+        what = f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px"
+        raise UsageError(f"{what} ({place}); {advice}")
     return K, (int(size[0]), int(size[1]))
 
 
@@ -329,27 +307,21 @@ def _growing_radius(distortion: F64) -> float:
 
 def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
     if images is None:
-        raise UsageError(
-            "the model does not record the folder of its images; give it with --images (images=)"
-        )
+        message = "the model does not record the folder of its images; give it with --images (images=)"
+        raise UsageError(message)
     return find_images(Path(images), model.names)
 
 
 def _write_images(
-    folder: Path,
-    model: SparseModel,
-    pinholes: SparseModel,
-    paths: Sequence[Path],
-    masks: Mapping[str, Path],
-    mask_names: Sequence[str],
-    threads: int,
-) -> list[bool]:
+    folder: Path, model: SparseModel, pinholes: SparseModel, paths: Sequence[Path], masks: Mapping[str, Path],
+    mask_names: Sequence[str], threads: int,
+) -> list[bool]:  # fmt: skip
     """Undistort the images of a model into a folder, and their masks; return which have one."""
     whole = int(np.iinfo(np.int32).max)
 
     def write(i: int) -> bool:
-        (K, size), distortion = calibration(model.views[i]), coefficients(model.views[i])
-        pinhole_K, pinhole_size = calibration(pinholes.views[i])
+        K, size, distortion = model.views[i].intrinsics
+        pinhole_K, pinhole_size, _ = pinholes.views[i].intrinsics
         # Measured: 17 bytes per pixel of the original and of the result.
         with _budget.reserve(17 * (math.prod(size) + math.prod(pinhole_size))):
             (image,) = read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
@@ -387,8 +359,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     Raises
     ------
     ValueError, UsageError, OutputError
-        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
-        cannot be written.
+        If the mesh is invalid; if the name does not end in .glb; if the file cannot be written.
 
     Examples
     --------
@@ -401,6 +372,4 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     path = Path(path)
     if path.suffix.lower() != ".glb":
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
-    if not isinstance(mesh, TexturedMesh):
-        raise UsageError(f"write_mesh needs a TexturedMesh; got a {type(mesh).__name__}")
     write_atomically(path, glb_bytes(mesh))

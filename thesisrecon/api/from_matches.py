@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
@@ -50,15 +51,11 @@ class GivenOptions(RunOptions, total=False):
 
 
 def reconstruct_from_matches(
-    keypoints: Sequence[F64] | None,
-    matches: Mapping[tuple[int, int], PairMatches],
-    sizes: Sequence[tuple[int, int]] | I64,
-    out: str | Path | None = None,
-    *,
-    names: Sequence[str] | None = None,
-    images: str | Path | Sequence[Any] | None = None,
+    keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], PairMatches],
+    sizes: Sequence[tuple[int, int]] | I64, out: str | Path | None = None, *,
+    names: Sequence[str] | None = None, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
-) -> RunResult:
+) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras and points from matches of any program.
 
     The matches are verified (chapter 5), joined to tracks and used like those of thesisrecon's matching.
@@ -71,29 +68,20 @@ def reconstruct_from_matches(
     matches : mapping
         (i, j) -> (M, 2) rows of ``keypoints[i]`` and ``keypoints[j]``; or a pair of (M, 2) positions in
         images i and j, which are joined to tracks where they lie within a pixel of each other.
-    sizes : array_like (V, 2)
-        Width and height of the images.
-    out : path, optional
-        Output folder, as for :func:`reconstruct`; None: no files are kept.
-    names : sequence of V str, optional
-        Names of the images; by default "image-0" and so on.
+    sizes, out, names : array_like (V, 2), path, sequence of V str
+        Width and height of the images; the output folder (None: no files are kept); the names of the images
+        (by default "image-0" and so on).
     images : path, or sequence of V path, array or Image, optional
-        The images, for colours, depth maps and the textured model: a folder with files of these names, or the
-        images in the order of the keypoints.
+        For colours, depth maps and the textured model: a folder with files of these names, or the images.
     **options
-        As for :func:`reconstruct`: ``config``, ``seed``, ``progress``, ``preset``, ``max_size``, ``cameras``,
-        ``set``, ``masks`` (matches in masked pixels are dropped), ``until`` ("metric" without images),
-        ``threads``, ``executor``, ``overwrite``, ``shared``.
+        As for :func:`reconstruct`, except ``pairs`` and ``every``; ``masks``: matches in masked pixels are
+        dropped; ``until``: "metric" without images.
 
     Returns
     -------
     RunResult
-        As of :func:`reconstruct`.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If the input contradicts itself; if it cannot be reconstructed.
+        As of :func:`reconstruct`. ``UsageError`` if the input contradicts itself, ``StageFailure`` if it
+        cannot be reconstructed.
 
     Examples
     --------
@@ -119,14 +107,10 @@ def reconstruct_from_matches(
 
 
 def reconstruct_from_tracks(
-    tracks: Tracks | F64,
-    sizes: Sequence[tuple[int, int]] | I64,
-    out: str | Path | None = None,
-    *,
-    names: Sequence[str] | None = None,
-    images: str | Path | Sequence[Any] | None = None,
+    tracks: Tracks | F64, sizes: Sequence[tuple[int, int]] | I64, out: str | Path | None = None, *,
+    names: Sequence[str] | None = None, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
-) -> RunResult:
+) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras and points from tracks of any program.
 
     Parameters
@@ -135,17 +119,12 @@ def reconstruct_from_tracks(
         Observations in pixels of the images; in an array NaN where a point is not seen. They may contain
         outliers: pairs of images are verified by the points that they share.
     sizes, out, names, images, **options
-        As for :func:`reconstruct_from_matches`.
+        As for :func:`reconstruct_from_matches`, which raises the same.
 
     Returns
     -------
     RunResult
         As of :func:`reconstruct`.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If the input contradicts itself; if it cannot be reconstructed.
 
     Examples
     --------
@@ -163,12 +142,9 @@ def reconstruct_from_tracks(
 
 
 def reconstruct_from_colmap(
-    path: str | Path,
-    out: str | Path | None = None,
-    *,
-    images: str | Path | Sequence[Any] | None = None,
+    path: str | Path, out: str | Path | None = None, *, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
-) -> RunResult:
+) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras and points from a COLMAP database or sparse model.
 
     Nothing of COLMAP's calibration and poses is used.
@@ -179,18 +155,13 @@ def reconstruct_from_colmap(
         A database with keypoints and matches (the verified matches, or the raw ones if there are none), or a
         folder with a sparse model of any kind of camera, binary or text, whose tracks are used.
     out, images, **options
-        As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images,
-        which are used as stored, without EXIF rotation.
+        As for :func:`reconstruct_from_matches`, which raises the same; ``images`` is the folder of COLMAP's
+        images, which are used as stored, without EXIF rotation.
 
     Returns
     -------
     RunResult
         As of :func:`reconstruct`.
-
-    Raises
-    ------
-    UsageError, StageFailure
-        If there is no database or model; if it cannot be reconstructed.
 
     Examples
     --------
@@ -225,12 +196,8 @@ def reconstruct_from_colmap(
 
 
 def _reconstruct(
-    name: str,
-    given: Given,
-    views: Views,
-    out: str | Path | None,
-    options: Mapping[str, Any],
-) -> RunResult:
+    name: str, given: Given, views: Views, out: str | Path | None, options: Mapping[str, Any],
+) -> RunResult:  # fmt: skip
     options = dict(options)
     chosen = {name: options.pop(name, None) for name in ("preset", "max_size", "cameras")}
     config = build_config(options.pop("config", None), **chosen, settings=options.pop("set", ()))
@@ -259,9 +226,8 @@ def _reconstruct(
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
                 inputs, warnings = views.read(run, digests), list[str]()
                 if masks is not None:
-                    inputs, warnings = add_masks(
-                        inputs, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
-                    )
+                    masked = partial(add_masks, as_stored=views.as_stored, map_all=run.workers.map_all)
+                    inputs, warnings = masked(inputs, Path(masks))
                     if all(image.mask is None for image in inputs.images):
                         warnings.append(USELESS_MASKS)
                 given = outside_masks(at_working_size(given, inputs.images), inputs.images)

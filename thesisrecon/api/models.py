@@ -1,9 +1,10 @@
-"""Finished runs and models of other programs: loaded, saved, aligned to positions and scaled."""
+"""Finished runs and models of other programs: loaded, saved, aligned, scaled and compared."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -11,18 +12,27 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.camera import Camera
-from thesisrecon.errors import UsageError, counted, unknown_word
-from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.errors import UsageError, counted, in_words, unknown_word
+from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model, read_positions
 from thesisrecon.pipeline.outputs import folder_with, load_run, save_result
 from thesisrecon.records import Similarity
-from thesisrecon.results import SUMMARY, RunResult, SparseModel
+from thesisrecon.results import (
+    SUMMARY,
+    THRESHOLDS,
+    ModelComparison,
+    PointDistances,
+    RunResult,
+    SparseModel,
+    SparseView,
+)
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
 
 _INLIER_SIGMAS = 3.37
@@ -63,9 +73,8 @@ class AlignmentReport:
                 f"{latitude:.7f}, longitude {longitude:.7f}, height {height:.7g} m (WGS84)"
             )
         if self.unknown:
-            lines.append(
-                f"{counted(len(self.unknown), 'position')} without an image, such as {self.unknown[0]}"
-            )
+            text = f"{counted(len(self.unknown), 'position')} without an image, such as {self.unknown[0]}"
+            lines.append(text)
         return "\n".join(lines)
 
 
@@ -88,11 +97,9 @@ def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
 
 
 def align_to_positions(
-    model: SparseModel | RunResult | str | Path,
-    positions: Mapping[str, ArrayLike] | str | Path,
-    *,
+    model: SparseModel | RunResult | str | Path, positions: Mapping[str, ArrayLike] | str | Path, *,
     seed: int = 0,
-) -> tuple[SparseModel, AlignmentReport]:
+) -> tuple[SparseModel, AlignmentReport]:  # fmt: skip
     """Move a model to known positions of its cameras by a robust similarity.
 
     Similarities of triples of positions are compared by a quantile of their residuals (least median of
@@ -104,9 +111,8 @@ def align_to_positions(
     model : SparseModel, RunResult or path
         A model, a run or its output folder, or a COLMAP model.
     positions : mapping of str to (3,), or path
-        Image name -> position, in metres or any other unit of length; or a CSV file of ``name,x,y,z``. If
-        its header names latitude, longitude and height (degrees and metres, WGS84), they become metres east,
-        north and up of their median.
+        Image name -> position in any unit of length; or a CSV file of ``name,x,y,z``. Latitude, longitude and
+        height (degrees and metres, WGS84) of its header become metres east, north and up of their median.
     seed : int
         Random seed of the triples, which are drawn only for more than 18 positions.
 
@@ -212,7 +218,8 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
         _require_width(target, "positions", 0.0)
         best = estimate_similarity(source, target)
     # Rousseeuw's correction for few points, and the quantile of the lengths of normal residuals.
-    sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / math.sqrt(2.0 * gammaincinv(1.5, rank / (n + 1)))
+    normal = math.sqrt(2.0 * scipy.special.gammaincinv(1.5, rank / (n + 1)))
+    sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / normal
     inlier = distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
     for _ in range(20):
         _require_width(target[inlier], "positions", 0.0)
@@ -233,20 +240,13 @@ def scaled(
 
     Parameters
     ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
-    name1, name2, distance : str, str, float
-        Two images, and the distance of their camera centres in the new unit.
+    model, name1, name2, distance : SparseModel or RunResult or path, str, str, float
+        A model as of :func:`align_to_positions`; two images, and the distance of their camera centres.
 
     Returns
     -------
     SparseModel
-        The scaled model; the origin stays.
-
-    Raises
-    ------
-    UsageError
-        If an image is unknown, or a distance is not positive.
+        The scaled model; the origin stays. ``UsageError`` if an image is unknown, or a distance not positive.
 
     Examples
     --------
@@ -281,14 +281,12 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     Returns
     -------
     dict of str to Camera
-        In pixels of the original images, (0, 0) = centre of the top-left pixel; ``as_stored`` of COLMAP
-        models and of runs from COLMAP's matches or tracks.
+        In pixels of the original images; ``as_stored`` of COLMAP models and of runs from COLMAP's matches.
 
     Raises
     ------
     UsageError
-        If there is no such file, it is damaged or empty, a camera has no K or size, or its lens is neither
-        a pinhole nor radial.
+        If there is no such file, it is damaged or empty, or a camera has no K or size, or another lens.
 
     Examples
     --------
@@ -324,13 +322,8 @@ def load(out: str | Path) -> RunResult:
     Returns
     -------
     RunResult
-        As the run returned it, except for what is not stored: the pixels of ``images`` (grey), ``views`` and
-        ``depth_maps``.
-
-    Raises
-    ------
-    UsageError
-        If no run has finished in the folder, or a file is damaged.
+        Without what is not stored: the pixels of ``images`` (grey), ``views`` and ``depth_maps``.
+        ``UsageError`` if no run has finished in the folder, or a file is damaged.
 
     Examples
     --------
@@ -361,10 +354,8 @@ def save(result: RunResult, folder: str | Path, *, overwrite: bool = False) -> N
 
     Parameters
     ----------
-    result : RunResult
-        Result of a run; if its output folder still holds it, the files are copied.
-    folder : path
-        Created if missing.
+    result, folder : RunResult, path
+        Result of a run, copied if its output folder still holds it; the folder is created if missing.
     overwrite : bool
         Replace files of these names that thesisrecon did not write, or that were changed since.
 
@@ -386,3 +377,149 @@ def save(result: RunResult, folder: str | Path, *, overwrite: bool = False) -> N
     True
     """
     save_result(result, Path(folder), overwrite=overwrite)
+
+
+Model = str | Path | SparseModel | RunResult | Mapping[str, Camera]
+
+
+def compare_models(a: Model, b: Model) -> ModelComparison:
+    """Compare two metric models of the same images after the similarity that takes a to b.
+
+    Cameras are paired by name; if no name is common, by name without folder and suffix; if there is none
+    either, a trajectory is paired by order with a model of as many cameras. The similarity needs three common
+    cameras whose centres are not on one line. Intrinsics are compared at the image size in b.
+
+    Parameters
+    ----------
+    a, b : path, RunResult, SparseModel or mapping of str to Camera
+        Models; b is the reference. A path is the folder of a run, a COLMAP model, a ``cameras.json``, or a
+        trajectory in TUM or KITTI format.
+
+    Returns
+    -------
+    ModelComparison
+        Errors of each common camera, their summary, and the distances of the points. ``UsageError`` if a
+        model cannot be read or there is no common camera.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, compare_models
+    >>> K, size = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), (640, 480)
+    >>> centres = {"1.jpg": [0.0, 0, 0], "2.jpg": [1, 0, 0], "3.jpg": [0, 1, 0]}
+    >>> a = {name: Camera(K, np.eye(3), -np.array(c), size) for name, c in centres.items()}
+    >>> K_b = K / [[1.01], [1.01], [1]]
+    >>> b = {name: Camera(K_b, np.eye(3), -2.0 * np.array(c), size) for name, c in centres.items()}
+    >>> comparison = compare_models(a, b)
+    >>> round(comparison.similarity.scale, 6), comparison.focal_error_rel.round(6).tolist()
+    (2.0, [0.01, 0.01, 0.01])
+    """
+    first, second = _model(a, "first"), _model(b, "second")
+    pairs = _pairs(first, second)
+    left, right = [first.views[i] for i, _ in pairs], [second.views[j] for _, j in pairs]
+    R, R_b = (np.array([view.R for view in views]) for views in (left, right))
+    centres, centres_b = (np.array([view.centre for view in views]) for views in (left, right))
+    unknown, notes = np.full(len(pairs), np.nan), list[str]()
+    similarity = _similarity(centres, centres_b, notes)
+    points = None
+    if similarity is not None:
+        first = first.transformed(similarity)
+        points = _point_distances(first.X, second.X)
+    intrinsics = np.array([_intrinsic_errors(*views) for views in zip(left, right, strict=True)])
+    moved = unknown if similarity is None else np.linalg.norm(similarity.apply(centres) - centres_b, axis=1)
+    paired, paired_b = ({pair[k] for pair in pairs} for k in (0, 1))
+    return ModelComparison(
+        names=tuple(view.name for view in left), names_b=tuple(view.name for view in right),
+        centre_error=moved, rotation_error_deg=rotation_errors_deg(R, R_b) if len(pairs) > 1 else unknown,
+        focal_error_rel=intrinsics[:, 0], principal_point_error_px=intrinsics[:, 1], similarity=similarity,
+        points=points, only_a=tuple(name for i, name in enumerate(first.names) if i not in paired),
+        only_b=tuple(name for j, name in enumerate(second.names) if j not in paired_b), notes=tuple(notes),
+        a=first, b=second,
+    )  # fmt: skip
+
+
+def _model(model: Model, which: str) -> SparseModel:
+    if isinstance(model, Mapping):
+        cameras = model.items()
+        model = SparseModel([SparseView(name, c.R, c.t, c.K, c.size, c.distortion) for name, c in cameras])
+    if isinstance(model, str | Path | RunResult | SparseModel):
+        model = as_sparse_model(model)
+        if len(model.views):
+            return model
+    kinds = "a path, a RunResult, a SparseModel or a mapping of names to cameras, with at least one camera"
+    raise UsageError(f"the {which} model of a comparison must be {kinds}; got {in_words(model)}")
+
+
+def _pairs(a: SparseModel, b: SparseModel) -> list[tuple[int, int]]:
+    """Pairs of cameras with the same name, in the order of a."""
+    for key in (str, _stem):
+        keys, keys_b = ([key(view.name) for view in model.views] for model in (a, b))
+        counts, counts_b = Counter(keys), Counter(keys_b)
+        place = {name: j for j, name in enumerate(keys_b) if counts_b[name] == 1}
+        pairs = [(i, place[name]) for i, name in enumerate(keys) if counts[name] == 1 and name in place]
+        if pairs:
+            return pairs
+    trajectory = any(all(view.K is None for view in model.views) for model in (a, b))
+    if trajectory and len(a.views) == len(b.views):
+        return [(i, i) for i in range(len(a.views))]
+    names = (f"{_few(model.names)} in the {which}" for which, model in (("first", a), ("second", b)))
+    advice = "give models of the same images, or a trajectory of as many cameras"
+    raise UsageError(f"the models have no common camera: {' and '.join(names)}; {advice}")
+
+
+def _stem(name: str) -> str:
+    """The name without folder and suffix; a suffix of digits belongs to a time."""
+    path = Path(name)
+    return path.name if path.suffix[1:].isdigit() else path.stem
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(in_words(name) for name in names[:3]) + more
+
+
+def _similarity(centres: F64, centres_b: F64, notes: list[str]) -> Similarity | None:
+    """The similarity of the centres; a note if there is none, or if it is uncertain."""
+    if len(centres) < 3:
+        known = "rotations and intrinsics are compared" if len(centres) > 1 else "intrinsics are compared"
+        text = f"{counted(len(centres), 'common camera')} cannot be aligned, at least 3 are needed; {known}"
+        notes.append(text)
+        return None
+    try:
+        similarity = estimate_similarity(centres, centres_b)
+    except ValueError:
+        notes.append(
+            "the centres of the common cameras lie on one line or in one point and cannot be aligned; "
+            "rotations and intrinsics are compared"
+        )
+        return None
+    if min(_extent_across(points) for points in (centres, centres_b)) < 0.01:
+        notes.append(
+            "the centres of the common cameras lie almost on one line; the rotation about it is uncertain, "
+            "and with it the distances of points"
+        )
+    return similarity
+
+
+def _extent_across(points: F64) -> float:
+    along, across, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1]
+    return float(across / along)
+
+
+def _intrinsic_errors(a: SparseView, b: SparseView) -> tuple[float, float]:
+    """Relative error of the focal length, and distance of the principal points in pixels of b."""
+    if a.K is None or b.K is None:
+        return np.nan, np.nan
+    scale = np.divide(b.size, a.size) if a.size and b.size else np.ones(2)
+    focal, focal_b = (np.sqrt(f[0] * f[1]) for f in (np.diag(a.K)[:2] * scale, np.diag(b.K)))
+    offset = (a.K[:2, 2] + 0.5) * scale - 0.5 - b.K[:2, 2]
+    return float(focal / focal_b - 1.0), float(np.linalg.norm(offset))
+
+
+def _point_distances(X: F64, X_b: F64) -> PointDistances | None:
+    if not (len(X) and len(X_b)):
+        return None
+    thresholds = np.array(THRESHOLDS) / scene_frame(X_b)[1]
+    there, back = (scipy.spatial.cKDTree(to).query(of)[0] for of, to in ((X, X_b), (X_b, X)))
+    within = [np.mean(distances[:, None] < thresholds, axis=0) for distances in (there, back)]
+    return PointDistances(float(np.median(there)), float(np.median(back)), thresholds, *within)

@@ -34,16 +34,13 @@ def match_pair(
     ----------
     image1, image2 : path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
         The two images; transparent pixels are masked.
-    config : PipelineConfig, str or path, optional
-        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
-    seed : int
-        Random seed.
+    config, seed : PipelineConfig, str or path, int
+        Settings, the name of a preset, or a TOML file (None: the preset ``default``); the random seed.
 
     Returns
     -------
     TwoView
-        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images, also if they were
-        matched at a smaller size (``config.images.max_size_px``).
+        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images.
 
     Raises
     ------
@@ -88,14 +85,9 @@ def _transformed(pair: TwoView, T1: F64, T2: F64) -> TwoView:
         model = None if model is None else transform(model)
         report = replace(report, competing_model=model, expected_error_px=error)
     return replace(
-        pair,
-        F=transform(pair.F),
-        sigma_px=pair.sigma_px * scale,
-        xy1=pair.xy1 @ T1[:2, :2] + T1[:2, 2],
-        xy2=pair.xy2 @ T2[:2, :2] + T2[:2, 2],
-        affine=pair.affine * (T2[0, 0] / T1[0, 0]),
-        degeneracy=report,
-    )
+        pair, F=transform(pair.F), sigma_px=pair.sigma_px * scale, xy1=pair.xy1 @ T1[:2, :2] + T1[:2, 2],
+        xy2=pair.xy2 @ T2[:2, :2] + T2[:2, 2], affine=pair.affine * (T2[0, 0] / T1[0, 0]), degeneracy=report,
+    )  # fmt: skip
 
 
 def draw_epipolar_lines(
@@ -107,10 +99,8 @@ def draw_epipolar_lines(
     ----------
     image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         Files, read at full size, or images.
-    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
-        Fundamental matrix and matches in pixels of these images.
-    max_lines : int
-        Number of matches to draw, spread over all; each has one colour in both images.
+    F, xy1, xy2, max_lines : ndarray (3, 3), (N, 2) and (N, 2), int
+        Fundamental matrix and matches in pixels of these images, and how many of them to draw.
 
     Returns
     -------
@@ -148,10 +138,8 @@ def estimate_homography(
     ----------
     xy1, xy2 : array_like (N, 2)
         Matched points, N >= 4, px.
-    threshold_px : float or None
-        Distance of an inlier during the search; None: all matches are inliers.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
+    threshold_px, seed : float or None, int or numpy.random.Generator
+        Distance of an inlier during the search (None: all matches are inliers); the random seed.
 
     Returns
     -------
@@ -160,10 +148,8 @@ def estimate_homography(
 
     Raises
     ------
-    ValueError
-        If the shapes differ or coordinates are not finite.
-    StageFailure
-        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
+    ValueError, StageFailure
+        If an argument is invalid; if the matches or inliers are too few, or do not determine H.
 
     Examples
     --------
@@ -185,34 +171,22 @@ def estimate_homography(
 
 
 def estimate_trifocal(
-    xy1: F64 = NO_POINTS,
-    xy2: F64 = NO_POINTS,
-    xy3: F64 = NO_POINTS,
-    *,
-    segments: F64 = NO_SEGMENTS,
-    threshold_px: float | None = 1.0,
-    loss_px: float = 1.0,
-    seed: int | Generator = 0,
-) -> TrifocalFit:
+    xy1: F64 = NO_POINTS, xy2: F64 = NO_POINTS, xy3: F64 = NO_POINTS, *, segments: F64 = NO_SEGMENTS,
+    threshold_px: float | None = 1.0, loss_px: float = 1.0, seed: int | Generator = 0,
+) -> TrifocalFit:  # fmt: skip
     """Estimate the trifocal tensor from points and lines of three views.
 
     Minimises Huber's loss of the distances of points to their reprojections and of segment endpoints to the
-    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
-    contradict the epipolar geometry of a pair of views are left out first.
+    reprojected lines. Points that contradict the epipolar geometry of a pair of views are left out first.
 
     Parameters
     ----------
-    xy1, xy2, xy3 : array_like (N, 2)
-        Matched points of the three views, px.
-    segments : ndarray (3, M, 2, 2), optional
-        Endpoints of matched line segments, px; the endpoints need not correspond. 4 N + 2 M >= 26.
-    threshold_px : float or None
-        Threshold of the fundamental matrices by which wrong points are found, from 12 points on; None: no
-        search.
-    loss_px : float
-        Residual at which Huber's loss becomes linear.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from.
+    xy1, xy2, xy3, segments : array_like (N, 2), ndarray (3, M, 2, 2)
+        Matched points of the three views, px, and endpoints of matched line segments, which need not
+        correspond. 4 N + 2 M >= 26.
+    threshold_px, loss_px, seed : float or None, float, int or numpy.random.Generator
+        Threshold of the fundamental matrices by which wrong points are found, from 12 points on (None: no
+        search); the residual at which Huber's loss becomes linear; the random seed.
 
     Returns
     -------
@@ -221,11 +195,9 @@ def estimate_trifocal(
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong or values are not finite.
-    StageFailure
-        If there are too few matches, or they do not determine the tensor, exactly or within their noise:
-        points of one plane or line, pure rotation, random matches.
+    ValueError, StageFailure
+        If an argument is invalid; if there are too few matches, or they do not determine the tensor, exactly
+        or within their noise: points of one plane or line, pure rotation, random matches.
 
     Examples
     --------
@@ -240,19 +212,24 @@ def estimate_trifocal(
     if not loss_px > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
     require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
-    every, segments = _check_triplets(np.stack([xy1, xy2, xy3]), segments)
+    points = np.stack([xy1, xy2, xy3])
+    if np.iscomplexobj(points) or np.iscomplexobj(segments):
+        raise ValueError("points and segments must be real numbers; got complex ones")
+    points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
+    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
+    require_finite("a trifocal tensor", points, segments)
+    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
+        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
+    if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
+        raise ValueError("a segment needs two different ends; one has no length")
     rng = np.random.default_rng(seed)
-    return fit_trifocal(every, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
+    return fit_trifocal(points, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
 
 
 def estimate_fundamental(
-    xy1: NDArray[np.float64],
-    xy2: NDArray[np.float64],
-    *,
-    method: Method = "locally-optimised",
-    threshold_px: float | None = 1.0,
-    seed: int | Generator = 0,
-) -> FundamentalEstimate:
+    xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, method: Method = "locally-optimised",
+    threshold_px: float | None = 1.0, seed: int | Generator = 0,
+) -> FundamentalEstimate:  # fmt: skip
     """Estimate the fundamental matrix of matches by one of the methods of chapter 5.
 
     Parameters
@@ -264,26 +241,21 @@ def estimate_fundamental(
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
         the thesis) or "least-median". For matches without outliers: "gold-standard" (least reprojection
         error, HZ 11.4.1), "eight-point" (normalised) or "seven-point" (up to three solutions).
-    threshold_px : float or None
-        Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
-        "gold-standard" is used instead of these two.
-    seed : int or numpy.random.Generator
-        Random seed, or the generator to draw from; the same seed gives the same result.
+    threshold_px, seed : float or None, int or numpy.random.Generator
+        Largest Sampson distance of an inlier during the search of the first two methods (None: no outliers,
+        "gold-standard" is used instead of these two); the random seed.
 
     Returns
     -------
     FundamentalEstimate
-        F with x2' F x1 = 0, inliers, noise and covariance. ``determined``: no other F explains the matches as
-        well; otherwise ``reasons`` says why. The covariance is that of the minimum of the Sampson distances,
-        a lower bound for the linear methods. For "seven-point" noise and covariance are NaN (there are no
-        residuals), and ``competing_models`` are the other solutions.
+        F with x2' F x1 = 0, inliers, noise, and the covariance of the minimum of the Sampson distances.
+        ``determined``: no other F explains the matches as well; otherwise ``reasons`` says why. For
+        "seven-point" noise and covariance are NaN, and ``competing_models`` are the other solutions.
 
     Raises
     ------
-    ValueError
-        If the method is unknown, the shapes differ or coordinates are not finite.
-    StageFailure
-        If there are too few or collinear matches, or no F has 8 matches within the threshold.
+    ValueError, StageFailure
+        If an argument is invalid; if there are too few or collinear matches, or no F has 8 inliers.
 
     Examples
     --------
@@ -299,9 +271,6 @@ def estimate_fundamental(
     >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
     >>> thesisrecon.estimate_fundamental(xy1, plane).determined
     False
-    >>> linear = thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point")
-    >>> linear.covariance.shape
-    (9, 9)
     """
     rng = np.random.default_rng(seed)
     if threshold_px is None:
@@ -349,20 +318,6 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     F, xy1 = np.asarray(F, dtype=np.float64), np.asarray(xy1, dtype=np.float64)
     require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return lines_of_points(F, xy1)
-
-
-def _check_triplets(points: F64, segments: F64) -> tuple[F64, F64]:
-    """Check matches of three views and return them as float64 arrays."""
-    if np.iscomplexobj(points) or np.iscomplexobj(segments):
-        raise ValueError("points and segments must be real numbers; got complex ones")
-    points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
-    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
-    require_finite("a trifocal tensor", points, segments)
-    if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
-        raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
-    if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
-        raise ValueError("a segment needs two different ends; one has no length")
-    return points, segments
 
 
 def _drawn(image: U8, lines: F64, xy: F64) -> U8:

@@ -33,21 +33,11 @@ from thesisrecon.results import RunResult
 
 
 def reconstruct(
-    images: ImageSource,
-    out: str | Path,
-    *,
-    config: Config | None = None,
-    preset: str | None = None,
-    max_size: int | None = None,
-    cameras: str | None = None,
-    pairs: Pairs | None = None,
-    set: Settings = (),
-    masks: str | Path | None = None,
-    every: int | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
-    **options: Unpack[RunOptions],
-) -> RunResult:
+    images: ImageSource, out: str | Path, *, config: Config | None = None, preset: str | None = None,
+    max_size: int | None = None, cameras: str | None = None, pairs: Pairs | None = None, set: Settings = (),
+    masks: str | Path | None = None, every: int | None = None, seed: int = 0,
+    progress: Progress | None = None, **options: Unpack[RunOptions],
+) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras, points and a textured model from images of one scene.
 
     Parameters
@@ -56,14 +46,11 @@ def reconstruct(
         A folder, or the images; with ``every`` a video (extra ``video``) or a folder of frames.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
-    config : PipelineConfig, str or path, optional
-        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
-    preset : {"default", "thesis"}, optional
-        Pipeline to start from.
-    max_size : int, optional
-        Long side (px) to which larger images are reduced (1600).
-    cameras : {"shared", "per-image"}, optional
-        One camera per image size (default), or one per image.
+    config, preset : PipelineConfig or str or path, {"default", "thesis"}
+        Settings, the name of a preset, or a TOML file (None: ``default``); the pipeline to start from.
+    max_size, cameras : int, {"shared", "per-image"}
+        Long side (px) to which larger images are reduced (1600); one camera per image size (default), or one
+        per image.
     pairs : str, path or list of (str, str), optional
         "all", "overlap", "window:N", a file of pairs, or pairs of file names.
     set : mapping or list of str
@@ -73,11 +60,9 @@ def reconstruct(
         no features, no depth and no texture; transparent pixels of images give none either.
     every : int, optional
         Take the sharpest of each ``every`` frames; those of a video are written to ``out/00-frames``.
-    seed : int
-        Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
-        workers.
-    progress : callable, optional
-        Called with (stage, done, total).
+    seed, progress : int, callable
+        Random seed, at least 0 (the same images, settings and seed give the same bytes for any number of
+        workers); called with (stage, done, total).
     **options
         ``until``: last stage, "features", "matches", "projective", "metric", "dense" or "model" (by default
         "model", where a surface that fails is only a warning); ``threads``: number of workers;
@@ -117,9 +102,8 @@ def reconstruct(
     frames = None if every is None else _frame_source(images, every, run)
     if isinstance(images, str | Path):
         if Path(images).is_file() and frames is None:
-            raise UsageError(
-                f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
-            )
+            message = f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
+            raise UsageError(message)
         if frames is None and not list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
@@ -130,9 +114,7 @@ def reconstruct(
     surface_required = options.get("until") is not None
     source = None if frames is None else frames.identity
     with claimed(run, overwrite=overwrite, source=source):
-        inputs = _read_inputs(
-            run, images if frames is None else frames, None if masks is None else Path(masks)
-        )
+        inputs = _read_inputs(run, frames or images, None if masks is None else Path(masks))
         listed = run.config.pairs
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
@@ -145,9 +127,8 @@ def _frame_source(images: ImageSource, every: int, run: Run) -> FrameSource:
     if not isinstance(images, str | Path):
         raise UsageError("every needs a video or a folder of frames, not a list of images")
     if isinstance(run.config.pairs, ListedPairs):
-        raise UsageError(
-            "pairs by name cannot be combined with every, which chooses the images; use window:N"
-        )
+        message = "pairs by name cannot be combined with every, which chooses the images; use window:N"
+        raise UsageError(message)
     return FrameSource(Path(images), every)
 
 
@@ -156,10 +137,8 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     counts: dict[str, int] = {}
     with run.clock("images"):
         if isinstance(images, FrameSource):
-            out, workers = run.directory.path, run.workers
-            images, counts["frames"], warnings = images.choose(
-                out, threads=workers.threads, map_all=workers.map_all, progress=run.progress
-            )
+            given = run.directory.path, run.workers.threads, run.workers.map_all, run.progress
+            images, counts["frames"], warnings = images.choose(*given)
         size = run.config.images.max_size_px
         inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
         unused: list[str] = []

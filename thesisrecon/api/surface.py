@@ -1,4 +1,4 @@
-"""Depth maps, surface and texture of known cameras in one call each (thesis, sections 2.5 and 2.6)."""
+"""Rectified pairs, and depth maps, surface and texture of known cameras (thesis, sections 2.5 and 2.6)."""
 
 from __future__ import annotations
 
@@ -9,33 +9,121 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon._numba import ThreadPool
-from thesisrecon.api.arguments import CameraInput, as_cameras, radial_coefficients
+from thesisrecon.api.cameras import CameraInput, as_cameras, radial_coefficients, reconstruction_from_cameras
 from thesisrecon.arrays import F32, F64, I64, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
-from thesisrecon.io._images import list_images, read_image, rotation_words
+from thesisrecon.io._images import is_rgba, list_images, read_image, read_levels, rotation_words
 from thesisrecon.pipeline.image_pair import ImageInput
-from thesisrecon.records import DepthMap, Image, Reconstruction, TexturedMesh, Tracks, require_mesh
+from thesisrecon.records import (
+    DepthMap,
+    DisparityMap,
+    Image,
+    Reconstruction,
+    TexturedMesh,
+    Tracks,
+    require_mesh,
+)
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
+from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range, rectify_pair
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
 """A folder, or images as files or uint8 arrays."""
 
 
+def rectify(
+    image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
+) -> RectifiedImages:
+    """Rectify two images by their fundamental matrix: epipolar lines become common rows (2.5).
+
+    Parameters
+    ----------
+    image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
+        Files, read at full size, or images.
+    F, xy1, xy2, planar : ndarray (3, 3), (N, 2) and (N, 2), bool
+        Fundamental matrix and N >= 8 of its inliers in pixels of these images; whether only homographies are
+        allowed, which need epipoles outside the images.
+
+    Returns
+    -------
+    RectifiedImages
+        The rectified images, for :func:`match_rectified`, and the maps between them and the images.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        If a shape is wrong; if the pair has no parallax, too few matches, or with ``planar`` inner epipoles.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import rectify
+    >>> xy1 = np.random.default_rng(0).uniform(20, 140, (30, 2))
+    >>> xy2 = xy1 - np.array([[8.0, 4]]) / np.random.default_rng(1).uniform(1, 4, (30, 1))
+    >>> F = np.array([[0.0, 0, 4], [0, 0, -8], [-4, 8, 0]])
+    >>> gray = np.full((160, 160), 128, np.uint8)
+    >>> pair = rectify(gray, gray, F, xy1, xy2)
+    >>> rows = [pair.rectified_from_original(k, xy)[:, 1] for k, xy in enumerate((xy1, xy2))]
+    >>> bool(np.abs(rows[0] - rows[1]).max() < 1e-6)
+    True
+    """
+    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    images = read_levels(image1), read_levels(image2)
+    size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
+    frame = rectify_pair(F, xy1, xy2, size1, size2, methods=PLANAR if planar else METHODS)
+    return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
+
+
+def match_rectified(
+    left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: Config | None = None
+) -> DisparityMap:
+    """Compute the disparity map of a rectified pair (2.5).
+
+    Parameters
+    ----------
+    left, right : path or ndarray (H, W), (H, W, 3) or (H, W, 4)
+        Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
+        cannot be read), or levels 0 to 255 with NaN for missing pixels; transparent pixels are missing.
+    max_disparity_px, config : float, PipelineConfig or str or path
+        Largest disparity d, x_right = x_left - d; the matcher is ``config.dense.pairs``.
+
+    Returns
+    -------
+    DisparityMap
+        Disparity and confidence of each pixel of the left image, NaN where unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import match_rectified
+    >>> from scipy.ndimage import gaussian_filter
+    >>> texture = gaussian_filter(128 + 300 * np.random.default_rng(0).uniform(-1, 1, (60, 90)), 1.0)
+    >>> found = match_rectified(texture[:, :80], texture[:, 6:86], max_disparity_px=10)
+    >>> round(float(np.nanmedian(found.disparity)), 1)
+    6.0
+    """
+    images = [
+        side if isinstance(side, np.ndarray) and not is_rgba(side) else read_levels(side)
+        for side in (left, right)
+    ]
+    for image in images:
+        # Levels of rectified images may exceed the range a little; those of 16 bits would all be white.
+        if image.dtype.kind in "iu" and image.max(initial=0) > 255:
+            message = f"match_rectified needs grey levels 0 to 255; got {image.dtype} up to {image.max()}"
+            raise ValueError(message)
+    dense = as_config(config).dense
+    return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
+
+
 def depth_maps(
-    images: ImagesInput,
-    cameras: CameraInput,
-    *,
-    sizes: I64 | None = None,
-    depth_range: F64 | tuple[float, float] | None = None,
-    max_size: int | None = None,
-    config: Config | None = None,
-    threads: int = 1,
-) -> tuple[DepthMap, ...]:
+    images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
+    depth_range: F64 | tuple[float, float] | None = None, max_size: int | None = None,
+    config: Config | None = None, threads: int = 1,
+) -> tuple[DepthMap, ...]:  # fmt: skip
     """Estimate the depth maps of images with known cameras; no tracks or points are needed (2.5).
 
     Parameters
@@ -44,16 +132,14 @@ def depth_maps(
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
         Their cameras in pixels of the images (arrays with ``sizes``), after EXIF rotation unless they are
-        ``as_stored``. If a reconstruction has points with observations, these give the depth range and the
-        neighbours. Of a run from COLMAP's matches or tracks give ``result.cameras``.
-    sizes : array_like (V, 2) or (2,), optional
-        Image width and height, for plain arrays.
-    depth_range : array_like (2,) or (V, 2), optional
-        Nearest and farthest depth. None: from the cameras, see Notes.
-    max_size : int, optional
-        Larger images are reduced to this long side; None: ``config.images``.
-    config, threads : PipelineConfig, str or Path, int
-        ``config.dense`` is the method; number of threads, on which the result does not depend.
+        ``as_stored``. The observed points of a reconstruction give the depth range and the neighbours. Of a
+        run from COLMAP's matches or tracks give ``result.cameras``.
+    sizes, depth_range : array_like (V, 2) or (2,), optional
+        Image width and height, for plain arrays; nearest and farthest depth. Without points and range, a pair
+        is searched where both images contain a point and its rays meet at 0.5 to 40 degrees.
+    max_size, config, threads : int, PipelineConfig or str or Path, int
+        Larger images are reduced to this long side (None: ``config.images``); ``config.dense`` is the method;
+        number of threads, on which the result does not depend.
 
     Returns
     -------
@@ -63,16 +149,9 @@ def depth_maps(
 
     Raises
     ------
-    ValueError
-        If a camera is missing or is not of its image's size, or the range is not 0 < nearest < farthest.
-    StageFailure
-        If no two images see common space, or no depth is found.
-
-    Notes
-    -----
-    Without points and range, a pair is searched at the depths at which both images contain a point and its
-    rays meet at 0.5 to 40 degrees. The neighbours of a view are those that share the most space with it at
-    angles of about 10 degrees. A known range saves time and avoids errors.
+    ValueError, StageFailure
+        If a camera is missing or not of its image's size, or the range is not 0 < nearest < farthest; if no
+        two images see common space, or no depth is found.
 
     Examples
     --------
@@ -120,13 +199,9 @@ def confirmed_depth_maps(
 
 
 def fuse_depth_maps(
-    depth_maps: Sequence[DepthMap] | Sequence[F32 | F64],
-    cameras: CameraInput | None = None,
-    *,
-    sizes: I64 | None = None,
-    config: Config | None = None,
-    threads: int = 1,
-) -> TexturedMesh:
+    depth_maps: Sequence[DepthMap] | Sequence[F32 | F64], cameras: CameraInput | None = None, *,
+    sizes: I64 | None = None, config: Config | None = None, threads: int = 1,
+) -> TexturedMesh:  # fmt: skip
     """Fuse depth maps to one surface (2.6).
 
     Parameters
@@ -167,23 +242,16 @@ def fuse_depth_maps(
         raise ValueError("fuse_depth_maps needs the cameras of plain depths")
     views = as_cameras("fuse_depth_maps", cameras, sizes)
     if len(views) != len(depth_maps):
-        raise ValueError(
-            f"fuse_depth_maps needs a camera per depth map; got {len(views)} and {len(depth_maps)}"
-        )
+        message = f"fuse_depth_maps needs a camera per depth map; got {len(views)} and {len(depth_maps)}"
+        raise ValueError(message)
     given = enumerate(zip(depth_maps, views, strict=True))
     return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)  # type: ignore[arg-type]
 
 
 def texture(
-    mesh: TexturedMesh,
-    images: ImagesInput,
-    cameras: CameraInput,
-    *,
-    sizes: I64 | None = None,
-    max_size: int | None = None,
-    config: Config | None = None,
-    threads: int = 1,
-) -> TexturedMesh:
+    mesh: TexturedMesh, images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
+    max_size: int | None = None, config: Config | None = None, threads: int = 1,
+) -> TexturedMesh:  # fmt: skip
     """Texture a surface from images with known cameras (2.6).
 
     Parameters
@@ -202,8 +270,7 @@ def texture(
     Raises
     ------
     ValueError, StageFailure
-        If the mesh is invalid; if a camera is missing or is not of its image's size; if no view shows a face
-        completely.
+        If an argument is invalid; if no view shows a face completely.
 
     Examples
     --------
@@ -213,8 +280,8 @@ def texture(
     >>> mesh = TexturedMesh(square, np.array([[0, 2, 1], [0, 3, 2]]))
     >>> K = np.array([[100.0, 0, 49.5], [0, 100, 49.5], [0, 0, 1]])
     >>> camera = Camera(K, np.eye(3), np.zeros(3), (100, 100))
-    >>> image = np.zeros((100, 100, 3), np.uint8)
-    >>> image[:50], image[50:] = (200, 0, 0), (0, 0, 200)
+    >>> image = np.full((100, 100, 3), 200, np.uint8)
+    >>> image[50:] = 0
     >>> texture(mesh, [image], [camera]).texture.dtype
     dtype('uint8')
     """
@@ -242,17 +309,17 @@ def _scene(
         read_image(one, max_size_px=max_size, as_stored=view.as_stored).images[0]
         for one, view in zip(listed, views, strict=True)
     ]
+    scaled = []
     for name, image, view in zip(names, read, views, strict=True):
         if image.original_size != view.size:
             what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
             rule = f"cameras in pixels of the images {rotation_words(view.as_stored)}, or Camera.scaled(...)"
             raise ValueError(f"{what}; give {rule}")
-    scaled = [_scaled(view, image.scale, image.size) for view, image in zip(views, read, strict=True)]
+        scaled.append(_scaled(view, image.scale, image.size))
     model = _model(scaled)
     if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):
-        kept = cameras.registered[cameras.tracks.view_index]
-        t, number = cameras.tracks, np.cumsum(cameras.registered) - 1
-        index = number[t.view_index[kept]]
+        t, kept = cameras.tracks, cameras.registered[cameras.tracks.view_index]
+        index = (np.cumsum(cameras.registered) - 1)[t.view_index[kept]]
         xy = (t.xy[kept] + 0.5) * np.array([image.scale for image in read])[index, None] - 0.5
         tracks = Tracks(index, t.point_index[kept], xy, len(read), t.n_points)
         model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
@@ -272,22 +339,16 @@ def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
 
 def _model(views: Sequence[Camera]) -> Reconstruction:
     """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
-    n, lenses = len(views), radial_coefficients("depth of known cameras", views)
-    none = np.zeros(0, dtype=np.int64)
-    K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
-    return Reconstruction(
-        "metric", P, np.zeros((0, 4)), np.ones(n, dtype=bool), np.zeros(0, dtype=bool),
-        np.zeros(0, dtype=bool), Tracks(none, none, np.zeros((0, 2)), n, 0),
-        np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, lenses,
-    )  # fmt: skip
+    lenses = radial_coefficients("depth of known cameras", views)
+    K, R, t, sizes = (np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t", "size"))
+    return replace(reconstruction_from_cameras(K, R, t, sizes=sizes), distortion=lenses)
 
 
 def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
     limits = np.asarray(depth_range, dtype=np.float64)
     if limits.shape not in ((2,), (n, 2)):
-        raise ValueError(
-            f"depth_range needs shape (2,) or ({n}, 2), nearest and farthest; got {limits.shape}"
-        )
+        message = f"depth_range needs shape (2,) or ({n}, 2), nearest and farthest; got {limits.shape}"
+        raise ValueError(message)
     limits = np.broadcast_to(limits, (n, 2))
     if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (limits[:, 1] > limits[:, 0]).all()):
         raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
@@ -306,7 +367,5 @@ def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
         raise ValueError(
             f"depth map {number} of {width} x {height} px needs a camera of its shape; got {camera.size}"
         )
-    own = (
-        camera if (width, height) == camera.size else _scaled(camera, width / camera.size[0], (width, height))
-    )
+    own = _scaled(camera, width / camera.size[0], (width, height))
     return DepthMap(number, own.P, z, z / np.float32(own.K[0, 0]), np.isfinite(z).astype(np.uint8))

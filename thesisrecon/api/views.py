@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.api.pairs import match_pair
-from thesisrecon.arrays import F32, F64, U8, require_calibration
+from thesisrecon.arrays import F32, F64, U8, require_calibration, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
@@ -36,26 +36,21 @@ _SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
 def interpolate_view(
-    left: Any,
-    right: Any,
-    s: float,
-    *,
+    left: Any, right: Any, s: float, *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
     config: Config | None = None,
-) -> U8:
+) -> U8:  # fmt: skip
     """Interpolate the view between two rectified images (thesis, section 1.2; Seitz and Dyer 1995).
+
+    For many views of one pair call :func:`prepare_rectified_pair` once.
 
     Parameters
     ----------
-    left, right : str, Path or ndarray (H, W, 3) uint8
-        Images of parallel cameras with corresponding rows.
-    s : float
-        Position on the baseline, from 0 (left image) to 1 (right image).
-    disparity : ndarray (H, W), DisparityMap or tuple of both sides, optional
+    left, right, s : str, Path or ndarray (H, W, 3) uint8, float
+        Images of parallel cameras with corresponding rows; position on the baseline, 0 (left) to 1 (right).
+    disparity, config : ndarray (H, W), DisparityMap or tuple of both sides, PipelineConfig or str or path
         Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add the
         regions that only it shows. None: matched by ``config.dense``.
-    config : PipelineConfig, str or path, optional
-        The default configuration if None.
 
     Returns
     -------
@@ -67,10 +62,6 @@ def interpolate_view(
     ------
     ValueError, UsageError, StageFailure
         If ``s`` is outside [0, 1], shapes differ, or a file does not exist or cannot be read.
-
-    Notes
-    -----
-    For many views of one pair call :func:`prepare_rectified_pair` once.
 
     Examples
     --------
@@ -87,12 +78,10 @@ def interpolate_view(
 
 
 def prepare_rectified_pair(
-    left: Any,
-    right: Any,
-    *,
+    left: Any, right: Any, *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
     config: Config | None = None,
-) -> InterpolatedPair:
+) -> InterpolatedPair:  # fmt: skip
     """Prepare two rectified images for any number of views between them: ``view(s)`` interpolates.
 
     The arguments are those of :func:`interpolate_view`.
@@ -242,16 +231,12 @@ def prepare_trilinear_views(
 
 
 def synthesize_view(
-    image1: Any,
-    image2: Any,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    *,
-    K: ArrayLike | None = None,
-    config: Config | None = None,
-    seed: int = 0,
-) -> U8:
+    image1: Any, image2: Any, rotation: ArrayLike, translation: ArrayLike, *, K: ArrayLike | None = None,
+    config: Config | None = None, seed: int = 0,
+) -> U8:  # fmt: skip
     """Compute the view of a virtual camera from two images by the trilinear tensor (section 1.3).
+
+    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
 
     Parameters
     ----------
@@ -260,10 +245,8 @@ def synthesize_view(
     rotation, translation : array_like (3, 3) and (3,)
         Motion from the second camera to the virtual one, X_new = R X_2 + t (x right, y down, z forwards), in
         units of the distance between the two cameras. R = I and t = 0 reproduce the second image.
-    K : array_like (3, 3) or (2, 3, 3), optional
-        Intrinsics, as in :func:`prepare_trilinear_views`.
-    config, seed : PipelineConfig or str or path, int
-        Configuration (None: the default) and random seed of the matching.
+    K, config, seed : array_like (3, 3) or (2, 3, 3), PipelineConfig or str or path, int
+        Intrinsics as in :func:`prepare_trilinear_views`; configuration and random seed of the matching.
 
     Returns
     -------
@@ -272,14 +255,9 @@ def synthesize_view(
 
     Raises
     ------
-    ValueError
-        If the rotation, translation, K or seed is invalid.
-    StageFailure
-        If the images cannot be read, do not match or show no parallax, or the camera does not see the scene.
-
-    Notes
-    -----
-    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
+    ValueError, StageFailure
+        If an argument is invalid; if the images cannot be read, do not match or show no parallax, or the
+        camera does not see the scene.
 
     Examples
     --------
@@ -318,11 +296,7 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
     scales = np.array([image.scale for image in found.images])
     given = _given_intrinsics(K)
     if given is not None:
-        working = given.copy()
-        working[:, :2] *= scales[:, None, None]
-        # Pixel (0, 0) is the centre of the first one.
-        working[:, :2, 2] += 0.5 * (scales[:, None] - 1.0)
-        return working[0], working[1]
+        return resizing_transform(scales[0]) @ given[0], resizing_transform(scales[1]) @ given[1]
     sizes = [image.original_size for image in found.images]
     prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
     both = []
@@ -333,28 +307,20 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
 
 
 def render(
-    mesh: TexturedMesh,
-    camera: Camera,
-    *,
-    shading: Shading | None = None,
-    background: tuple[int, int, int] = (0, 0, 0),
-    samples: int = 2,
-    threads: int = 1,
-) -> RenderedView:
+    mesh: TexturedMesh, camera: Camera, *, shading: Shading | None = None,
+    background: tuple[int, int, int] = (0, 0, 0), samples: int = 2, threads: int = 1,
+) -> RenderedView:  # fmt: skip
     """Render a mesh.
 
     Parameters
     ----------
     mesh, camera : TexturedMesh, Camera
         Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
-    shading : Shading, optional
-        Lighting. None shows the texture as photographed.
-    background : tuple of int
-        Colour of empty pixels.
-    samples : int
-        Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
-    threads : int
-        Number of threads; the image does not depend on it.
+    shading, background : Shading, tuple of int
+        Lighting (None shows the texture as photographed) and colour of empty pixels.
+    samples, threads : int
+        Samples per pixel side, averaged (depth and validity refer to the pixel centre); number of threads,
+        on which the image does not depend.
 
     Returns
     -------

@@ -25,19 +25,11 @@ from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
 _STAGE_LABELS = {
-    "frames": "frames of the video",
-    "kernels": "compiling (first run)",
-    "features": "corners",
-    "pairs": "pair selection",
-    "matches": "image pairs",
-    "projective": "projective cameras",
-    "selfcalibration": "self-calibration",
-    "metric": "metric refinement",
-    "dense": "depth maps",
-    "model": "surface and texture",
-    "correspondence": "dense correspondence",
-    "views": "views",
-}
+    "frames": "frames of the video", "kernels": "compiling (first run)", "features": "corners",
+    "pairs": "pair selection", "matches": "image pairs", "projective": "projective cameras",
+    "selfcalibration": "self-calibration", "metric": "metric refinement", "dense": "depth maps",
+    "model": "surface and texture", "correspondence": "dense correspondence", "views": "views",
+}  # fmt: skip
 
 
 def parse_folder(text: str | Path) -> Path:

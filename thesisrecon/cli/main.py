@@ -11,18 +11,14 @@ from typing import Annotated
 import typer
 
 from thesisrecon import __version__
+from thesisrecon.cli.commands import compare, demo, export, inspect, interpolate, reconstruct, render
 from thesisrecon.cli.common import DEBUG_VARIABLE, exit_code_of
-from thesisrecon.cli.results import compare, export, interpolate, render
-from thesisrecon.cli.runs import demo, inspect, reconstruct
 from thesisrecon.runtime._signals import set_error_stream
 
 app = typer.Typer(
-    name="thesisrecon",
-    help="From uncalibrated images to metric cameras, points and a textured model.",
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-)
+    name="thesisrecon", help="From uncalibrated images to metric cameras, points and a textured model.",
+    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+)  # fmt: skip
 for _command in (reconstruct, demo, inspect, compare, render, interpolate, export):
     app.command()(_command)
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,11 @@ from thesisrecon.api.views import (
     render,
     require_comparable_images,
 )
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, counted, made
-from thesisrecon.io._exports import animation_suffix, frame_name, write_animation, write_image
+from thesisrecon.io._exports import frame_name, write_animation, write_image
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
@@ -34,15 +35,13 @@ from thesisrecon.pipeline.run import Progress
 from thesisrecon.records import Image, TexturedMesh
 from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
-from thesisrecon.views.interpolation import InterpolatedPair, detect_monotonicity_violations
+from thesisrecon.views.interpolation import detect_monotonicity_violations
 from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.render import Light, Shading
 from thesisrecon.views.tensor import camera_at
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-_OWN = re.compile(
-    r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)"
-)
+_OWN = re.compile(r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.webp")
 """Names of the files of these commands."""
 _MIDWAY = 0.5
 
@@ -76,8 +75,10 @@ def interpolated_sequence(
         leg, s = stops[k]
         return legs[leg].view(s, threads=threads)
 
-    names = [image.name for image in images]
-    violations = [_violating(leg) for leg in legs]
+    names, maps = [image.name for image in images], [leg.left.disparity for leg in legs]
+    # Shares of the known pixels of the first image.
+    counts = [(detect_monotonicity_violations(d).sum(), np.isfinite(d).sum()) for d in maps]
+    violations = [float(found / max(known, 1)) for found, known in counts]
     metadata = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
     captions = [", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights]
     notes = [
@@ -86,13 +87,6 @@ def interpolated_sequence(
         for share, leg in zip(violations, legs, strict=True)
     ]
     return ViewSequence(captions, draw, notes, metadata, [{"weights": w} for w in weights])
-
-
-def _violating(pair: InterpolatedPair) -> float:
-    """Share of the known pixels of the first image that violate monotonicity."""
-    disparity = pair.left.disparity
-    known = max(int(np.isfinite(disparity).sum()), 1)
-    return float(detect_monotonicity_violations(disparity).sum() / known)
 
 
 def trilinear_sequence(
@@ -137,60 +131,31 @@ METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
 
 
 def render_run(
-    out: Path,
-    folder: Path,
-    *,
-    path: str = "orbit",
-    frames: int = 90,
-    size: tuple[int, int] | None = None,
-    light: str = "none",
-    background: tuple[int, int, int] = (0, 0, 0),
-    threads: int = 1,
-    progress: Progress | None = None,
-    overwrite: bool = False,
-) -> str:
+    out: Path, folder: Path, *, path: str = "orbit", frames: int = 90, size: tuple[int, int] | None = None,
+    light: str = "none", background: tuple[int, int, int] = (0, 0, 0), threads: int = 1,
+    progress: Progress | None = None, overwrite: bool = False,
+) -> str:  # fmt: skip
     """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
     with _claimed(folder, path, frames, overwrite=overwrite) as outputs:
-        size = size or cameras[0].scaled(min(1.0, 1000 / max(cameras[0].size))).size
-        views = _camera_path(mesh, cameras, path, frames, size)
+        width, height = size or cameras[0].scaled(min(1.0, 1000 / max(cameras[0].size))).size
+        views = _camera_path(mesh, cameras, path, frames, (width, height))
         shading = _shading(mesh, cameras, light)
-        report, done = progress or (lambda *_: None), 0
 
-        def draw(k: int) -> None:
-            view = render(mesh, views[k], shading=shading(views[k]), background=background)
-            write_image(folder / frame_name(k + 1), view.color)
+        def draw(k: int) -> U8:
+            return render(mesh, views[k], shading=shading(views[k]), background=background).color
 
-        def finished(_: int, __: Any) -> None:
-            nonlocal done
-            done += 1
-            # The last step is the animation.
-            report("views", done, frames + 1)
-
-        _remove_old(outputs, frames)
-        Workers(threads).run(draw, [(k,) for k in range(frames)], finished)
-        warnings = list[str]()
-        animation = _animate(folder, path, frames, warnings)
-        given = {"path": path, "light": light, "background": background, "width": size[0], "height": size[1]}
+        facts = {"path": path, "light": light, "background": background, "width": width, "height": height}
         # The cameras as in cameras.json.
         entries = [{key: getattr(view, key) for key in ("K", "R", "t", "centre")} for view in views]
-        _describe(folder, given, entries, warnings)
-        finished(frames, animation)
-    return _written(folder, frames, size, animation, warnings)
+        return _write_views(folder, path, outputs, draw, facts, entries, Workers(threads), progress)
 
 
 def interpolate_images(
-    folder: Path,
-    paths: Sequence[Path],
-    *,
-    method: str = "interpolation",
-    frames: int = 21,
-    seed: int = 0,
-    max_size_px: int | None = None,
-    threads: int = 1,
-    progress: Progress | None = None,
+    folder: Path, paths: Sequence[Path], *, method: str = "interpolation", frames: int = 21, seed: int = 0,
+    max_size_px: int | None = None, threads: int = 1, progress: Progress | None = None,
     overwrite: bool = False,
-) -> str:
+) -> str:  # fmt: skip
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
     _check_images(paths)
     with _claimed(folder, method, frames, overwrite=overwrite) as outputs:
@@ -202,24 +167,21 @@ def interpolate_images(
         report("correspondence", 0, 1)
         sequence = METHODS[method](images, frames, config=config, seed=seed)
         report("correspondence", 1, 1)
-        _remove_old(outputs, frames)
-        drawn, warnings = [], list[str]()
-        for k, caption in enumerate(sequence.captions):
-            rgb = sequence.draw(k, threads)
-            write_image(folder / frame_name(k + 1), rgb)
-            drawn.append((caption, rgb))
-            report("views", k + 1, frames + 2)
-        animation = _animate(folder, method, frames, warnings, milliseconds=100)
-        report("views", frames + 1, frames + 2)
-        title = "Between " + " and ".join(image.name for image in images)
+        drawn: list[tuple[str, U8]] = []
 
-        def write_strip() -> None:
-            write_text(folder / STRIP, strip_page(title, drawn, notes=sequence.notes))
+        def draw(k: int) -> U8:
+            drawn.append((sequence.captions[k], sequence.draw(k, threads)))
+            return drawn[-1][1]
 
-        made(STRIP, write_strip, warnings, None)
-        _describe(folder, {"method": method, **sequence.metadata}, sequence.frame_metadata, warnings)
-        report("views", frames + 2, frames + 2)
-    return _written(folder, frames, rgb.shape[1::-1], animation, warnings)
+        def page() -> str:
+            title = "Between " + " and ".join(image.name for image in images)
+            return strip_page(title, drawn, notes=sequence.notes)
+
+        facts, entries = {"method": method, **sequence.metadata}, sequence.frame_metadata
+        # The threads work on one view at a time.
+        return _write_views(
+            folder, method, outputs, draw, facts, entries, Workers(1), progress, milliseconds=100, page=page
+        )
 
 
 @contextmanager
@@ -233,28 +195,47 @@ def _claimed(folder: Path, name: str, frames: int, *, overwrite: bool) -> Iterat
             what = f"contains {foreign[0]!r}, which this command did not create"
             raise UsageError(f"the folder {folder} {what}; choose an empty or a new folder")
 
-    names = [FRAMES, *_file_names(name, frames)]
+    names = [FRAMES, *map(frame_name, range(1, frames + 1)), f"{name}.webp", *[STRIP] * (name in METHODS)]
     with claim_folder(folder, overwrite=overwrite, names=names, check=check) as outputs:
         yield outputs
 
 
-def _remove_old(outputs: OutputFolder, frames: int) -> None:
-    """Remove the files of an earlier command but for frames that this one replaces."""
-    new = [frame_name(k + 1) for k in range(frames)]
-    outputs.remove([old for old in outputs.digests if _OWN.fullmatch(old) and old not in new])
+def _write_views(
+    folder: Path, name: str, outputs: OutputFolder, draw: Callable[[int], U8], facts: dict[str, Any],
+    entries: Sequence[dict[str, Any]], workers: Workers, progress: Progress | None, *, milliseconds: int = 40,
+    page: Callable[[], str] | None = None,
+) -> str:  # fmt: skip
+    """Write a frame for each entry, then animation, page and description; return a sentence."""
+    frames = [frame_name(k + 1) for k in range(len(entries))]
+    # Files of an earlier command, but for frames that this one replaces.
+    outputs.remove([old for old in outputs.digests if _OWN.fullmatch(old) and old not in frames])
+    sizes, warnings, report = set[Any](), list[str](), progress or (lambda *_: None)
+    files, film, done = [folder / frame for frame in frames], folder / f"{name}.webp", 0
 
+    def write(k: int) -> None:
+        rgb = draw(k)
+        sizes.add(rgb.shape[1::-1])
+        write_image(files[k], rgb)
 
-def _describe(
-    folder: Path, facts: dict[str, Any], entries: Sequence[dict[str, Any]], warnings: list[str]
-) -> None:
-    listed = [{"name": frame_name(k + 1), **entry} for k, entry in enumerate(entries)]
-    noted = {"warnings": warnings} if warnings else {}
-    write_json(folder / FRAMES, {**facts, "frames": listed, **noted})
+    def finished(*_: Any) -> None:
+        nonlocal done
+        done += 1
+        # The last step is the animation.
+        report("views", done, len(frames) + 1)
 
-
-def _file_names(name: str, frames: int) -> list[str]:
-    files = [frame_name(k + 1) for k in range(frames)] + [f"{name}{animation_suffix()}"]
-    return [*files, STRIP] if name in METHODS else files
+    workers.run(write, [(k,) for k in range(len(frames))], finished)
+    animate = partial(write_animation, film, files, milliseconds=milliseconds)
+    animation = made(film.name, animate, warnings, None)
+    if page is not None:
+        made(STRIP, lambda: write_text(folder / STRIP, page()), warnings, None)
+    listed = [{"name": frame, **entry} for frame, entry in zip(frames, entries, strict=True)]
+    write_json(folder / FRAMES, facts | {"frames": listed} | ({"warnings": warnings} if warnings else {}))
+    finished()
+    ((width, height),) = sizes
+    text = f"{counted(len(frames), 'frame')} of {width} x {height} px"
+    text += "" if animation is None else f" and {animation.name}"
+    lines = [f"{text} written to {folder}", *(f"warning: {warning}" for warning in warnings)]
+    return "\n".join(map(printable, lines))
 
 
 def _check_images(paths: Sequence[Path]) -> None:
@@ -268,38 +249,19 @@ def _check_images(paths: Sequence[Path]) -> None:
             raise UsageError(f"{first} is given twice; give different images")
 
 
-def _animate(folder: Path, name: str, frames: int, warnings: list[str], **options: int) -> Path | None:
-    files, path = [folder / frame_name(k + 1) for k in range(frames)], folder / f"{name}{animation_suffix()}"
-    return made(path.name, lambda: write_animation(path, files, **options), warnings, None)
-
-
-def _written(
-    folder: Path, frames: int, size: Sequence[int], animation: Path | None, warnings: list[str]
-) -> str:
-    files = f"{counted(frames, 'frame')} of {size[0]} x {size[1]} px"
-    files += "" if animation is None else f" and {animation.name}"
-    lines = [f"{files} written to {folder}", *(f"warning: {warning}" for warning in warnings)]
-    return "\n".join(map(printable, lines))
-
-
 def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
     if not out.is_dir() or not any((out / name).is_file() for name in (MODEL, CAMERAS, "run.json")):
         raise UsageError(f"{out} holds no run; create one with thesisrecon reconstruct IMAGES -o {out}")
     if not (out / MODEL).is_file():
-        raise UsageError(_missing_model(out))
+        summary = read_json(out / "summary.json")
+        warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
+        if failed := [str(w) for w in warnings if str(w).startswith("No surface model was built")]:
+            raise UsageError(f"the run in {out} has cameras but no model: {failed[0]}")
+        command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
+        raise UsageError(f"the run in {out} has no model yet ({MODEL}); continue it with {command}")
     mesh = read_mesh(out / MODEL)
     # Views are rendered without lens distortion.
     return mesh, [replace(camera, distortion=None) for camera in read_cameras(out / CAMERAS).values()]
-
-
-def _missing_model(out: Path) -> str:
-    """Why a run has no model: its surface stage failed, or it has not been run."""
-    summary = read_json(out / "summary.json")
-    warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
-    if reason := next((str(w) for w in warnings if str(w).startswith("No surface model was built")), None):
-        return f"the run in {out} has cameras but no model: {reason}"
-    command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
-    return f"the run in {out} has no model yet ({MODEL}); continue it with {command}"
 
 
 def _camera_path(
@@ -318,13 +280,12 @@ def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[
         return lambda _: None
     if light == "sun":
         # From above, the left and the first camera: walls and ground keep their brightness.
-        towards = estimate_up(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]
-        sun = Shading(ambient=0.4, lights=(Light(direction=_triple(towards), color=(0.9,) * 3),))
+        x, y, z = (estimate_up(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]).tolist()
+        sun = Shading(ambient=0.4, lights=(Light(direction=(x, y, z), color=(0.9,) * 3),))
         return lambda _: sun
-    grey = (0.8, 0.8, 0.8)
-    return lambda eye: Shading(ambient=0.3, lights=(Light(position=_triple(eye.centre), color=grey),))
 
+    def lamp(eye: Camera) -> Shading:
+        x, y, z = eye.centre.tolist()
+        return Shading(ambient=0.3, lights=(Light(position=(x, y, z), color=(0.8, 0.8, 0.8)),))
 
-def _triple(vector: F64) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
+    return lamp

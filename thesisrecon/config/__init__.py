@@ -7,6 +7,7 @@ Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis).
 from __future__ import annotations
 
 import logging
+import re
 import typing
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -22,7 +23,7 @@ from thesisrecon.config.plug_ins import FunctionMatcher, as_method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
-from thesisrecon.errors import UsageError, in_words, unknown_word
+from thesisrecon.errors import UsageError, in_words, require_at_least, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._prepared import EstimateFundamental, MapAll
@@ -61,35 +62,31 @@ from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets
 from thesisrecon.surface.model import SurfaceModel
 
-# Stage -> word in text -> class. A new method is one line here.
-KINDS: Mapping[str, Mapping[str, type[Any]]] = {
-    "features": {"multi-scale-corners": MultiScaleCorners, "harris-corners": HarrisCorners},
-    "pairs": {
-        "all-pairs": AllPairs,
-        "overlap-estimate": OverlapEstimate,
-        "sequence-window": SequenceWindow,
-        "listed-pairs": ListedPairs,
-    },
-    "matching": {"seeds-and-growth": SeedsAndGrowth, "strength-of-match": StrengthOfMatch},
-    "epipolar": {"locally-optimised-ransac": LocallyOptimisedRansac, "thesis-ransac": ThesisRansac},
-    "verification": {"pair-verification": PairVerification},
-    "tracks": {"aligned-tracks": AlignedTracks, "plain-tracks": PlainTracks},
-    "projective": {
-        "incremental-projective": IncrementalProjective,
-        "sequential-projective": SequentialProjective,
-        "factorization": Factorization,
-    },
-    "selfcalibration": {
-        "hypotheses-and-refinement": HypothesesAndRefinement,
-        "stratified": Stratified,
-        "linear-quadric": LinearQuadric,
-        "nonlinear-quadric": NonlinearQuadric,
-        "kruppa-equations": KruppaEquations,
-    },
-    "metric": {"metric-refinement": MetricRefinement},
-    "dense": {"multi-view-stereo": MultiViewStereo},
-    "model": {"surface-model": SurfaceModel},
-}
+# A new method is one word here.
+_METHODS: Mapping[str, Sequence[type[Any]]] = {
+    "features": (MultiScaleCorners, HarrisCorners),
+    "pairs": (AllPairs, OverlapEstimate, SequenceWindow, ListedPairs),
+    "matching": (SeedsAndGrowth, StrengthOfMatch),
+    "epipolar": (LocallyOptimisedRansac, ThesisRansac),
+    "verification": (PairVerification,),
+    "tracks": (AlignedTracks, PlainTracks),
+    "projective": (IncrementalProjective, SequentialProjective, Factorization),
+    "selfcalibration": (
+        HypothesesAndRefinement, Stratified, LinearQuadric, NonlinearQuadric, KruppaEquations,
+    ),
+    "metric": (MetricRefinement,),
+    "dense": (MultiViewStereo,),
+    "model": (SurfaceModel,),
+}  # fmt: skip
+
+
+def word_of(kind: type[Any]) -> str:
+    """The name of a class in text, in kebab case: "modulus-constraint" for ``ModulusConstraint``."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
+
+
+KINDS = {stage: {word_of(method): method for method in methods} for stage, methods in _METHODS.items()}
+"""Stage -> word in text -> class."""
 
 
 # `rng` is the source of randomness, which deterministic methods ignore; views are numbered like images.
@@ -121,14 +118,9 @@ class Matcher(Protocol):
         """Do the work that depends on one image, and return the data of the image that ``match`` needs."""
 
     def match(
-        self,
-        view1: Any,
-        view2: Any,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental,
+        self, view1: Any, view2: Any, *, pair: tuple[int, int], estimate_fundamental: EstimateFundamental,
         rng: np.random.Generator,
-    ) -> Matches:
+    ) -> Matches:  # fmt: skip
         """Match the corners of two prepared images one-to-one; there may be no matches.
 
         ``pair`` are the numbers of the views, ``estimate_fundamental`` is the robust estimator of F for
@@ -169,14 +161,9 @@ class ProjectiveReconstructor(Protocol):
     """Reconstruction up to a projective transform (chapter 6)."""
 
     def reconstruct(
-        self,
-        tracks: Tracks,
-        pairs: Sequence[TwoView],
-        sizes: I64,
-        *,
-        rng: np.random.Generator,
+        self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: np.random.Generator,
         attempt: int = 0,
-    ) -> Reconstruction:
+    ) -> Reconstruction:  # fmt: skip
         """Reconstruct cameras and points from a selection of the tracks and verified pairs.
 
         ``sizes`` (V, 2) are width and height of the images; each ``attempt`` begins with another initial
@@ -201,14 +188,9 @@ class MetricRefiner(Protocol):
     """Refine the metric model: missing cameras, bundle adjustment, intervals and self-check."""
 
     def refine(
-        self,
-        reconstruction: Reconstruction,
-        calibration: SelfCalibration,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,
-        threads: int,
-    ) -> MetricResult:
+        self, reconstruction: Reconstruction, calibration: SelfCalibration, *, prior: IntrinsicsPrior,
+        rng: np.random.Generator, threads: int,
+    ) -> MetricResult:  # fmt: skip
         """Refine a projective reconstruction to the metric model; all candidate calibrations are tried.
 
         Returns cameras, points, intrinsics with intervals, and the self-check, which do not depend on the
@@ -239,13 +221,9 @@ class DepthEstimator(StereoMatcher, Protocol):
     """Estimate depth maps view by view (2.5); ``scene`` contains all views or at least ``required_views``."""
 
     def prepare(
-        self,
-        images: Sequence[Image],
-        reconstruction: Reconstruction,
-        *,
-        depth_range: F64 | None = None,
+        self, images: Sequence[Image], reconstruction: Reconstruction, *, depth_range: F64 | None = None,
         threads: int = 1,
-    ) -> MultiViewScene:
+    ) -> MultiViewScene:  # fmt: skip
         """Undistort the images of a metric reconstruction and select the neighbours of each.
 
         The depths to search are ``depth_range`` (V, 2), nearest and farthest, else follow from the points of
@@ -281,13 +259,9 @@ class ModelBuilder(Protocol):
         """
 
     def color(
-        self,
-        surface: TexturedMesh,
-        views: Sequence[PinholeView],
-        *,
-        without: int | None = None,
+        self, surface: TexturedMesh, views: Sequence[PinholeView], *, without: int | None = None,
         threads: int = 1,
-    ) -> TexturedMesh:
+    ) -> TexturedMesh:  # fmt: skip
         """Texture a surface from all views except ``without``, whose image is to be compared with the model.
 
         The depths of that view remain part of the surface.
@@ -314,10 +288,7 @@ class ImageOptions:
     part_views: int = 400
 
     def __post_init__(self) -> None:
-        if self.max_size_px < 64:
-            raise ValueError(f"max_size_px must be at least 64; got {self.max_size_px}")
-        if self.part_views < 0:
-            raise ValueError(f"part_views must be at least 0; got {self.part_views}")
+        require_at_least(self, max_size_px=64, part_views=0)
 
 
 @dataclass(frozen=True)

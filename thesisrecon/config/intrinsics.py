@@ -14,7 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
-from thesisrecon.records import INTRINSICS, IntrinsicsPrior, Reconstruction
+from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
 Mode = Literal["known", "constant", "free"]
 """``known``: the value is given; ``constant``: one unknown value per camera; ``free``: one per image."""
@@ -22,12 +22,9 @@ Mode = Literal["known", "constant", "free"]
 _OF_COLUMN = ("focal", "aspect", "skew", "principal_point", "principal_point", "k1")
 """Mode setting of each column."""
 _STD_SETTINGS = {
-    "focal_std_rel": "focal",
-    "aspect_std": "aspect",
-    "skew_std_px": "skew",
-    "principal_point_std_rel": "principal_point",
-    "k1_std": "k1",
-}
+    "focal_std_rel": "focal", "aspect_std": "aspect", "skew_std_px": "skew",
+    "principal_point_std_rel": "principal_point", "k1_std": "k1",
+}  # fmt: skip
 """Setting of each standard deviation -> its intrinsic."""
 
 
@@ -118,15 +115,10 @@ class IntrinsicsOptions:
             raise ValueError(f"{idle}: set focal_px, or exif = true")
 
 
-def _camera_groups(original_sizes: Sequence[tuple[int, int]], cameras: str) -> I64:
-    """Camera number (V,) of each image in order of appearance: one per distinct size, or one per image."""
-    if cameras == "per-image":
-        return np.arange(len(original_sizes), dtype=np.int64)
-    return _numbered(original_sizes)
-
-
-def _numbered(keys: Sequence[tuple[float, ...]]) -> I64:
-    """Number of each key among the distinct ones, in order of appearance."""
+def _numbered(keys: Sequence[tuple[float, ...]], *, each: bool = False) -> I64:
+    """Number (V,) of each key among the distinct ones, in order of appearance; ``each``: all are distinct."""
+    if each:
+        return np.arange(len(keys), dtype=np.int64)
     distinct = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     return np.array([distinct[key] for key in keys], dtype=np.int64)
 
@@ -134,16 +126,13 @@ def _numbered(keys: Sequence[tuple[float, ...]]) -> I64:
 def camera_numbers(
     original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
 ) -> I64:
-    """Number the cameras (V,) so that views with equal numbers agree in all intrinsics, known or shared.
-
-    ``exif_focal_px`` None: no EXIF data.
-    """
+    """Number the cameras (V,) so that views with equal numbers agree in all intrinsics, known or shared."""
     n = len(original_sizes)
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
     prior = prior_from_options(options, original_sizes, exif, np.ones(n))
     known = prior.std == 0.0
     tied, values = np.where(known, -1, prior.shared), np.where(known, prior.mean, 0.0)
-    group = _camera_groups(original_sizes, options.cameras)
+    group = _numbered(original_sizes, each=options.cameras == "per-image")
     return _numbered(list(map(tuple, np.column_stack([group, tied, values]).tolist())))
 
 
@@ -157,22 +146,17 @@ def prior_from_options(
     """
     n = len(original_sizes)
     _check_sizes(options, original_sizes)
-    group, own = _camera_groups(original_sizes, options.cameras), np.arange(n, dtype=np.int64)
+    group, own = _numbered(original_sizes, each=options.cameras == "per-image"), np.arange(n)
     # A known value is known for every view: sharing it would add nothing.
     modes = [getattr(options, name) for name in _OF_COLUMN]
     shared = np.stack([group if mode == "constant" else own for mode in modes], axis=1)
-    kind = _camera_groups(original_sizes, "shared") if options.common_prior else own
+    kind = _numbered(original_sizes, each=not options.common_prior)
     mean, std = _values(options, np.array(original_sizes, dtype=np.float64).reshape(n, 2), exif_focal_px)
-    for column, name in enumerate(INTRINSICS):
-        if modes[column] == "known":
-            std[:, column] = 0.0
-        if name in ("principal_x", "principal_y"):
-            # (0, 0) is the centre of the first pixel: x goes to (x + 0.5) s - 0.5.
-            mean[:, column] = (mean[:, column] + 0.5) * scales - 0.5
-        elif name in ("focal", "skew"):
-            mean[:, column] *= scales
-        if name in ("skew", "principal_x", "principal_y"):
-            std[:, column] *= scales
+    std[:, [mode == "known" for mode in modes]] = 0.0
+    # Columns of INTRINSICS. (0, 0) is the centre of the first pixel: x goes to (x + 0.5) s - 0.5.
+    mean[:, [0, 2]] *= scales[:, None]
+    mean[:, 3:5] = (mean[:, 3:5] + 0.5) * scales[:, None] - 0.5
+    std[:, 2:5] *= scales[:, None]
     missing = ~np.isfinite(mean[:, 0])
     std[missing, 0] = np.inf
     if options.focal == "known":

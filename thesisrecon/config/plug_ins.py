@@ -96,9 +96,8 @@ class _Check:
 
 def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence[Any]) -> Matches:
     """Check the matches that a user-defined matcher returned: the kernels that use them check nothing."""
-    check = _Check(
-        f"the method match of {type(matching).__name__}", f"Matches, or {FUNCTIONS['matching'][2]}"
-    )
+    who, returns = f"the method match of {type(matching).__name__}", FUNCTIONS["matching"][2]
+    check = _Check(who, f"Matches, or {returns}")
     if not isinstance(found, Matches):
         return check.matches(found, pair)
     xy1, xy2 = check.array(found.xy1, 2, "xy1"), check.array(found.xy2, 2, "xy2")
@@ -110,15 +109,11 @@ def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence
     for number, view in zip(index, views, strict=True):
         features = getattr(view, "features", None)
         most = np.inf if features is None else len(features.xy)
-        if (
-            number.shape != (n,)
-            or number.dtype.kind != "i"
-            or (n and not -1 <= number.min() <= number.max() < most)
-        ):
+        shaped = number.shape == (n,) and number.dtype.kind == "i"
+        if not shaped or (n and not -1 <= number.min() <= number.max() < most):
             raise check.wrong("indices that are not corners of the view (-1: none)")
-    return replace(
-        found, xy1=xy1, xy2=xy2, index1=index[0].astype(np.int64), index2=index[1].astype(np.int64)
-    )
+    index1, index2 = (number.astype(np.int64) for number in index)
+    return replace(found, xy1=xy1, xy2=xy2, index1=index1, index2=index2)
 
 
 @dataclass(frozen=True)
@@ -169,9 +164,8 @@ class FunctionPairs(FunctionAdapter):
             try:
                 i, j = (number[end.item() if isinstance(end, np.generic) else end] for end in pair)
             except (KeyError, TypeError, ValueError):
-                raise self._check.wrong(
-                    f"{in_words(pair)}, which is no pair of the {len(names)} images"
-                ) from None
+                what = f"{in_words(pair)}, which is no pair of the {len(names)} images"
+                raise self._check.wrong(what) from None
             if i == j:
                 raise self._check.wrong(f"{in_words(pair)}, a pair of an image with itself")
             chosen.add((min(i, j), max(i, j)))
@@ -192,9 +186,8 @@ class FunctionView:
 class FunctionMatcher(FunctionAdapter):
     """Matches by a function ``f(image1, image2) -> xy1, xy2[, score]`` of arrays (H, W, 3) uint8.
 
-    Positions may differ from pair to pair, as without a detector: tracks join those within
-    ``PlainTracks.merge_px``. Positions are not aligned, so that a configuration with ``AlignedTracks()`` gets
-    ``PlainTracks()``.
+    Tracks join positions within ``PlainTracks.merge_px``, which may differ from pair to pair. They are not
+    aligned: ``AlignedTracks()`` becomes ``PlainTracks()``.
     """
 
     def prepare(self, image: Image, features: Features) -> FunctionView:
@@ -202,14 +195,9 @@ class FunctionMatcher(FunctionAdapter):
         return FunctionView(image.rgb, features)
 
     def match(
-        self,
-        view1: FunctionView,
-        view2: FunctionView,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: Any,
+        self, view1: FunctionView, view2: FunctionView, *, pair: tuple[int, int], estimate_fundamental: Any,
         rng: np.random.Generator,
-    ) -> Matches:
+    ) -> Matches:  # fmt: skip
         """See `thesisrecon.config.Matcher.match`."""
         sizes = [(view.rgb.shape[1], view.rgb.shape[0]) for view in (view1, view2)]
         return self._check.matches(self.function(view1.rgb, view2.rgb), pair, sizes)
@@ -246,9 +234,8 @@ class FunctionFundamental(FunctionAdapter):
         F = frame.matrix_in_pixels(f)
         sigma = noise_scale(sampson_residuals(F, xy1[inliers], xy2[inliers]))
         points = frame.points(xy1[inliers], xy2[inliers])
-        return FundamentalFit(
-            F, inliers, sigma, fundamental_covariance(frame, f, points, sigma * frame.scale)
-        )
+        covariance = fundamental_covariance(frame, f, points, sigma * frame.scale)
+        return FundamentalFit(F, inliers, sigma, covariance)
 
     def _failure(self, what: str, count: int) -> StageFailure:
         return StageFailure(Notice("no-geometry-of-function", name_of(self)), f"{what} in {count} matches")
@@ -278,9 +265,8 @@ def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
             parameters = list(inspect.signature(member).parameters.values())[1:]
             # The pipeline always passes the arguments without a default.
             fixed = [p for p in parameters if p.default is p.empty]
-            _check_arguments(
-                getattr(value, name), fixed, f"the method {name} of {stage}={type(value).__name__}"
-            )
+            what = f"the method {name} of {stage}={type(value).__name__}"
+            _check_arguments(getattr(value, name), fixed, what)
         return value
     if stage in FUNCTIONS and callable(value):
         kind, names, _ = FUNCTIONS[stage]
@@ -304,9 +290,8 @@ def _check_arguments(function: Callable[..., Any], fixed: Sequence[inspect.Param
         signature.bind(*[None] * (len(fixed) - len(by_name)), **by_name)
     except TypeError:
         wanted = ", ".join(p.name + "=..." * (p.kind is p.KEYWORD_ONLY) for p in fixed)
-        raise UsageError(
-            f"{what} must take the {len(fixed)} arguments ({wanted}); it takes {signature}"
-        ) from None
+        message = f"{what} must take the {len(fixed)} arguments ({wanted}); it takes {signature}"
+        raise UsageError(message) from None
 
 
 def text_of(value: Any) -> str:
@@ -319,13 +304,8 @@ def text_of(value: Any) -> str:
     # A function typed at the prompt after a script has run is in the script's module, not in its file.
     in_file = code is None or Path(code.co_filename).resolve() == Path(file or "").resolve()
     # Files of a package may need their package.
-    if (
-        home is not None
-        and file
-        and Path(file).is_file()
-        and in_file
-        and (is_function or "." not in home.__name__)
-    ):
+    loadable = home is not None and (is_function or "." not in home.__name__)
+    if loadable and file and Path(file).is_file() and in_file:
         names = [name for name, member in vars(home).items() if member is made]
         kind = type(made).__name__
         if not is_function and is_dataclass(made) and getattr(home, kind, None) is type(made):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import re
 import tomllib
 import types
 import typing
@@ -19,7 +18,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from thesisrecon.config import KINDS, PRESETS, PipelineConfig
+from thesisrecon.config import KINDS, PRESETS, PipelineConfig, word_of
 from thesisrecon.config import preset as _preset
 from thesisrecon.config.plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
 from thesisrecon.errors import UsageError, in_words, unknown_word
@@ -37,14 +36,9 @@ _NONE, _KIND = "none", "kind"
 
 
 def build_config(
-    config: Config | None = None,
-    *,
-    preset: str | None = None,
-    max_size: int | None = None,
-    cameras: str | None = None,
-    pairs: Pairs | None = None,
-    settings: Settings = (),
-) -> PipelineConfig:
+    config: Config | None = None, *, preset: str | None = None, max_size: int | None = None,
+    cameras: str | None = None, pairs: Pairs | None = None, settings: Settings = (),
+) -> PipelineConfig:  # fmt: skip
     """Build the configuration of a run from the options of the command and of :func:`reconstruct`.
 
     The preset (the given one, else that of the file), the file, the options and the settings apply in this
@@ -71,9 +65,8 @@ def build_config(
     elif isinstance(config, str) and config in PRESETS:
         base = PRESETS[config]
     elif isinstance(config, str):
-        raise UsageError(
-            f"{unknown_word('preset', config, PRESETS)}; there is no TOML file of this name either"
-        )
+        message = f"{unknown_word('preset', config, PRESETS)}; there is no TOML file of this name either"
+        raise UsageError(message)
     elif config is not None:
         takes = "config takes a PipelineConfig, the name of a preset or a TOML file"
         raise UsageError(f"{takes}; got {in_words(config)}")
@@ -112,12 +105,9 @@ def _pairs_table(value: Pairs) -> Table:
 
 
 def config_from_toml(
-    text: str,
-    base: PipelineConfig | None = None,
-    *,
-    fixed_preset: bool = False,
+    text: str, base: PipelineConfig | None = None, *, fixed_preset: bool = False,
     changes: Sequence[Mapping[str, Any]] = (),
-) -> PipelineConfig:
+) -> PipelineConfig:  # fmt: skip
     """Read a TOML configuration; a line ``preset = "thesis"`` selects the base, unless ``fixed_preset``.
 
     ``changes`` are further tables, later ones override. All are merged before values are checked, so settings
@@ -181,9 +171,7 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     fields = {key: value for key, value in table.items() if key != _KIND}
     own = _kind_of(stage, current)
     kind = table.get(_KIND, own)
-    method = current
-    if kind != own or kind in KINDS[stage]:
-        method = _method_of_kind(stage, kind, current)
+    method = current if kind == own else _method_of_kind(stage, kind)
     if isinstance(method, type) and not dataclasses.is_dataclass(method) and not fields:
         return method()
     variant = method if isinstance(method, type) else type(method)
@@ -198,8 +186,8 @@ def _stage_from_table(stage: str, table: Mapping[str, Any], current: Any) -> Any
     return dataclass_from_table(variant, fields, stage, None if isinstance(method, type) else method)
 
 
-def _method_of_kind(stage: str, kind: Any, current: Any) -> Any:
-    """The class of a kind, or the object of ``file.py:name``; the current object if it has this kind."""
+def _method_of_kind(stage: str, kind: Any) -> Any:
+    """The class of a kind, or the object of ``file.py:name``."""
     if is_reference(kind):
         return load_reference(kind, f"{stage}.{_KIND}")
     if isinstance(kind, str) and kind.endswith(NOT_IN_A_FILE):
@@ -211,8 +199,7 @@ def _method_of_kind(stage: str, kind: Any, current: Any) -> Any:
     if not isinstance(kind, str) or kind not in KINDS[stage]:
         known = unknown_word(f"kind of {stage}", kind, KINDS[stage])
         raise UsageError(f"{known}; code in a file is path/to/file.py:name")
-    variant = KINDS[stage][kind]
-    return current if type(current) is variant else variant
+    return KINDS[stage][kind]
 
 
 def tables_from_settings(settings: Settings) -> Table:
@@ -278,8 +265,9 @@ def table_from_dataclass(value: Any) -> Table:
     table = {}
     for name in _settings_of(type(value)):
         content, several = getattr(value, name), _alternatives(typing.get_args(hints[name]))
-        head = {_KIND: _word_of(type(content))} if type(content) in several.values() else {}
-        table[name] = head | _plain(content) if head else _plain(content)
+        table[name] = _plain(content)
+        if type(content) in several.values():
+            table[name] = {_KIND: word_of(type(content)), **table[name]}
     return table
 
 
@@ -296,15 +284,10 @@ def _settings_of(kind: type[Any]) -> list[str]:
     return [f.name for f in dataclasses.fields(kind) if not f.metadata.get("given")]
 
 
-def _word_of(kind: type[Any]) -> str:
-    """The name of a class in kebab case: "modulus-constraint" for ``ModulusConstraint``."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "-", kind.__name__).lower()
-
-
 def _alternatives(union: Iterable[Any]) -> dict[str, type[Any]]:
     """Word -> class of the dataclasses among the members of a union, if there are several."""
     classes = [a for a in union if isinstance(a, type) and dataclasses.is_dataclass(a)]
-    return {_word_of(a): a for a in classes} if len(classes) > 1 else {}
+    return {word_of(a): a for a in classes} if len(classes) > 1 else {}
 
 
 def _plain(value: Any) -> Any:
@@ -374,7 +357,7 @@ def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str
     if not isinstance(table, Mapping):
         one_of = f"one of {', '.join(several)} or a table of settings"
         raise UsageError(f"{where} takes {one_of}; got {in_words(value)}")
-    kind = table.get(_KIND, _word_of(type(current)))
+    kind = table.get(_KIND, word_of(type(current)))
     if not isinstance(kind, str) or kind not in several:
         raise UsageError(unknown_word(f"kind of {where}", kind, several))
     fields = {key: v for key, v in table.items() if key != _KIND}

@@ -12,9 +12,9 @@ import math
 import shutil
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64, U8, rows_of_views
+from thesisrecon.arrays import B8, F64, I64, U8, resizing_transform, rows_of_views
 from thesisrecon.camera import project_camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import first_repeated, read_bytes, require_image_name, write_atomically
@@ -106,9 +106,8 @@ def _parsed(file: Path, parse: Callable[[bytes], Iterator[Any]]) -> list[Any]:
         return list(parse(read_bytes(file, largest=2**32)))
     except (struct.error, ValueError, OverflowError, IndexError, OSError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise UsageError(
-            f"{file} is not a valid COLMAP file; it cannot be parsed: {reason}; export the model again"
-        ) from None
+        message = f"{file} is not a valid COLMAP file; it cannot be parsed: {reason}; export the model again"
+        raise UsageError(message) from None
 
 
 def _camera(number: int, kind: int, size: tuple[int, int], params: Sequence[float]) -> _Camera:
@@ -249,10 +248,7 @@ _TABLES = {
 
 
 def read_database(path: Path) -> Database:
-    """Read the keypoints and the verified matches, or the raw matches if none are verified.
-
-    Nothing is written beside the file. Time and memory are bounded by its size.
-    """
+    """Read the keypoints and the verified matches, or the raw ones; nothing is written beside the file."""
     if not path.is_file():
         raise UsageError(f"there is no COLMAP database or model at {path}")
     path = path.resolve()
@@ -261,9 +257,8 @@ def read_database(path: Path) -> Database:
         with _opened(path) as base:
             found = _read_tables(base, path, sum(size for size, _ in before))
         if _states(path) != before:
-            raise UsageError(
-                f"{path} was changed while it was read; repeat the command when COLMAP has ended"
-            )
+            message = f"{path} was changed while it was read; repeat the command when COLMAP has ended"
+            raise UsageError(message)
         return found
     except UsageError:
         raise
@@ -380,64 +375,38 @@ def _read_tables(base: sqlite3.Connection, path: Path, size: int) -> Database:
 
 
 def write_colmap_model(
-    folder: str | Path,
-    reconstruction: Reconstruction,
-    names: Sequence[str],
-    *,
-    colors: U8,
-    groups: I64,
-    scales: F64,
-    original_sizes: I64,
-) -> int:
+    folder: str | Path, reconstruction: Reconstruction, names: Sequence[str], *, colors: U8, groups: I64,
+    scales: F64, original_sizes: I64,
+) -> int:  # fmt: skip
     """Write a metric reconstruction as a binary COLMAP model in original pixels; return 0.
 
-    It contains the registered views and the valid points with at least two inlier observations in them; view
-    i is image i + 1 and point j is point j + 1. The error of a point is its mean distance in original pixels.
-    Views of one of the ``groups`` share a camera if their intrinsics and sizes are equal. COLMAP has no
-    camera with skew: then nothing is written, and the number of such views is returned.
+    It has the registered views (i is image i + 1) and the valid points (j is point j + 1) with at least two
+    inliers in them; views of one of the ``groups`` share a camera if their intrinsics and sizes are equal.
+    COLMAP has no skew: then nothing is written, and the number of such views is returned.
     """
     r = reconstruction
     assert r.K is not None
     assert r.distortion is not None
-    skewed = r.registered & has_skew(r.K)
-    if skewed.any():
-        return int(skewed.sum())
-    view, point = r.tracks.view_index, r.tracks.point_index
-    kept = r.used
-    kept &= np.bincount(point[kept], minlength=len(r.X))[point] >= 2
-    view, point, xy = view[kept], point[kept], r.tracks.xy[kept]
-    posed, distance = dict[int, _PosedImage](), np.zeros(len(view))
-    rows = rows_of_views(view, len(r.P))
+    if skewed := int((r.registered & has_skew(r.K)).sum()):
+        return skewed
+    views = {}
     for i in np.flatnonzero(r.registered).tolist():
-        width, height = (int(size) for size in original_sizes[i])
-        camera = (int(groups[i]), width, height, *_camera_params(r.K[i], r.distortion[i], scales[i]))
         R, t = _pose(r.K[i], r.P[i])
-        posed[i] = _PosedImage(names[i], R, t, camera)
-        here = rows[i]
-        seen = project_camera(r.K[i], R, t, _points(r.X[point[here]]), distortion=r.distortion[i])
-        distance[here] = np.linalg.norm((seen - xy[here]) * scales[i], axis=1)
-    observed = _Observations(view, point, (xy + PIXEL_CENTRE) * scales[view, None], distance)
-    _write(Path(folder), posed, observed, np.unique(point), (r.X, colors))
+        K, (width, height) = resizing_transform(scales[i]) @ r.K[i], original_sizes[i].tolist()
+        views[i] = SparseView(names[i], R, t, K, (width, height), r.distortion[i], int(groups[i]))
+    kept, every = r.used, r.tracks.point_index
+    kept &= np.bincount(every[kept], minlength=len(r.X))[every] >= 2
+    view, point = r.tracks.view_index[kept], every[kept]
+    xy = (r.tracks.xy[kept] + 0.5) * scales[view, None] - 0.5
+    X = r.X[:, :3] / np.where(r.valid, r.X[:, 3], 1.0)[:, None]
+    _write(Path(folder), views, SparseModel([], X, colors, view, point, xy), np.unique(point))
     return 0
 
 
 def write_sparse_model(folder: str | Path, model: SparseModel, *, pinhole: bool = False) -> None:
     """Write a sparse model, without skew, as a binary COLMAP model; ``pinhole`` uses PINHOLE throughout."""
-    posed, distance = dict[int, _PosedImage](), np.zeros(len(model.xy))
-    rows = rows_of_views(model.view_index, len(model.views))
-    for i, view in enumerate(model.views):
-        assert view.K is not None
-        assert view.size is not None
-        assert view.distortion is not None
-        kind, params = _camera_params(view.K, view.distortion, 1.0, pinhole=pinhole)
-        posed[i] = _PosedImage(view.name, view.R, view.t, (0, *view.size, kind, params))
-        here = rows[i]
-        X = model.X[model.point_index[here]]
-        seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
-        distance[here] = np.linalg.norm(seen - model.xy[here], axis=1)
-    observed = _Observations(model.view_index, model.point_index, model.xy + PIXEL_CENTRE, distance)
-    Xh = np.column_stack([model.X, np.ones(len(model.X))])
-    _write(Path(folder), posed, observed, np.arange(len(Xh)), (Xh, colors_of(model)))
+    views = {i: replace(view, camera=0) for i, view in enumerate(model.views)}
+    _write(Path(folder), views, model, np.arange(len(model.X)), pinhole=pinhole)
 
 
 def has_skew(K: F64) -> B8:
@@ -445,54 +414,40 @@ def has_skew(K: F64) -> B8:
     return np.asarray(np.abs(K[..., 0, 1]) > 1e-9 * K[..., 0, 0])
 
 
-class _PosedImage(NamedTuple):
-    name: str
-    R: F64
-    t: F64
-    camera: tuple[int, int, int, str, tuple[float, ...]]  #: group, width, height, model, parameters
-
-
-class _Observations(NamedTuple):
-    """Observations in COLMAP's pixels, and their reprojection distances."""
-
-    view: I64
-    point: I64
-    xy: F64
-    distance: F64
-
-
 def _write(
-    folder: Path, posed: dict[int, _PosedImage], observed: _Observations, used: I64, points: tuple[F64, U8]
+    folder: Path, views: Mapping[int, SparseView], model: SparseModel, used: I64, *, pinhole: bool = False
 ) -> None:
-    """Write images by number, and the points ``used`` of (Xh, colors)."""
-    view, point, xy, distance = observed
+    """Write views by number, and the points ``used`` of a model; those of a group may share a camera."""
+    view, point, X = model.view_index, model.point_index, model.X
     kinds = [name for name, _ in _KINDS]
     # One camera per group and set of intrinsics.
     cameras: dict[tuple[object, ...], int] = {}
     camera_parts, images, frames = list[bytes](), list[bytes](), list[bytes]()
-    row, rows = np.zeros(len(view), dtype=np.int64), rows_of_views(view, max(posed, default=-1) + 1)
-    for i, (name, R, t, camera) in posed.items():
-        _, width, height, model, params = camera
-        if camera not in cameras:
-            cameras[camera] = len(cameras) + 1
-            head = (cameras[camera], kinds.index(model), width, height)
+    row, distance = np.zeros(len(view), dtype=np.int64), np.zeros(len(view))
+    rows = rows_of_views(view, max(views, default=-1) + 1)
+    for i, one in views.items():
+        K, size, distortion = one.intrinsics
+        kind, params = _camera_params(K, distortion, pinhole=pinhole)
+        number = cameras.setdefault((one.camera, size, kind, params), len(cameras) + 1)
+        if number > len(camera_parts):
+            head = (number, kinds.index(kind), *size)
             camera_parts.append(struct.pack(f"<IiQQ{len(params)}d", *head, *params))
         here = rows[i]
-        row[here] = np.arange(len(here))
-        quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(R).as_quat(canonical=True), 1)
+        seen = project_camera(K, one.R, one.t, X[point[here]], distortion=distortion)
+        row[here], distance[here] = np.arange(len(here)), np.linalg.norm(seen - model.xy[here], axis=1)
+        quaternion = np.roll(scipy.spatial.transform.Rotation.from_matrix(one.R).as_quat(canonical=True), 1)
         observations = np.empty(len(here), dtype=POINT_2D)
-        observations["xy"], observations["point"] = xy[here], point[here] + 1
-        image = struct.pack("<I7dI", i + 1, *quaternion, *t, cameras[camera])
-        encoded = name.encode("utf-8", "surrogateescape") + b"\0"
+        observations["xy"], observations["point"] = model.xy[here] + PIXEL_CENTRE, point[here] + 1
+        image = struct.pack("<I7dI", i + 1, *quaternion, *one.t, number)
+        encoded = one.name.encode("utf-8", "surrogateescape") + b"\0"
         images.append(image + encoded + struct.pack("<Q", len(here)) + observations.tobytes())
-        sensor = (1, 0, cameras[camera], i + 1)  # a sensor of the kind 0, a camera
-        frames.append(struct.pack("<II7dIiIQ", i + 1, cameras[camera], *quaternion, *t, *sensor))
+        sensor = (1, 0, number, i + 1)  # a sensor of the kind 0, a camera
+        frames.append(struct.pack("<II7dIiIQ", i + 1, number, *quaternion, *one.t, *sensor))
     order = np.lexsort((view, point))
     tracks = np.column_stack([view[order] + 1, row[order]]).astype("<u4")
-    Xh, colors = points
-    counts = np.bincount(point, minlength=len(Xh))[used]
-    error = np.bincount(point, weights=distance, minlength=len(Xh))[used] / np.maximum(counts, 1)
-    columns = (used + 1, _points(Xh[used]), colors[used], error, np.split(tracks, np.cumsum(counts)))
+    counts = np.bincount(point, minlength=len(X))[used]
+    error = np.bincount(point, weights=distance, minlength=len(X))[used] / np.maximum(counts, 1)
+    columns = (used + 1, X[used], model.point_colors[used], error, np.split(tracks, np.cumsum(counts)))
     parts = [
         struct.pack("<Q3d3BdQ", number, *xyz, *rgb, mean, len(track)) + track.tobytes()
         for number, xyz, rgb, mean, track in zip(*columns, strict=False)
@@ -503,15 +458,6 @@ def _write(
         write_atomically(folder / f"{file}.bin", struct.pack("<Q", len(records)) + b"".join(records))
 
 
-def colors_of(model: SparseModel) -> U8:
-    """Colours (N, 3) of the points; mid-grey if they are not known."""
-    return np.full((len(model.X), 3), 128, np.uint8) if model.colors is None else model.colors
-
-
-def _points(Xh: F64) -> F64:
-    return Xh[:, :3] / Xh[:, 3:]
-
-
 def _pose(K: F64, P: F64) -> tuple[F64, F64]:
     """R (3, 3) and t (3,) of P = s K [R t] with s > 0."""
     pose = np.asarray(np.linalg.solve(K, P), dtype=np.float64)
@@ -519,12 +465,9 @@ def _pose(K: F64, P: F64) -> tuple[F64, F64]:
     return pose[:, :3], pose[:, 3]
 
 
-def _camera_params(
-    K: F64, distortion: F64, scale: float, *, pinhole: bool = False
-) -> tuple[str, tuple[float, ...]]:
-    """Return the smallest COLMAP camera model for K and (k1, k2, k3), with parameters in original pixels."""
-    fx, fy = float(K[0, 0] * scale), float(K[1, 1] * scale)
-    centre = tuple(float(value) for value in (K[:2, 2] + PIXEL_CENTRE) * scale)
+def _camera_params(K: F64, distortion: F64, *, pinhole: bool) -> tuple[str, tuple[float, ...]]:
+    """Return the smallest COLMAP camera model for K and (k1, k2, k3), and its parameters."""
+    fx, fy, *centre = (*K[[0, 1], [0, 1]].tolist(), *(K[:2, 2] + PIXEL_CENTRE).tolist())
     k1, k2, k3 = distortion.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)

@@ -16,13 +16,12 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-import PIL.features
 import PIL.Image
 
 from thesisrecon.arrays import F64, U8, rows_of_views
 from thesisrecon.camera import Camera, undistort
 from thesisrecon.errors import UsageError
-from thesisrecon.io._colmap import PIXEL_CENTRE, colors_of
+from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
 from thesisrecon.results import SparseModel, SparseView
 
@@ -47,13 +46,13 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
             own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
         frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
     head = {"camera_model": "OPENCV", **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
-    write_point_cloud(folder / "points.ply", model.X, colors_of(model))
+    write_point_cloud(folder / "points.ply", model.X, model.point_colors)
     write_json(folder / "transforms.json", {**head, "frames": frames})
     return folder / "transforms.json"
 
 
 def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
-    K, (width, height) = calibration(view)
+    K, (width, height), _ = view.intrinsics
     cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
     known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
     return known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
@@ -66,7 +65,7 @@ def write_openmvs(folder: Path, model: SparseModel) -> Path:
     # OpenMVS reads all versions up to its own; later ones add only optional fields.
     parts = [b"MVSI", struct.pack("<II", 2, 0), _count(1), _text("platform"), _count(len(cameras))]
     for i, view in enumerate(cameras):
-        K, size = calibration(view)
+        K, size, _ = view.intrinsics
         parts += [_text(f"camera{i}"), struct.pack("<II", *size), _matrices(K), still]
     parts += [_count(len(model.views)), *(_matrices(view.R, view.centre) for view in model.views)]
     parts.append(_count(len(model.views)))
@@ -76,7 +75,7 @@ def write_openmvs(folder: Path, model: SparseModel) -> Path:
     for X, seen in zip(model.X.tolist(), _observations_of_points(model), strict=True):
         views = model.view_index[seen].tolist()
         parts += [struct.pack("<3fQ", *X, len(views)), *(struct.pack("<If", view, 0.0) for view in views)]
-    colors = np.ascontiguousarray(colors_of(model)[:, ::-1]).tobytes()
+    colors = np.ascontiguousarray(model.point_colors[:, ::-1]).tobytes()
     # No normals; after the colours no lines, their normals and colours; the transform of the frame.
     parts += [_count(0), _count(len(model.X)), colors, _count(0) * 3, _matrices(np.eye(4))]
     write_atomically(folder / "scene.mvs", b"".join(parts))
@@ -101,13 +100,13 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
     lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
     centre = np.zeros((len(model.views), 2))
     for i, view in enumerate(model.views):
-        K, _ = calibration(view)
+        K, *_ = view.intrinsics
         centre[i] = K[:2, 2]
         rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
         lines += [_numbers(row) for row in rows]
     xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
     keys = _keys(model)
-    points = zip(model.X, colors_of(model).tolist(), _observations_of_points(model), strict=True)
+    points = zip(model.X, model.point_colors.tolist(), _observations_of_points(model), strict=True)
     for X, rgb, seen in points:
         entries = [f"{model.view_index[k]} {keys[k]} {_numbers(xy[k])}" for k in seen]
         lines += [_numbers(X), " ".join(map(str, rgb)), " ".join([str(len(entries)), *entries])]
@@ -129,8 +128,7 @@ def write_opencv(folder: Path, model: SparseModel) -> Path:
     cameras, number = _distinct_cameras(model)
     head = "%YAML:1.0\n---\n"
     for i, view in enumerate(cameras):
-        K, (width, height) = calibration(view)
-        k1, k2, k3 = coefficients(view)
+        K, (width, height), (k1, k2, k3) = view.intrinsics
         entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
         entries.append(_matrix("distortion_coefficients", np.array([[k1, k2, 0.0, 0.0, k3]])))
         write_text(folder / f"camera_{i}.yml", head + "".join(entries))
@@ -153,64 +151,45 @@ def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
     """Write ``camchain.yaml`` of pinhole-radtan cameras without k3, and note the largest difference."""
     lines, notes = list[str](), list[str]()
     for i, view in enumerate(_distinct_cameras(model)[0]):
-        K, (width, height) = calibration(view)
+        K, (width, height), _ = view.intrinsics
         (k1, k2), error_px = _two_coefficients(view)
         if error_px > 0.0:
             notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
         lines += [
-            f"cam{i}:",
-            "  camera_model: pinhole",
-            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]",
-            "  distortion_model: radtan",
+            f"cam{i}:", "  camera_model: pinhole",
+            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]", "  distortion_model: radtan",
             f"  distortion_coeffs: [{_numbers(np.array([k1, k2, 0.0, 0.0]), ', ')}]",
-            f"  resolution: [{width}, {height}]",
-            f"  rostopic: /cam{i}/image_raw",
-        ]
+            f"  resolution: [{width}, {height}]", f"  rostopic: /cam{i}/image_raw",
+        ]  # fmt: skip
     write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
     return folder / "camchain.yaml", notes
 
 
 def _two_coefficients(view: SparseView) -> tuple[F64, float]:
     """Best k1, k2 (least squares over the image area) for k1, k2, k3, and the largest difference (px)."""
-    k = coefficients(view)
+    K, (width, height), k = view.intrinsics
     if k[2] == 0.0:
         return k[:2], 0.0
-    K, (width, height) = calibration(view)
     corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)]) @ np.linalg.inv(K).T
     r = np.linspace(0.0, float(np.linalg.norm(undistort(corners[:, :2], k), axis=1).max()), 500)[1:]
     powers = r[:, None] ** [3, 5, 7]
     # The area of a ring is proportional to r.
     weight = np.sqrt(r)[:, None]
     fitted = np.linalg.lstsq(weight * powers[:, :2], weight[:, 0] * (powers @ k), rcond=None)[0]
-    return np.asarray(fitted, np.float64), float(
-        np.abs(powers @ k - powers[:, :2] @ fitted).max() * max(K[0, 0], K[1, 1])
-    )
+    apart = np.abs(powers @ k - powers[:, :2] @ fitted).max() * max(K[0, 0], K[1, 1])
+    return np.asarray(fitted, np.float64), float(apart)
 
 
 def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
     """Return one view per set of intrinsics and size, and the number of each view's set."""
-    first, number, cameras = dict[tuple[object, ...], int](), list[int](), list[SparseView]()
+    first: dict[tuple[object, ...], SparseView] = {}
+    keys = []
     for view in model.views:
-        K, size = calibration(view)
-        key = (size, K.tobytes(), coefficients(view).tobytes())
-        if key not in first:
-            first[key] = len(cameras)
-            cameras.append(view)
-        number.append(first[key])
-    return cameras, number
-
-
-def coefficients(view: SparseView) -> F64:
-    """Distortion k1, k2, k3 of a view in which it is known."""
-    assert view.distortion is not None
-    return view.distortion
-
-
-def calibration(view: SparseView) -> tuple[F64, tuple[int, int]]:
-    """K and (width, height) of a view in which they are known."""
-    assert view.K is not None
-    assert view.size is not None
-    return view.K, view.size
+        K, size, distortion = view.intrinsics
+        keys.append((size, K.tobytes(), distortion.tobytes()))
+        first.setdefault(keys[-1], view)
+    place = {key: number for number, key in enumerate(first)}
+    return [*first.values()], [place[key] for key in keys]
 
 
 def _observations_of_points(model: SparseModel) -> list[list[int]]:
@@ -255,12 +234,9 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 def write_image(path: Path, rgb: U8) -> None:
     """Write an RGB image as JPEG or, by the suffix, PNG."""
-    encoded = io.BytesIO()
-    if path.suffix.lower() == ".png":
-        # Level 6 saves two percent for three times the time.
-        PIL.Image.fromarray(rgb).save(encoded, "PNG", compress_level=3)
-    else:
-        PIL.Image.fromarray(rgb).save(encoded, "JPEG", quality=95, subsampling=0)
+    encoded, kind = io.BytesIO(), "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    # Level 6 saves two percent for three times the time. Each format ignores the options of the other.
+    PIL.Image.fromarray(rgb).save(encoded, kind, compress_level=3, quality=95, subsampling=0)
     write_atomically(path, encoded.getvalue())
 
 
@@ -269,18 +245,12 @@ def frame_name(number: int) -> str:
     return f"frame-{number:04d}.png"
 
 
-def animation_suffix() -> str:
-    """``.webp``, or ``.png`` (APNG, lossless and larger) if Pillow lacks WebP."""
-    return ".webp" if PIL.features.check("webp") else ".png"
-
-
 def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 40) -> Path:
-    """Write an endless animation of frame files of the same size; equal frames give equal bytes."""
-    encoded, webp = io.BytesIO(), path.suffix == ".webp"
-    # 38 dB on textured frames, at an eighth of the size of APNG; a higher method saves few percent.
-    lossy = {"quality": 85, "method": 2} if webp else {}
-    kind = "WEBP" if webp else "PNG"
-    _Sequence(frames).save(encoded, kind, save_all=True, duration=milliseconds, loop=0, **lossy)
+    """Write an endless WebP of frame files of the same size; equal frames give equal bytes."""
+    encoded = io.BytesIO()
+    # 38 dB on textured frames; a higher method saves few percent.
+    options = {"duration": milliseconds, "loop": 0, "quality": 85, "method": 2}
+    _Sequence(frames).save(encoded, "WEBP", save_all=True, **options)
     write_atomically(path, encoded.getvalue())
     return path
 

@@ -49,17 +49,14 @@ def _escaped(c: str) -> str:
 
 
 def require_image_name(name: Any, source: object) -> str:
-    """Return the name of an image in ``source``; UsageError unless it is a relative path without ``..``.
-
-    A path is judged by the rules of every system, since models are copied between them.
-    """
+    """Return the name of an image in ``source``; UsageError if it breaks ``IMAGE_NAME_RULE``."""
     if not is_image_name(name):
         raise UsageError(f"{source} names an image {in_words(name)}; {IMAGE_NAME_RULE}")
     return str(name)
 
 
 def is_image_name(name: Any) -> bool:
-    """Whether an image has a name of ``IMAGE_NAME_RULE``."""
+    """Whether an image has a name of ``IMAGE_NAME_RULE``, by the rules of every system: models are copied."""
     parts = name.replace("\\", "/").split("/") if isinstance(name, str) else [".."]
     return not (".." in parts or parts[-1] in ("", ".") or "\0" in name or _ABSOLUTE.match(name))
 
@@ -179,16 +176,10 @@ def json_text(value: Any) -> str:
 
 
 def write_new(
-    texts: Mapping[Path, str],
-    *,
-    overwrite: bool,
-    extra: Path | None = None,
+    texts: Mapping[Path, str], *, overwrite: bool, extra: Path | None = None,
     warnings: list[str] | None = None,
-) -> None:
-    """Write single texts; UsageError, and nothing is written, if an existing file would be replaced.
-
-    If the file ``extra`` cannot be written, ``warnings`` receives a warning.
-    """
+) -> None:  # fmt: skip
+    """Write single texts, or none if a file would be replaced; ``extra`` may fail with a warning."""
     files = {path: text.encode("utf-8", "replace") for path, text in texts.items()}
     new = {path: file for path, file in files.items() if not has_content(path, [digest_of(file)])}
     if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
@@ -254,10 +245,8 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
             continue
         names = _names(line)
         if len(names) != 2:
-            raise UsageError(
-                f"line {number} of {path} must hold two file names, quoted if they contain blanks; "
-                f"got {shortened(line.strip())!r}"
-            )
+            rule = "must hold two file names, quoted if they contain blanks"
+            raise UsageError(f"line {number} of {path} {rule}; got {shortened(line.strip())!r}")
         pairs.append((names[0], names[1]))
     return pairs
 

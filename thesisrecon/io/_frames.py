@@ -26,7 +26,7 @@ from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import FRAMES_FOLDER, printable, read_json, write_json
 from thesisrecon.io._images import MAX_DECODED_BYTES, decode_file, list_images
-from thesisrecon.io._outputs import OutputFolder, has_content, join_claim
+from thesisrecon.io._outputs import OutputFolder, join_claim
 from thesisrecon.io._pixels import EXIF_TRANSFORMS, StoredImage, UnusableImage
 
 _CHOICE = "frames.json"
@@ -76,33 +76,29 @@ class FrameSource:
         return (out / FRAMES_FOLDER if self.video else self.path).absolute()
 
     def choose(
-        self,
-        out: Path,
-        *,
-        threads: int = 1,
-        map_all: MapAll = map,
-        progress: Progress = lambda *_: None,
-    ) -> tuple[list[Path], int, list[str]]:
+        self, out: Path, threads: int = 1, map_all: MapAll = map, progress: Progress = lambda *_: None,
+    ) -> tuple[list[Path], int, list[str]]:  # fmt: skip
         """Return the chosen frames, the number of all frames, and warnings, as ``out`` records them."""
         record, home, warnings = out / FRAMES_FOLDER / _CHOICE, self.home(out), list[str]()
         digest = self.identity["digest"]
         with join_claim(out) as outputs:
             if os.path.lexists(record):
                 outputs.require_own(record)
-            unchanged = has_content(record, outputs.digests.get(outputs.name_of(record), ()))
-            known = read_json(record) if unchanged else {}
-            own = list(zip(known.get("names", ()), known.get("digests", ()), strict=False))
-            damaged = [name for name, found in own if not has_content(home / name, [found])]
+            known = read_json(record) if outputs.has_written(record) else {}
+            frames = [home / name for name in known.get("names", ()) if self.video]
+            damaged = [frame.name for frame in frames if not outputs.has_written(frame)]
             if known.get("digest") != digest or damaged:
-                chosen = (
-                    self._write_frames(outputs, threads, progress) if self.video else self._listed(map_all)
-                )
+                # The record is that of the frames in the folder.
+                outputs.remove([Path(FRAMES_FOLDER, _CHOICE)])
                 if known.get("digest") == digest:
                     more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
-                    found = f"{FRAMES_FOLDER}/{damaged[0]}{more}"
-                    warnings = [f"{found}: missing, damaged or exchanged, and extracted again"]
-                known = {"digest": digest, **chosen}
-                write_json(record, known)
+                    first = f"{FRAMES_FOLDER}/{damaged[0]}{more}"
+                    warnings = [f"{first}: missing, damaged or exchanged, and extracted again"]
+                if self.video:
+                    known = self._write_frames(outputs, threads, progress)
+                else:
+                    known = self._listed(map_all)
+                write_json(record, known | {"digest": digest})
         return [home / name for name in known["names"]], known["total"], known["warnings"] + warnings
 
     def _listed(self, map_all: MapAll) -> dict[str, Any]:
@@ -113,13 +109,8 @@ class FrameSource:
         return {"names": [paths[n].name for n in best], "total": len(paths), "warnings": []}
 
     def _write_frames(self, outputs: OutputFolder, threads: int, progress: Progress) -> dict[str, Any]:
-        """Decode the video and write the best frame of each window; two frames are in memory at a time.
-
-        Frames of another video, or of an interrupted command, are removed.
-        """
-        digests: dict[str, str] = {}
-        warnings: list[str] = []
-        total = 0
+        """Write the best frame of each window of a video, two in memory at a time, and remove older ones."""
+        names, warnings, total = list[str](), list[str](), 0
 
         def measured(numbered: tuple[int, tuple[Any, int]]) -> float:
             nonlocal total
@@ -131,17 +122,16 @@ class FrameSource:
             number, (frame, stated) = max(window, key=measured)
             turn = _UPRIGHT.get(frame.rotation)
             image = frame.to_image()
-            name = f"{FRAMES_FOLDER}/{self.path.stem}-{number:06d}.png"
-            outputs.damaged.add(name)
-            write_image(outputs.path / name, np.array(image if turn is None else image.transpose(turn)))
-            digests[name] = outputs.written[name]
+            names.append(f"{self.path.stem}-{number:06d}.png")
+            outputs.damaged.add(f"{FRAMES_FOLDER}/{names[-1]}")
+            upright = image if turn is None else image.transpose(turn)
+            write_image(outputs.path / FRAMES_FOLDER / names[-1], np.array(upright))
             progress("frames", total, max(total, stated))
-        if not digests:
+        if not names:
             raise UsageError(f"{self.path} contains no video frame that can be decoded")
-        listed = [name for name in outputs.digests if name.startswith(f"{FRAMES_FOLDER}/")]
-        outputs.remove([Path(n) for n in listed if n not in digests and Path(n).name != _CHOICE])
-        names = [Path(name).name for name in digests]
-        return {"names": names, "digests": [*digests.values()], "total": total, "warnings": warnings}
+        listed = [Path(name) for name in outputs.digests if name.startswith(f"{FRAMES_FOLDER}/")]
+        outputs.remove([path for path in listed if path.name not in names])
+        return {"names": names, "total": total, "warnings": warnings}
 
 
 def _sharpness(image: PIL.Image.Image) -> float:
@@ -186,10 +176,9 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
     try:
         av = import_module("av")
     except ImportError:
-        install = (
-            'install the extra video (pip install ".[video]" in the clone), or give a folder of its frames'
-        )
-        raise UsageError(f"{path} is read as a video by PyAV: {install}") from None
+        install = 'install the extra video (pip install ".[video]" in the clone)'
+        frames = "or give a folder of its frames"
+        raise UsageError(f"{path} is read as a video by PyAV: {install}, {frames}") from None
     damaged = 0
     try:
         # A stream, since FFmpeg reads some names as addresses, and playlists name other files.

@@ -112,10 +112,9 @@ def demo_images() -> list[Path]:
         # The first six: enough neighbouring views for self-calibration, few enough for a small wheel.
         if found := sorted((home / "courtyard" / "images").glob("*.jpg"))[:6]:
             return found
-    raise UsageError(
-        f"the demo images are neither in {package / 'courtyard'} nor in fixtures/courtyard of the source "
-        "tree; reinstall the package, or reconstruct a folder of your own"
-    )
+    places = f"neither in {package / 'courtyard'} nor in fixtures/courtyard of the source tree"
+    advice = "reinstall the package, or reconstruct a folder of your own"
+    raise UsageError(f"the demo images are {places}; {advice}")
 
 
 def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
@@ -124,10 +123,7 @@ def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """List the image files of a folder by suffix or content, without hidden files and sub-folders.
-
-    Numbers in names are compared as numbers: frame9 before frame10.
-    """
+    """List the image files of a folder by suffix or content, frame9 before frame10, without hidden files."""
     if not folder.exists():
         raise UsageError(f"there is no folder {folder}")
     if not folder.is_dir():
@@ -178,9 +174,8 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
     missing = [name for name, path in zip(names, paths, strict=True) if not path.is_file()]
     if missing:
         share = f"{len(missing)} of the {len(names)} images of the model"
-        raise UsageError(
-            f"{share} are not in {folder}, such as {missing[0]!r}; give their folder with --images"
-        )
+        message = f"{share} are not in {folder}, such as {missing[0]!r}; give their folder with --images"
+        raise UsageError(message)
     return paths
 
 
@@ -202,19 +197,12 @@ def read_image(source: Any, *, max_size_px: int, as_stored: bool = False) -> Ima
 
 
 def read_images(
-    source: ImageSource,
-    *,
-    max_size_px: int,
-    as_stored: bool = False,
-    map_all: MapAll = map,
-) -> ImageSet:
+    source: ImageSource, *, max_size_px: int, as_stored: bool = False, map_all: MapAll = map,
+) -> ImageSet:  # fmt: skip
     """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
 
-    ``source`` is a folder, or a sequence of files, uint8 arrays (H, W), (H, W, 3) or (H, W, 4) and Image
-    records. Transparent pixels are masked.
     ``map_all`` is an ordered map; that of a thread pool reads several images at the same time. Files are
     rotated upright unless they are read ``as_stored``. Names are printable; equal names are numbered.
-    Duplicates, blank and small images are unusable too.
     """
     items = _named_items(source)
 
@@ -275,10 +263,8 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     else:
         array = np.asarray(item)
         if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] not in ((3,), (4,))):
-            raise ValueError(
-                "an image array must be (H, W), (H, W, 3) or (H, W, 4) uint8; "
-                f"got {array.shape} {array.dtype}"
-            )
+            rule = "an image array must be (H, W), (H, W, 3) or (H, W, 4) uint8"
+            raise ValueError(f"{rule}; got {array.shape} {array.dtype}")
         decoded = DecodedImage(_image(name, StoredImage(PIL.Image.fromarray(array)), max_size_px), "")
     decoded = with_digest(decoded)
     rgb, mask = decoded.image.rgb, decoded.image.mask
@@ -340,9 +326,8 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
         raise UnusableImage(Notice("too-large-for-memory")) from None
     except Exception as error:
         # Decoders raise errors of any kind on damaged files; the other images are still read.
-        raise UnusableImage(
-            Notice("undecodable", printable(getattr(error, "strerror", None) or str(error)))
-        ) from None
+        reason = printable(getattr(error, "strerror", None) or str(error))
+        raise UnusableImage(Notice("undecodable", reason)) from None
 
 
 def _image(name: str, stored: StoredImage, max_size_px: int) -> Image:
@@ -426,9 +411,8 @@ def _full_image(side: Any) -> Image:
     if not isinstance(side, np.ndarray):
         return read_image(side, max_size_px=_ANY_SIZE).images[0]
     if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] not in (3, 4)):
-        raise ValueError(
-            f"an image must be a uint8 array (H, W, 3) or (H, W, 4); got {side.dtype} {side.shape}"
-        )
+        message = f"an image must be a uint8 array (H, W, 3) or (H, W, 4); got {side.dtype} {side.shape}"
+        raise ValueError(message)
     try:
         return _image("", StoredImage(PIL.Image.fromarray(side)), _ANY_SIZE)
     except UnusableImage as refusal:
@@ -472,16 +456,9 @@ def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], lis
 
 
 def add_masks(
-    inputs: ImageSet,
-    folder: Path,
-    *,
-    as_stored: bool = False,
-    map_all: MapAll = map,
-) -> tuple[ImageSet, list[str]]:
-    """Set the masks of images named like files in a folder; return also warnings of the other files.
-
-    Masks are upright, or ``as_stored`` like the images.
-    """
+    inputs: ImageSet, folder: Path, *, as_stored: bool = False, map_all: MapAll = map,
+) -> tuple[ImageSet, list[str]]:  # fmt: skip
+    """Set the masks of images named like files in a folder; return also warnings of the other files."""
     names = [*(decoded.image.name for decoded in inputs.decoded), *inputs.refused]
     mask_of, unused = find_masks(folder, names)
 

@@ -184,11 +184,7 @@ class _Header(NamedTuple):
 
 
 def read_positions(path: Path) -> Positions:
-    """Read camera positions: one "name,x,y,z" per line, or columns in the order of a header.
-
-    Columns of latitude and longitude are degrees: the positions become metres east, north and up of their
-    median.
-    """
+    """Read camera positions: "name,x,y,z" per line, or columns of a header; degrees become metres."""
     header, found = _Header(_ORDER, 4), dict[str, Place]()
     for number, cells in _rows(path):
         if number == 0:
@@ -203,22 +199,19 @@ def read_positions(path: Path) -> Positions:
             if header.degrees and (abs(x) > 90.0 or abs(y) > 360.0):
                 raise ValueError
         except ValueError:
-            what = (
-                "the name, latitude, longitude and height of an image, in decimal degrees and metres"
-                if header.degrees
-                else "name,x,y,z with finite numbers"
-            )
-            row = shortened(",".join(cells).strip())
-            raise UsageError(
-                f"line {number} of {path} must hold {what}, one line per image; got {row!r}"
-            ) from None
+            what = "name,x,y,z with finite numbers"
+            if header.degrees:
+                what = "the name, latitude, longitude and height of an image, in decimal degrees and metres"
+            rule = f"must hold {what}, one line per image; got {shortened(','.join(cells).strip())!r}"
+            raise UsageError(f"line {number} of {path} {rule}") from None
         found[name] = x, y, z
     if not header.degrees or not found:
         return Positions(found)
-    latitudes, longitudes, heights = zip(*found.values(), strict=True)
+    places = np.array([*found.values()])
     # The median is one of the positions near most of them, also beside those without a fix (0, 0).
-    origin = median_low(latitudes), median_low(longitudes), median_low(heights)
-    return Positions({name: _east_north_up(place, origin) for name, place in found.items()}, origin)
+    x, y, z = (median_low(column) for column in places.T.tolist())
+    metres = _east_north_up(places, np.array([x, y, z])).tolist()
+    return Positions({name: (e, n, u) for name, (e, n, u) in zip(found, metres, strict=True)}, (x, y, z))
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -227,13 +220,12 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
+        is_comment = line.lstrip().startswith("#")
         try:
-            (cells,) = csv.reader(
-                [line.lstrip("# ") if line.lstrip().startswith("#") else line], skipinitialspace=True
-            )
+            (cells,) = csv.reader([line.lstrip("# ") if is_comment else line], skipinitialspace=True)
         except (ValueError, csv.Error):
             cells = [line]
-        if line.lstrip().startswith("#"):
+        if is_comment:
             comment = cells
             continue
         if first:
@@ -263,32 +255,28 @@ def _header_of(cells: Sequence[str], path: Path) -> _Header:
     if x is not None and y is not None and z is not None and name is not None:
         return _Header((name, x, y, z), len(cells), degrees)
     if degrees:
-        raise UsageError(
-            f"the header of {path} must name a column each of latitude, longitude and height, such as "
-            f"name,lat,lon,alt, separated by commas; got {shortened(','.join(cells))!r}"
-        )
+        rule = "must name a column each of latitude, longitude and height, such as name,lat,lon,alt"
+        got = shortened(",".join(cells))
+        raise UsageError(f"the header of {path} {rule}, separated by commas; got {got!r}")
     return _Header(_ORDER, 4)
 
 
-def _east_north_up(place: Place, origin: Place) -> Place:
-    """Metres in the tangent plane of the WGS84 ellipsoid at the origin."""
-    dx, dy, dz = (a - b for a, b in zip(_geocentric(place), _geocentric(origin), strict=True))
-    latitude, longitude = math.radians(origin[0]), math.radians(origin[1])
-    outwards = math.cos(longitude) * dx + math.sin(longitude) * dy
-    return (
-        math.cos(longitude) * dy - math.sin(longitude) * dx,
-        math.cos(latitude) * dz - math.sin(latitude) * outwards,
-        math.cos(latitude) * outwards + math.sin(latitude) * dz,
-    )
+def _east_north_up(places: F64, origin: F64) -> F64:
+    """Metres (N, 3) in the tangent plane of the WGS84 ellipsoid at the origin."""
+    (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians(origin[:2])) for f in (np.sin, np.cos))
+    east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    axes = np.array([east, north, np.cross(east, north)])
+    return np.asarray((_geocentric(places) - _geocentric(origin)) @ axes.T)
 
 
-def _geocentric(place: Place) -> Place:
-    latitude, longitude, height = math.radians(place[0]), math.radians(place[1]), place[2]
+def _geocentric(place: F64) -> F64:
+    latitude, longitude, height = np.radians(place[..., 0]), np.radians(place[..., 1]), place[..., 2]
     flattening = 1.0 / 298.257223563
     square = flattening * (2.0 - flattening)
-    normal = 6_378_137.0 / math.sqrt(1.0 - square * math.sin(latitude) ** 2)
-    across, up = (normal + height) * math.cos(latitude), normal * (1.0 - square) + height
-    return across * math.cos(longitude), across * math.sin(longitude), up * math.sin(latitude)
+    normal = 6_378_137.0 / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
+    across, up = (normal + height) * np.cos(latitude), normal * (1.0 - square) + height
+    x, y, z = across * np.cos(longitude), across * np.sin(longitude), up * np.sin(latitude)
+    return np.stack([x, y, z], axis=-1)
 
 
 def _is_number(text: str) -> bool:

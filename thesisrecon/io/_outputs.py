@@ -92,7 +92,11 @@ class OutputFolder:
             return False
         name = self.name_of(path)
         damaged = name in self.damaged & self.digests.keys() and stat.S_ISREG(path.lstat().st_mode)
-        return bool(self.overwrite) or damaged or has_content(path, self.digests.get(name, ()))
+        return bool(self.overwrite) or damaged or self.has_written(path)
+
+    def has_written(self, path: Path) -> bool:
+        """Whether thesisrecon wrote the content of a file."""
+        return has_content(path, self.digests.get(self.name_of(path), ()))
 
     def _link_above(self, path: Path) -> Path | None:
         """The outermost link among the folders between this one and a file."""
@@ -295,12 +299,9 @@ def _locked(lock: Path) -> int:
 
 @contextmanager
 def claim_folder(
-    path: Path,
-    *,
-    overwrite: bool | None = False,
-    names: Sequence[str | Path] = (),
+    path: Path, *, overwrite: bool | None = False, names: Sequence[str | Path] = (),
     check: Callable[[OutputFolder], object] = lambda _: None,
-) -> Iterator[OutputFolder]:
+) -> Iterator[OutputFolder]:  # fmt: skip
     """Lock an output folder for the block, in which :func:`write_atomically` obeys the rule.
 
     ``names``: files that the command writes; ``overwrite``: None if the command has no such option; ``check``

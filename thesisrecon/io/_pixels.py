@@ -63,14 +63,9 @@ def decoding_bytes(file: PIL.Image.Image) -> int:
 
 
 EXIF_TRANSFORMS = {
-    2: Transpose.FLIP_LEFT_RIGHT,
-    3: Transpose.ROTATE_180,
-    4: Transpose.FLIP_TOP_BOTTOM,
-    5: Transpose.TRANSPOSE,
-    6: Transpose.ROTATE_270,
-    7: Transpose.TRANSVERSE,
-    8: Transpose.ROTATE_90,
-}
+    2: Transpose.FLIP_LEFT_RIGHT, 3: Transpose.ROTATE_180, 4: Transpose.FLIP_TOP_BOTTOM,
+    5: Transpose.TRANSPOSE, 6: Transpose.ROTATE_270, 7: Transpose.TRANSVERSE, 8: Transpose.ROTATE_90,
+}  # fmt: skip
 """Transform to the upright image by EXIF orientation; with any other value the image is used as stored."""
 EXIF_INVERSE = EXIF_TRANSFORMS | {6: Transpose.ROTATE_90, 8: Transpose.ROTATE_270}
 """Transform back to the stored image."""
@@ -80,10 +75,7 @@ _ROWS_FROM_END = {EXIF_TRANSFORMS[orientation] for orientation in (3, 4, 7, 8)}
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A decoded Pillow image of any mode, seen upright by its ``transform`` (None = as stored).
-
-    Its levels are RGB, or RGBA if it has transparency.
-    """
+    """A decoded Pillow image in RGB, or RGBA, seen upright by its ``transform`` (None = as stored)."""
 
     stored: PIL.Image.Image
     transform: Transpose | None = None
@@ -112,13 +104,11 @@ class StoredImage:
     def unmasked(self) -> B8:
         """Pixels (H, W) that the upright image uses as a mask: neither black nor transparent.
 
-        Without a black pixel, or if all are black, the mask is the transparency, and without a pixel that is
-        neither, the colours.
+        The transparency alone if no pixel or all are black; the colours alone if nothing else is left.
         """
         grey = self.stored if self._deep else self.stored.convert("L")
-        nonblack = np.asarray(
-            np.asarray(grey if self.transform is None else grey.transpose(self.transform)) != 0
-        )
+        upright = grey if self.transform is None else grey.transpose(self.transform)
+        nonblack = np.asarray(np.asarray(upright) != 0)
         if not self.layered:
             return nonblack
         parts = (np.asarray(self.rows(*stripe).getchannel("a")) >= OPAQUE for stripe in self.stripes())
@@ -170,10 +160,7 @@ def _eight_bit_colours(part: PIL.Image.Image) -> PIL.Image.Image:
 
 
 def resized_to(image: StoredImage, max_size_px: int) -> U8:
-    """Reduce an image to a long side by one exact scale s along both axes, (x + 0.5) s - 0.5.
-
-    The result is (H, W, 3), or (H, W, 4) with alpha if the image is ``layered``.
-    """
+    """Reduce an image by one exact scale s, (x + 0.5) s - 0.5, to (H, W, 3), or (H, W, 4) if ``layered``."""
     width, height = image.size
     scale = max_size_px / max(width, height)
     if scale >= 1:

@@ -128,25 +128,16 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
         colors, affine, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
-        page = ReportData(
+        page = ReportData.of(
+            result,
             title=run.title,
-            images=result.images,
-            reports=result.reports,
             config_text=config,
-            summary=result.summary,
-            version=__version__,
-            unread=result.unread,
-            pairs=result.pairs,
-            pair_choice=result.pair_choice,
-            reconstruction=result.projective,
-            metric=result.metric,
             colors=colors,
             affine=affine,
             model=made("the model in report.html", for_page.result, warnings, None),
-            held_out=result.held_out,
-            depth_maps=made("a depth map in report.html", lambda: _thinned_maps(result), warnings, {}),
+            depths=made("a depth map in report.html", lambda: _thinned_maps(result), warnings, {}),
             until=None if until == "model" else until,
-            failure=failure,
+            end=failure,
         )
         made(PAGE, lambda: write_text(out / PAGE, render_report(page, warnings)), warnings, None)
     run.finish("outputs", counts={})

@@ -40,16 +40,10 @@ Batch = tuple[Sequence[int], tuple[Any, ...]]
 Until = Literal["features", "matches", "projective", "metric", "dense", "model"]
 
 FOLDERS: Mapping[str, str] = {
-    "features": "01-features",
-    "pairs": "02-pairs",
-    "matches": "02-matches",
-    "tracks": "03-tracks",
-    "projective": "04-projective",
-    "selfcalibration": "05-selfcalibration",
-    "metric": "06-metric",
-    "dense": "07-dense",
-    "model": "08-model",
-}
+    "features": "01-features", "pairs": "02-pairs", "matches": "02-matches", "tracks": "03-tracks",
+    "projective": "04-projective", "selfcalibration": "05-selfcalibration", "metric": "06-metric",
+    "dense": "07-dense", "model": "08-model",
+}  # fmt: skip
 
 
 class RunOptions(TypedDict, total=False):
@@ -184,20 +178,14 @@ class Run:
             self.warnings.append(Notice("changed-files", changed[0], more, were, were))
 
     def map_cached(
-        self,
-        stage: str,
-        keys: Mapping[str, str],
-        function: Callable[..., Sequence[Any]],
-        batches: Callable[[Sequence[int]], Iterable[Batch]],
-        *,
-        max_bytes: float = np.inf,
-        silent: bool = False,
-        here: bool = False,
-    ) -> StoredRecords:
+        self, stage: str, keys: Mapping[str, str], function: Callable[..., Sequence[Any]],
+        batches: Callable[[Sequence[int]], Iterable[Batch]], *, max_bytes: float = np.inf,
+        silent: bool = False, here: bool = False,
+    ) -> StoredRecords:  # fmt: skip
         """The records of all items (item -> key) of a stage, missing ones computed by the workers.
 
-        Records beyond ``max_bytes`` are read from their files when they are used; ``silent``: no progress;
-        ``here``: in threads of this process, for tasks of little work with large arguments.
+        Records beyond ``max_bytes`` are read when used; ``silent``: no progress; ``here``: in threads
+        of this process, for tasks of little work with large arguments.
         """
         progress = (lambda *_: None) if silent else self.progress
         with self.clock(stage) as log:
@@ -245,13 +233,9 @@ class Run:
             raise OutputError(refused.place, refused.error, self.directory.path) from None
 
     def finish(
-        self,
-        stage: str,
-        *,
-        counts: Mapping[str, int],
-        metrics: Mapping[str, float] | None = None,
+        self, stage: str, *, counts: Mapping[str, int], metrics: Mapping[str, float] | None = None,
         warnings: Sequence[str] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """End a stage: write its manifest and report; a cached stage keeps its old report."""
         log = self.logs.setdefault(stage, _StageLog())
         report = StageReport(stage, log.seconds, dict(counts), dict(metrics or {}), tuple(warnings))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -47,8 +48,8 @@ class Fact:
 def assess(data: ReportData) -> Assessment:
     """Assess a run: trusted, not trusted, stopped early or failed."""
     total = len(data.images)
-    if data.failure is not None:
-        failure, done = data.failure, "no stage finished"
+    if data.end is not None:
+        failure, done = data.end, "no stage finished"
         if data.reports:
             done = f"the last stage that finished was {data.reports[-1].stage}"
         evidence = tuple(_sentence(text) for text in (failure.evidence, done) if text)
@@ -217,9 +218,9 @@ def decimals(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if np.isfinite(value) else "–"
 
 
-def significant(value: float) -> str:
-    """Format a length with three significant digits; a dash if it is not finite."""
-    return f"{value:.3g}" if np.isfinite(value) else "–"
+def significant(value: float, digits: int = 3) -> str:
+    """Format a length with significant digits; a dash if it is not finite."""
+    return f"{value:.{digits}g}" if np.isfinite(value) else "–"
 
 
 def duration(seconds: float) -> str:
@@ -234,15 +235,15 @@ def duration(seconds: float) -> str:
 def _named_number(name: str, value: float) -> tuple[str, str]:
     """Format a key and its value with the unit of its suffix: sigma_px -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
-    units = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB"}
+    unit = (
+        {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB", "rel": "%"}.get(suffix) if stem else None
+    )
     text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    if float(value).is_integer() and abs(value) < 1e15:
+    if unit == "%":
+        text = f"{100 * value:.3g}"
+    elif float(value).is_integer() and abs(value) < 1e15:
         text = grouped(int(value))
-    if stem and suffix in units:
-        return stem.replace("_", " "), f"{text}{_THIN}{units[suffix]}"
-    if stem and suffix == "rel":
-        return stem.replace("_", " "), f"{100 * value:.3g}{_THIN}%"
-    return name.replace("_", " "), text
+    return (name if unit is None else stem).replace("_", " "), f"{text}{_THIN}{unit}" if unit else text
 
 
 def named_numbers(numbers: Mapping[str, float] | Mapping[str, int]) -> list[tuple[str, str]]:
@@ -261,10 +262,7 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
 
 
-def _four_digits(value: float) -> str:
-    return f"{value:.4g}" if np.isfinite(value) else "–"
-
-
+_four_digits = partial(significant, digits=4)
 _COLUMNS = {
     "centre_error": ("centre (unit of B)", 1.0),
     "rotation_error_deg": ("rotation (deg)", 1.0),

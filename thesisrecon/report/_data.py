@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import F32, F64, I64, U8, rows_of_views
+from thesisrecon.arrays import F32, F64, U8, rows_of_views
 from thesisrecon.camera import distort
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.records import (
-    HeldOut,
     IdentifiabilityReport,
     Image,
     IntrinsicInterval,
-    MetricResult,
-    PairChoice,
     Reconstruction,
     SelfCalibration,
-    StageReport,
     TexturedMesh,
-    TwoView,
 )
 from thesisrecon.results import RunResult, in_original_pixels, pose_deviations
 
@@ -40,43 +34,32 @@ def pictured(images: int) -> list[int]:
 
 
 @dataclass(frozen=True)
-class ReportData:
-    """Content of ``report.html``, for a run that succeeded, stopped early or failed."""
+class ReportData(RunResult):
+    """Content of ``report.html``: the result of a run, and what only the page shows."""
 
-    title: str
-    images: tuple[Image, ...]
-    reports: tuple[StageReport, ...]
-    config_text: str
-    summary: Mapping[str, object]
-    version: str
-    unread: Mapping[str, str] = field(default_factory=dict)  # file name -> reason
-    pairs: Sequence[TwoView] = ()
-    pair_choice: PairChoice | None = None
-    reconstruction: Reconstruction | None = None  # projective; ``metric`` takes precedence
-    metric: MetricResult | None = None
+    title: str = ""
+    config_text: str = ""
     colors: U8 | None = None  # (N, 3) of the metric points, valid or not
     affine: Reconstruction | None = None
     model: TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
-    depth_maps: Mapping[int, F32] = field(default_factory=dict)  # a long side of 400 px is enough
-    held_out: HeldOut | None = None
+    depths: Mapping[int, F32] = field(default_factory=dict)  # by view; a long side of 400 px is enough
     until: str | None = None  # last stage that was requested, None = all
-    failure: StageFailure | None = None
+    end: StageFailure | None = None
+
+    @classmethod
+    def of(cls, result: RunResult, **more: Any) -> ReportData:
+        """The content of a result with ``more``."""
+        return cls(**{f.name: getattr(result, f.name) for f in fields(result)}, **more)
 
     @property
     def original_intrinsics(self) -> tuple[Mapping[str, IntrinsicInterval], ...]:
         """Intrinsics of every view in original pixels; empty mappings if there are none."""
         if self.metric is None:
             return tuple({} for _ in self.images)
-        views = zip(self.metric.intrinsics, self.images, strict=True)
         return tuple(
             {name: in_original_pixels(name, interval, image.scale) for name, interval in view.items()}
-            for view, image in views
+            for view, image in zip(self.metric.intrinsics, self.images, strict=True)
         )
-
-    @property
-    def best_reconstruction(self) -> Reconstruction | None:
-        """The metric reconstruction, else the projective one, else None."""
-        return self.metric.reconstruction if self.metric is not None else self.reconstruction
 
 
 @dataclass(frozen=True)
@@ -91,25 +74,18 @@ class ResidualSummary:
 
 def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
     """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered."""
-    used = np.flatnonzero(reconstruction.used)
-    views = reconstruction.tracks.view_index[used]
-    rows = rows_of_views(views, len(reconstruction.P))
-    return [_distances_in_view(reconstruction, i, used[here]) for i, here in enumerate(rows)]
-
-
-def _distances_in_view(reconstruction: Reconstruction, i: int, observations: I64) -> F64:
-    r, P = reconstruction, reconstruction.P[i]
-    if len(observations) == 0:
-        return np.zeros(0)
-    X = r.X[r.tracks.point_index[observations]]
-    if r.K is None or r.distortion is None:
-        xy = project(P, X)
-    else:
-        K = r.K[i]
-        normalized = dehomogenize(X @ np.linalg.solve(K, P).T)
-        xy = distort(normalized, r.distortion[i]) @ K[:2, :2].T + K[:2, 2]
-    distance = np.linalg.norm(r.tracks.xy[observations] - xy, axis=1)
-    return np.asarray(distance[np.isfinite(distance)], dtype=np.float64)
+    r, poses = reconstruction, reconstruction.P.copy()
+    used = np.flatnonzero(r.used)
+    view, X = r.tracks.view_index[used], r.X[r.tracks.point_index[used]]
+    if r.K is not None:
+        poses[r.registered] = np.linalg.solve(r.K[r.registered], poses[r.registered])
+    xy = dehomogenize(np.einsum("kij,kj->ki", poses[view], X))
+    if r.K is not None:
+        lens: float | F64 = 0.0 if r.distortion is None else r.distortion[view]
+        xy = np.einsum("kij,kj->ki", r.K[view, :2, :2], distort(xy, lens)) + r.K[view, :2, 2]
+    distance = np.linalg.norm(r.tracks.xy[used] - xy, axis=1)
+    parts = (distance[rows] for rows in rows_of_views(view, len(r.P)))
+    return [part[np.isfinite(part)] for part in parts]
 
 
 def summarize_distances(distances: F64) -> ResidualSummary | None:
@@ -226,17 +202,12 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
     image = result.images[i]
     registered = best is not None and bool(best.registered[i])
     view: dict[str, Any] = {
-        "name": image.name,
-        "registered": registered,
-        "reason": result.refused.get(image.name, ""),
-        "camera": int(result.groups[i]),
-        "width_px": image.original_size[0],
-        "height_px": image.original_size[1],
-        "working_scale": image.scale,
-        "corners": len(result.features[i].xy) if result.features else None,
-        "observations": len(distances),
+        "name": image.name, "registered": registered, "reason": result.refused.get(image.name, ""),
+        "camera": int(result.groups[i]), "width_px": image.original_size[0],
+        "height_px": image.original_size[1], "working_scale": image.scale,
+        "corners": len(result.features[i].xy) if result.features else None, "observations": len(distances),
         "reprojection_rms_px": _rms(distances),
-    }
+    }  # fmt: skip
     if image.mask is not None:
         view["masked_fraction"] = float(1.0 - image.mask.mean())
     if registered and result.metric is not None:

@@ -50,10 +50,7 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """3D view of a metric or affine reconstruction, thinned and without far points; None without a camera.
-
-    Affine cameras at infinity, or nearly so, are left out.
-    """
+    """3D view of a metric or affine reconstruction without far points and cameras; None without a camera."""
     views = np.flatnonzero(reconstruction.registered & finite_cameras(reconstruction.P)).astype(np.int64)
     if reconstruction.stratum != "metric":
         views = views[_near(reconstruction, views)]
@@ -83,9 +80,8 @@ def _scene(X: F64, index: I64, views: I64, cameras: tuple[F64, F64, list[F64]], 
     """The points of these numbers and the cameras: centres, rotations and rays through the image corners."""
     points, centres = X[index] @ upright.T, cameras[0] @ upright.T
     depth = _pyramid_depth(centres, points)
-    corners = np.stack(
-        [c + depth * rays @ R @ upright.T for c, R, rays in zip(centres, *cameras[1:], strict=True)]
-    )
+    views_of = zip(centres, *cameras[1:], strict=True)
+    corners = np.stack([c + depth * rays @ R @ upright.T for c, R, rays in views_of])
     everything = np.concatenate([points, centres, corners.reshape(-1, 3)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.03 * float((high - low).max()) or 1.0
@@ -249,11 +245,8 @@ def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure
     ticks = [1, 3, 10, 30, 100, 200, 300, 500, 1000, 2000, 3000, 5000, 10_000, 30_000]
     values = [round(float(np.log10(n)), 3) for n in ticks]
     bar: Figure = {
-        "tickvals": values,
-        "ticktext": [str(n) for n in ticks],
-        "thickness": 12,
-        "outlinewidth": 0,
-    }
+        "tickvals": values, "ticktext": [str(n) for n in ticks], "thickness": 12, "outlinewidth": 0,
+    }  # fmt: skip
     bar |= {"x": 1.01, "xpad": 4, "len": 1.0}
     good = _heat(accepted, labels, "", "verified matches") | {"colorscale": _PAIR_SCALE, "colorbar": bar}
     bad = _heat(refused, labels, "× ", "verified matches, not accepted")
@@ -283,14 +276,11 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
     axis |= {"constrain": "domain", "tickmode": "array", "tickvals": labels[::step], "ticktext": numbers}
     axis |= {"tickangle": 0, "ticks": ""}
     return {
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "#e9edf0",
+        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "#e9edf0",
         "margin": {"l": 34, "r": 8, "t": 30, "b": 8},
-        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1b2733"},
-        "showlegend": False,
-        "xaxis": {**axis, "side": "top"},
-        "yaxis": {**axis, "autorange": "reversed", "scaleanchor": "x"},
-    }
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1b2733"}, "showlegend": False,
+        "xaxis": {**axis, "side": "top"}, "yaxis": {**axis, "autorange": "reversed", "scaleanchor": "x"},
+    }  # fmt: skip
 
 
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
@@ -362,15 +352,10 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     eyes = np.array([place["eye"] for place in places])
     middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     return {
-        "low": low.tolist(),
-        "high": (low + steps * LEVELS).tolist(),
-        "positions": _packed(positions[vertex]),
-        "indices": _packed(faces.astype("<u4")),
-        **color,
-        "viewpoints": places,
-        "start": middle,
+        "low": low.tolist(), "high": (low + steps * LEVELS).tolist(), "positions": _packed(positions[vertex]),
+        "indices": _packed(faces.astype("<u4")), **color, "viewpoints": places, "start": middle,
         "directions": [{"name": name, "from": list(direction)} for name, direction in _DIRECTIONS],
-    }
+    }  # fmt: skip
 
 
 def _without_outliers(mesh: TexturedMesh) -> TexturedMesh:

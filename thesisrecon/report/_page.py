@@ -39,25 +39,17 @@ from thesisrecon.results import ModelComparison
 
 _HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
 _INTRINSICS = {
-    "focal_px": "Focal length (px)",
-    "aspect": "Aspect (fy/fx)",
-    "skew_px": "Skew (px)",
-    "principal_x_px": "Principal x (px)",
-    "principal_y_px": "Principal y (px)",
-    "k1": "k1",
-    "k2": "k2",
+    "focal_px": "Focal length (px)", "aspect": "Aspect (fy/fx)", "skew_px": "Skew (px)",
+    "principal_x_px": "Principal x (px)", "principal_y_px": "Principal y (px)", "k1": "k1", "k2": "k2",
     "k3": "k3",
-}
+}  # fmt: skip
 T = TypeVar("T")
 
 
 def render_page(
-    template: str,
-    scripts: Sequence[str],
-    *,
-    filters: Mapping[str, Callable[..., str]] | None = None,
+    template: str, scripts: Sequence[str], *, filters: Mapping[str, Callable[..., str]] | None = None,
     **content: Any,
-) -> str:
+) -> str:  # fmt: skip
     """Render a page: text is escaped, names are defined, JSON has no NaN, and only these scripts run."""
     digests = (hashlib.sha256(script.encode("utf-8")).digest() for script in scripts)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
@@ -127,17 +119,13 @@ def comparison_page(comparison: ModelComparison, a: str, b: str) -> str:
     drawn = {"scene-figure": figures.comparison_figure(comparison)} if aligned else {}
     scripts, content = _figure_content(drawn)
     return render_page(
-        page_resource("comparison.html.j2"),
-        scripts,
-        **content,
-        version=__version__,
-        names={"a": a, "b": b},
+        page_resource("comparison.html.j2"), scripts, **content, version=__version__, names={"a": a, "b": b},
         colors={key: cameras for key, (cameras, _) in figures.COMPARED_COLORS.items()},
         headline=words.headline(comparison),
         notes=[note[:1].upper() + note[1:] + "." for note in comparison.notes],
         tables=[t for t in (words.summary_table(comparison), words.point_table(comparison)) if t],
         cameras=words.camera_table(comparison),
-    )
+    )  # fmt: skip
 
 
 class _Pictures:
@@ -151,10 +139,7 @@ class _Pictures:
 
 
 def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
-    """Render the page of a run; the same data gives the same text.
-
-    Pictures that cannot be drawn are left out and added to ``warnings``.
-    """
+    """Render the page of a run; pictures that cannot be drawn are left out, with one of ``warnings``."""
     pictures = _Pictures([] if warnings is None else warnings)
     best, names = data.best_reconstruction, [image.name for image in data.images]
     working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
@@ -169,12 +154,12 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         given = (data.model, data.metric.reconstruction, names)
         model = pictures.make("the model", figures.viewer_data, *given)
-    side = drawing.depth_side(_sharing(len(data.depth_maps)))
+    side = drawing.depth_side(_sharing(len(data.depths)))
     depths = [
         (i + 1, names[i], picture)
         for i in pictured(len(names))
-        if i in data.depth_maps
-        and (picture := pictures.make("a depth map", drawing.draw_depth, data.depth_maps[i], side=side))
+        if i in data.depths
+        and (picture := pictures.make("a depth map", drawing.draw_depth, data.depths[i], side=side))
     ]
     if data.held_out is not None:
         held_out = pictures.make("the held-out image", drawing.draw_held_out, data.held_out)
@@ -182,41 +167,23 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     cards = _cards(data, distances, bars, pictures)
     return render_page(
-        page_resource("template.html.j2"),
-        [*scripts, *model_scripts],
+        page_resource("template.html.j2"), [*scripts, *model_scripts],
         filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
-        count_of=words.count_of,
-        data=data,
-        assessment=words.assess(data),
-        facts=words.key_facts(data, overall),
-        overall=overall,
-        cards=cards,
+        count_of=words.count_of, data=data, version=__version__, assessment=words.assess(data),
+        facts=words.key_facts(data, overall), overall=overall, cards=cards,
         unpictured=[card for card in cards if card["picture"] is None],
-        intrinsic_columns=_intrinsic_columns(data),
-        limit_px=limit_px,
-        model=model,
-        model_text=words.model_text(data.model) if data.model is not None else "",
-        depths=depths,
-        held_out=held_out,
-        scale=drawing.SCALE,
-        difference_limit=round(drawing.DIFFERENCE_LIMIT),
-        **content,
-        shown_points=shown,
-        omitted=omitted,
-        most_points=figures.MAX_POINTS,
-        most_pyramids=figures.MAX_PYRAMIDS,
-        all_points=int(best.valid.sum()) if best is not None else 0,
-        pair_selection=words.pair_selection_text(data),
-        drawn_pairs=_drawn_pairs(data, pictures),
-        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:120],
-        stages=_stages(data.reports),
-        warnings=_warnings(data, pictures.warnings),
-        limit_known=drawn is not None,
+        intrinsic_columns=_intrinsic_columns(data), limit_px=limit_px, model=model,
+        model_text=words.model_text(data.model) if data.model is not None else "", depths=depths,
+        held_out=held_out, scale=drawing.SCALE, difference_limit=round(drawing.DIFFERENCE_LIMIT), **content,
+        shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS,
+        most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
+        pair_selection=words.pair_selection_text(data), drawn_pairs=_drawn_pairs(data, pictures),
+        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:120], stages=_stages(data.reports),
+        warnings=_warnings(data, pictures.warnings), limit_known=drawn is not None,
         self_check=words.named_numbers(data.metric.self_check) if data.metric is not None else [],
         summary_text=json.dumps(_shortened(data.summary), indent=2, ensure_ascii=False, default=str),
-        model_scripts=model_scripts,
-        histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
-    )
+        model_scripts=model_scripts, histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
+    )  # fmt: skip
 
 
 def _sharing(images: int) -> int:
@@ -235,10 +202,7 @@ def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
 
 
 def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
-    """The figures by element id (not "scene", which plotly.js uses), the points in 3D, the cameras left out.
-
-    The cameras that are left out are those of the affine figure.
-    """
+    """The figures by id (not "scene", which plotly.js uses), points in 3D, affine cameras left out."""
     found: dict[str, Any] = {}
     points = omitted = 0
 

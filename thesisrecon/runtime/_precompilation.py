@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import wait
 from contextlib import suppress
 from pathlib import Path
 from platform import node
@@ -19,7 +20,7 @@ from typing import Any
 import numba
 from numba import types
 
-from thesisrecon._numba import cache_folder, copy_to
+from thesisrecon._numba import ThreadPool, cache_folder, copy_to
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
 from thesisrecon.runtime._signals import kill_on_exit, starting_processes
@@ -116,17 +117,11 @@ def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[
         for worker in workers:
             worker.kill()
 
-    with kill_on_exit(kill):
-        feeding = [threading.Thread(target=feed, args=(worker,), daemon=True) for worker in workers]
-        with suppress(RuntimeError):
-            for thread in feeding:
-                thread.start()
+    with kill_on_exit(kill), ThreadPool(len(workers)) as threads:
         try:
-            for thread in feeding:
-                while thread.is_alive():
-                    thread.join(0.1)
-                    progress("kernels", len(finished), len(lines))
-            # All may have ended before the first look.
+            feeding = [threads.submit(feed, worker) for worker in workers]
+            while wait(feeding, 0.1).not_done:
+                progress("kernels", len(finished), len(lines))
             progress("kernels", len(finished), len(lines))
         finally:
             kill()

@@ -56,11 +56,7 @@ def bytes_from_record(record: Any, key: str) -> bytes:
 
 
 def sealed(archive: bytes) -> bytes:
-    """A zip archive with the digest of its bytes as its comment, which follows a length of two bytes.
-
-    Kernels do not check their input, so a record is used only if it is unchanged. The seal detects accidents,
-    not forgery.
-    """
+    """A zip archive with the digest of its bytes as comment, against accidents: kernels check no input."""
     return archive[:-2] + b"\x20\0" + hashlib.sha256(archive).digest()
 
 
@@ -281,10 +277,9 @@ class RunDirectory:
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
         difference = difference or next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
-            raise UsageError(
-                f"the output folder {self.path} holds another run ({difference}); choose another folder, or "
-                "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
-            )
+            advice = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
+            there = f"the output folder {self.path} holds another run ({difference})"
+            raise UsageError(f"{there}; choose another folder, or {advice}")
         return bool(difference)
 
     def _identity(self) -> tuple[Any, str]:

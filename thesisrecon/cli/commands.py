@@ -1,0 +1,381 @@
+"""The commands: ``reconstruct``, ``demo`` and ``inspect`` of runs, and those on their results."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from thesisrecon.cli.common import (
+    MaxSize,
+    OutputFolder,
+    Overwrite,
+    Seed,
+    Threads,
+    cap_threads,
+    folder_argument,
+    folder_option,
+    interruptible,
+    parse_folder,
+    progress_bars,
+)
+from thesisrecon.errors import UsageError, counted, made
+from thesisrecon.io._files import printable, read_json
+from thesisrecon.runtime._executors import available_threads
+
+_DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
+"""Small depth maps: the demo should show a model soon."""
+Images = Annotated[Path | None, folder_argument("IMAGES", "Folder of images; with --every also a video.")]
+_EVERY_HELP = "Take the sharpest of each N frames of a video or folder."
+Every = Annotated[int | None, typer.Option("--every", min=1, metavar="N", help=_EVERY_HELP)]
+_SOURCE_HELP = (
+    "Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras are not used."
+)
+Source = Annotated[Path | None, folder_option(_SOURCE_HELP, "--from", metavar="DATABASE|SPARSE")]
+_IMAGES_HELP = "With --from: the folder of the images, for colours and the model."
+ImagesFolder = Annotated[Path | None, folder_option(_IMAGES_HELP, "--images")]
+Masks = Annotated[Path | None, folder_option("Folder of masks: black pixels are left out.", "--masks")]
+_PRESET_HELP = "Pipeline to start from (default: default)."
+Preset = Annotated[Literal["default", "thesis"] | None, typer.Option("--preset", help=_PRESET_HELP)]
+_CAMERAS_HELP = "One camera per image size, or one per image."
+Cameras = Annotated[Literal["shared", "per-image"] | None, typer.Option("--cameras", help=_CAMERAS_HELP)]
+_CONFIG_HELP = "TOML file of settings that override the preset."
+Config = Annotated[Path | None, typer.Option("--config", help=_CONFIG_HELP)]
+_SET_HELP = "One setting as stage.field=value; may be repeated."
+Settings = Annotated[list[str] | None, typer.Option("--set", help=_SET_HELP)]
+_PAIRS_HELP = (
+    "Image pairs to match: all, those that seem to overlap (the default above 30 images), each image with "
+    "the next N by name, or the pairs of a file with two names per line."
+)
+_PAIRS = "all|overlap|window:N|FILE"
+Pairs = Annotated[str | None, typer.Option("--pairs", metavar=_PAIRS, help=_PAIRS_HELP)]
+_UNTIL_HELP = "Last stage to run: features, matches, projective, metric, dense or model (the default)."
+Until = Annotated[str | None, typer.Option("--until", help=_UNTIL_HELP)]
+_EXECUTOR_HELP = "Run workers as threads (local), as processes, or on a Dask cluster."
+_EXECUTORS = "local|processes|dask://HOST:PORT"
+Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
+_OVERWRITE_HELP = "Replace another run, or changed result files, in the output folder."
+OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)]
+
+
+def reconstruct(
+    out: OutputFolder, images: Images = None, every: Every = None, source: Source = None,
+    images_folder: ImagesFolder = None, masks: Masks = None, preset: Preset = None, cameras: Cameras = None,
+    config: Config = None, settings: Settings = None, seed: Seed = 0, threads: Threads = 0,
+    max_size: MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
+    overwrite: OverwriteRun = False,
+) -> None:  # fmt: skip
+    """Reconstruct cameras, points and a textured model from images."""
+    cap_threads(threads)
+    chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
+    chosen |= {"max_size": max_size, "set": settings or [], "masks": masks}
+    options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
+    if source is None:
+        if images is None or images_folder is not None:
+            message = "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
+            raise UsageError(message)
+        _run(images, out, seed, chosen | options | {"every": every})
+        return
+    if images is not None or chosen.pop("pairs") is not None or every is not None:
+        message = "with --from the images are given by --images, and images and pairs are those of the source"
+        raise UsageError(message)
+    _run(source, out, seed, chosen | options | {"images": images_folder}, matched=True)
+
+
+def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: OverwriteRun = False) -> None:
+    """Reconstruct the courtyard images that come with the package."""
+    cap_threads(threads)
+    from thesisrecon.io._images import demo_images
+
+    options = {"threads": threads or None, "overwrite": overwrite}
+    _run(demo_images(), out, 0, {"set": _DEMO_SETTINGS} | options)
+
+
+def _run(source: Any, out: Path, seed: int, options: Mapping[str, Any], *, matched: bool = False) -> None:
+    from thesisrecon.api import from_matches, reconstruct
+
+    function: Callable[..., Any] = reconstruct.reconstruct
+    if matched:
+        function = from_matches.reconstruct_from_colmap
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    advice = f"repeat the command to resume from {printable(str(out))}"
+    with interruptible(advice), progress_bars() as progress:
+        result = function(source, out, seed=seed, progress=progress, **options)
+    typer.echo(summary_text(result.summary, out))
+
+
+def inspect(out: Annotated[Path, folder_argument("OUT", "Output folder of a run.")]) -> None:
+    """Print the summary of a run, or where it stands if it has not finished."""
+    from thesisrecon.pipeline.run import run_position
+    from thesisrecon.runtime._run_folder import is_running
+
+    summary = read_json(out / "summary.json")
+    position = run_position(out) if summary is None or is_running(out) else ""
+    if position:
+        typer.echo(printable(position))
+        return
+    if not isinstance(summary, dict):
+        raise UsageError(f"{out} holds no summary.json; no run has finished in this folder")
+    try:
+        text = summary_text(summary, out)
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError, RecursionError):
+        raise UsageError(f"{out / 'summary.json'} is not a summary written by thesisrecon") from None
+    typer.echo(text)
+
+
+def summary_text(summary: Mapping[str, Any], out: Path) -> str:
+    """Format ``summary.json`` for a terminal, one fact per line, without control characters."""
+    lines = [_result(summary)]
+    rms, median = summary["reprojection_rms_px"], summary["reprojection_median_px"]
+    if rms is not None:
+        lines.append(f"reprojection residual {rms:.3f} px RMS, {median:.3f} px median")
+    lines += _intrinsic_lines(summary["cameras"])
+    if summary.get("model"):
+        lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
+        if (tiles := out / "tiles" / "tiles.json").is_file():
+            lines.append(f"reduced there; all triangles are in the tiles of {tiles}")
+    groups = summary.get("groups", ())
+    elsewhere = {name for group in groups for name in group["names"] if name not in group["missing"]}
+    refused = [one for one in summary["refused"] if one["name"] not in elsewhere]
+    lines += [f"not registered: {one['name']}: {one['reason']}" for one in refused]
+    for group in groups:
+        count = f"{group['registered']} of {counted(group['images'], 'image')} registered"
+        found = group["failure"] or count + (", not trusted" if group["trusted"] is False else "")
+        page = out / group["folder"] / "report.html"
+        lines.append(f"{group['folder']}: {found.removesuffix('.')}; report: {page}")
+    lines += [f"camera model: {text}" for text in summary.get("limitations", ())]
+    lines += [f"warning: {warning}" for warning in summary["warnings"]]
+    if summary["failure"]:
+        lines.append(f"failed: {summary['failure']}")
+    lines.append(f"{_duration(summary)}; report: {out / 'report.html'}")
+    return "\n".join(printable(line) for line in lines)
+
+
+def _duration(summary: Mapping[str, Any]) -> str:
+    """Time of this run and, if stages were cached, the computing time of all of them."""
+    total = summary["seconds"]["total"]
+    elapsed = f"{summary.get('elapsed_seconds', total):.1f} s"
+    return f"{elapsed} ({total:.1f} s including cached stages)" if summary["resumed"] else elapsed
+
+
+def _result(summary: Mapping[str, Any]) -> str:
+    """Result of the last stage that has one."""
+    images, pairs = summary["images"], summary["pairs"]
+    if summary["stratum"] is not None:
+        kind = " in projective cameras" if summary["stratum"] == "projective" else ""
+        registered = f"{summary['registered']} of {counted(images, 'image')} registered"
+        return f"{registered}{kind}, {counted(summary['points'], 'point')}"
+    if pairs["matched"]:
+        possible = pairs.get("possible", pairs["matched"])
+        chosen = f" ({possible} are possible)" if possible > pairs["matched"] else ""
+        accepted = f"{pairs['accepted']} of {counted(pairs['matched'], 'image pair')} accepted{chosen}"
+        return f"{accepted}, {counted(pairs['verified_matches'], 'verified match')}"
+    corners = [view["corners"] for view in summary["cameras"] if view["corners"] is not None]
+    if corners:
+        return f"{counted(sum(corners), 'corner')} in {counted(len(corners), 'image')}"
+    return f"{len(summary['cameras'])} of {counted(images, 'image')} read"
+
+
+def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
+    """One line per camera: the estimated entries of K with their standard deviations."""
+    lines: dict[tuple[int, float], str] = {}
+    for view in views:
+        if "focal_px" not in view:
+            continue
+        focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
+        lines.setdefault(
+            (view["camera"], focal["value"]),
+            f"camera {view['camera']}: focal length {focal['value']:.1f} ± {focal['std']:.1f} px "
+            f"({focal['source']}), principal point ({x['value']:.1f} ± {x['std']:.1f}, "
+            f"{y['value']:.1f} ± {y['std']:.1f}) px" + _aspect_and_skew(view),
+        )
+    return list(lines.values())
+
+
+def _aspect_and_skew(view: Mapping[str, Any]) -> str:
+    """Aspect ratio and skew, each only if it was estimated."""
+    text = ""
+    for name, label, digits, unit in (("aspect", "aspect ratio", 5, ""), ("skew_px", "skew", 2, " px")):
+        interval = view.get(name)
+        if interval is not None and interval["std"] != 0.0:
+            text += f", {label} {interval['value']:.{digits}f} ± {interval['std']:.{digits}f}{unit}"
+    return text
+
+
+_KINDS = "folder of a run, COLMAP model, cameras.json, or trajectory (TUM or KITTI)"
+_PAGE_HELP = "Write a page (HTML) with both models in 3D."
+_TO_HELP = "colmap, colmap-undistorted, nerfstudio, openmvs, bundler, opencv or kalibr."
+_ORIGINALS_HELP = "Folder of the original images (default: that of the run)."
+_MASKS_HELP = "Folder of the masks of the images (default: that of the run)."
+_SCALE_HELP = "Known distance of the cameras of two images."
+_SCALE = typer.Option("--scale", metavar="NAME1 NAME2 DISTANCE", help=_SCALE_HELP)
+_ALIGN_HELP = "Known camera positions: a CSV of name,x,y,z or name,lat,lon,alt."
+_PATH_HELP = "Camera path: orbit the model, or interpolate between the cameras."
+_SIZE_HELP = "Frame size (px); by default that of the first image, at most 1000."
+_LIGHT_HELP = "Lighting: none, camera headlight or sun."
+_BACKGROUND_HELP = "Background colour, such as white or #20304f."
+_METHOD_HELP = "Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."
+_TWO_OR_THREE = typer.Argument(
+    parser=parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."
+)
+Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
+
+
+def compare(
+    a: Annotated[Path, folder_argument("A", f"Model: {_KINDS}.")],
+    b: Annotated[Path, folder_argument("B", "Reference: any of these.")],
+    json: Annotated[Path | None, typer.Option("--json", help="Write all numbers to this file.")] = None,
+    page: Annotated[Path | None, typer.Option("--page", help=_PAGE_HELP)] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compare two models of the same images after a similarity alignment."""
+    cap_threads(0)
+    from thesisrecon.api.models import compare_models
+    from thesisrecon.io._files import json_text, write_new
+    from thesisrecon.report._assessment import camera_table, headline, point_table, summary_table
+    from thesisrecon.report._page import comparison_page
+
+    if json is not None and json == page:
+        raise UsageError("--json and --page name the same file; give different ones")
+    found = compare_models(a, b)
+    lines = [f"A: {a}", f"B: {b} (reference)", headline(found), *(f"note: {note}" for note in found.notes)]
+    cameras, most = camera_table(found), 60
+    tables = [summary_table(found), point_table(found), cameras[: most + 1]]
+    for rows in filter(None, tables):
+        lines += ["", *_aligned(rows)]
+    if len(cameras) > most + 1:
+        lines.append(f"and {len(cameras) - 1 - most} more cameras; --json writes all")
+    files = {} if json is None else {json: json_text({"a": str(a), "b": str(b), **found.as_table()})}
+    warnings: list[str] = []
+    if page is not None:
+        html = made(str(page), lambda: comparison_page(found, str(a), str(b)), warnings, "")
+        files |= {page: html} if html else {}
+    write_new(files, overwrite=overwrite, extra=page, warnings=warnings)
+    lines += [f"warning: {warning}" for warning in warnings]
+    typer.echo("\n".join(printable(line) for line in lines))
+
+
+def _aligned(rows: list[list[str]]) -> list[str]:
+    """The rows with columns of one width, the first one flush left and the others flush right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
+    return ["  ".join(cells).rstrip() for cells in padded]
+
+
+def export(
+    model: Annotated[Path, folder_argument("OUT", "Folder of a run, or a COLMAP model.")],
+    folder: OutputFolder, to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=_TO_HELP)],
+    images: Annotated[Path | None, folder_option(_ORIGINALS_HELP, "--images")] = None,
+    masks: Annotated[Path | None, folder_option(_MASKS_HELP, "--masks")] = None,
+    scale: Annotated[tuple[str, str, float] | None, _SCALE] = None,
+    align: Annotated[Path | None, typer.Option("--align", metavar="FILE", help=_ALIGN_HELP)] = None,
+    threads: Threads = 0, overwrite: Overwrite = False,
+) -> None:  # fmt: skip
+    """Write cameras, points and undistorted images for another program."""
+    cap_threads(threads)
+    if scale is not None and align is not None:
+        raise UsageError("--scale and --align exclude each other; positions determine the scale")
+    from thesisrecon.api.export import export as write_export
+    from thesisrecon.api.export import recorded_images, recorded_masks, require_separate
+    from thesisrecon.api.models import align_to_positions, scaled
+    from thesisrecon.io._models import read_model
+
+    if folder.resolve() == model.resolve():
+        raise UsageError(f"the folder {folder} holds the model; export to another folder")
+    # Checked here, because `export` gets the model from memory and cannot compare its folder.
+    require_separate(folder, to, model=model)
+    found = read_model(model)
+    if scale is not None:
+        found = scaled(found, *scale)
+    if align is not None:
+        found, report = align_to_positions(found, align)
+        typer.echo("\n".join(map(printable, str(report).splitlines())))
+    with interruptible("repeat the command to write all files"):
+        images, lost = images or recorded_images(model), list[str]()
+        if masks is None:
+            masks, lost = recorded_masks(model, to)
+        written = write_export(
+            found, folder, to=to, images=images, masks=masks, threads=threads, overwrite=overwrite
+        )
+    for note in (*lost, *written.notes):
+        typer.echo(f"note: {note}")
+    typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")
+
+
+def render(
+    run: Annotated[Path, folder_argument("OUT", "Output folder of a run.")],
+    path: Annotated[Literal["orbit", "interpolate"], typer.Option("--path", help=_PATH_HELP)] = "orbit",
+    frames: Frames = 90,
+    size: Annotated[str | None, typer.Option("--size", metavar="WxH", help=_SIZE_HELP)] = None,
+    light: Annotated[Literal["none", "camera", "sun"], typer.Option("--light", help=_LIGHT_HELP)] = "none",
+    background: Annotated[str, typer.Option("--background", help=_BACKGROUND_HELP)] = "black",
+    folder: Annotated[Path | None, folder_option("Output folder (OUT/views/PATH).")] = None,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Render the model of a run along a camera path."""
+    cap_threads(threads)
+    if run.is_file():
+        raise UsageError(f"render takes the output folder of a run; {run} is a file")
+    from thesisrecon.cli.view_files import render_run
+
+    with interruptible("repeat the command to render all frames"), progress_bars() as progress:
+        written = render_run(
+            run, folder or run / "views" / path, path=path, frames=frames,
+            size=None if size is None else _size(size), light=light, background=_color(background),
+            threads=threads or available_threads(), progress=progress, overwrite=overwrite,
+        )  # fmt: skip
+    typer.echo(written)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
+    if found is None:
+        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
+    width, height = int(found[1]), int(found[2])
+    if not 1 <= min(width, height) <= max(width, height) <= 8192:
+        raise UsageError(f"--size takes sides of 1 to 8192 pixels; got {width}x{height}")
+    return width, height
+
+
+def _color(text: str) -> tuple[int, int, int]:
+    """Parse a colour name, "#rrggbb" or "rgb(...)"."""
+    import PIL.ImageColor
+
+    try:
+        return PIL.ImageColor.getrgb(text.strip())[:3]
+    except ValueError:
+        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
+
+
+def interpolate(
+    images: Annotated[list[Path], _TWO_OR_THREE],
+    method: Annotated[
+        Literal["interpolation", "tensor"], typer.Option("--method", help=_METHOD_HELP)
+    ] = "interpolation",
+    frames: Frames = 21,
+    seed: Seed = 0,
+    max_size: MaxSize = None,
+    folder: Annotated[Path | None, folder_option("Output folder (views/METHOD).")] = None,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Compute views between two or three images."""
+    cap_threads(threads)
+    if max_size is not None and max_size < 64:
+        raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
+    from thesisrecon.cli.view_files import STRIP, interpolate_images
+
+    folder = folder or Path("views") / method
+    with interruptible("repeat the command to compute all frames"), progress_bars() as progress:
+        written = interpolate_images(
+            folder, images, method=method, frames=frames, seed=seed, max_size_px=max_size,
+            threads=threads or available_threads(), progress=progress, overwrite=overwrite,
+        )  # fmt: skip
+    typer.echo(written)
+    if (page := folder / STRIP).is_file():
+        typer.echo(f"page: {printable(str(page))}")
