@@ -467,11 +467,11 @@ def _pose(K: F64, P: F64) -> tuple[F64, F64]:
 
 def _camera_params(K: F64, distortion: F64, *, pinhole: bool) -> tuple[str, tuple[float, ...]]:
     """Return the smallest COLMAP camera model for K and (k1, k2, k3), and its parameters."""
-    fx, fy, *centre = (*K[[0, 1], [0, 1]].tolist(), *(K[:2, 2] + PIXEL_CENTRE).tolist())
+    (fx, fy), (cx, cy) = K[[0, 1], [0, 1]].tolist(), (K[:2, 2] + PIXEL_CENTRE).tolist()
     k1, k2, k3 = distortion.tolist()
     if k2 or k3:
-        return "FULL_OPENCV", (fx, fy, *centre, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
+        return "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
     # One focal length for both moves no pixel by more than rounding.
     if not pinhole and abs(fx - fy) <= 1e-12 * fx:
-        return ("SIMPLE_RADIAL", (fx, *centre, k1)) if k1 else ("SIMPLE_PINHOLE", (fx, *centre))
-    return ("OPENCV", (fx, fy, *centre, k1, 0.0, 0.0, 0.0)) if k1 else ("PINHOLE", (fx, fy, *centre))
+        return ("SIMPLE_RADIAL", (fx, cx, cy, k1)) if k1 else ("SIMPLE_PINHOLE", (fx, cx, cy))
+    return ("OPENCV", (fx, fy, cx, cy, k1, 0.0, 0.0, 0.0)) if k1 else ("PINHOLE", (fx, fy, cx, cy))

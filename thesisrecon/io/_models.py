@@ -207,10 +207,10 @@ def read_positions(path: Path) -> Positions:
         found[name] = x, y, z
     if not header.degrees or not found:
         return Positions(found)
-    places = np.array([*found.values()])
+    degrees = np.array([*found.values()])
     # The median is one of the positions near most of them, also beside those without a fix (0, 0).
-    x, y, z = (median_low(column) for column in places.T.tolist())
-    metres = _east_north_up(places, np.array([x, y, z])).tolist()
+    x, y, z = (median_low(column) for column in degrees.T.tolist())
+    metres = _east_north_up(degrees, np.array([x, y, z])).tolist()
     return Positions({name: (e, n, u) for name, (e, n, u) in zip(found, metres, strict=True)}, (x, y, z))
 
 
