@@ -212,7 +212,7 @@ def test_the_residuals_are_the_noise_that_was_added():
     assert summary.rms_px == pytest.approx(np.sqrt(2) * synthetic.NOISE_PX, rel=0.03)
     assert summary.median_px == pytest.approx(np.sqrt(2 * np.log(2)) * synthetic.NOISE_PX, rel=0.03)
     # Without the distortion the residuals grow by what it moved.
-    without = reprojection_distances(synthetic.projective_run().reconstruction)
+    without = reprojection_distances(synthetic.projective_run().projective)
     assert summarize_distances(np.concatenate(without)).rms_px > 2 * synthetic.NOISE_PX
 
 
