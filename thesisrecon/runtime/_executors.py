@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 from thesisrecon.errors import UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
@@ -57,31 +57,12 @@ def _dask_place(executor: str) -> str:
 
 
 @dataclass
-class _Pool:
-    """A running executor and its number of workers."""
-
-    executor: futures.Executor
-    threads: int = 1
-
-    def parallel(self) -> int:
-        return self.threads
-
-    def check(self) -> None:
-        """Raise ``WorkersLost`` if the workers are gone."""
-
-    def lost(self, error: BaseException) -> WorkersLost:
-        """The error for tasks that were cancelled."""
-        if isinstance(error, futures.BrokenExecutor):
-            return WorkersLost("a worker process ended unexpectedly (killed, or out of memory)")
-        return WorkersLost(f"the executor ({type(self.executor).__name__}) cancelled its tasks")
-
-
-@dataclass
-class Cluster(_Pool):
+class Cluster:
     """A connection to a scheduler (HOST:PORT), and its executor."""
 
-    address: str = ""
-    client: Any = None
+    address: str
+    client: Any
+    executor: futures.Executor
     _alone_since: float = 0.0
 
     def parallel(self) -> int:
@@ -96,15 +77,16 @@ class Cluster(_Pool):
             alone = f"has had no worker for {WORKERLESS_S:.0f} s"
             raise WorkersLost(f"the Dask scheduler at {self.address} {alone}")
 
-    def lost(self, error: BaseException) -> WorkersLost:  # noqa: ARG002
+    def lost(self) -> WorkersLost:
+        """The error for tasks that were cancelled."""
         return WorkersLost(f"the Dask scheduler at {self.address} is gone")
 
     def _threads(self) -> dict[str, int]:
         try:
             found: dict[str, int] = self.client.nthreads()
-        except Exception as error:
+        except Exception:
             # A broken connection raises many types.
-            raise self.lost(error) from None
+            raise self.lost() from None
         return found
 
 
@@ -124,9 +106,10 @@ def _connect_dask(executor: str) -> Iterator[Cluster]:
         try:
             client = Client(f"tcp://{place}", timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
-            advice = "start one there (dask scheduler) and its workers (dask worker), or correct the address"
-            silent = f"no Dask scheduler answers at {place} within {ANSWER_S:.0f} s"
-            raise UsageError(f"{silent}; {advice}") from None
+            raise UsageError(
+                f"no Dask scheduler answers at {place} within {ANSWER_S:.0f} s; "
+                "start one there (dask scheduler) and its workers (dask worker), or correct the address"
+            ) from None
         try:
             try:
                 client.wait_for_workers(1, timeout=ANSWER_S)
@@ -137,7 +120,7 @@ def _connect_dask(executor: str) -> Iterator[Cluster]:
             # their worker.
             client.direct_to_workers = _reachable(client.nthreads())
             # pure=False: do not hash all bytes of the tasks.
-            yield Cluster(client.get_executor(pure=False), address=place, client=client)
+            yield Cluster(place, client, client.get_executor(pure=False))
         finally:
             with suppress(Exception):
                 client.close(timeout=1.0)
@@ -191,7 +174,7 @@ class Workers:
 
     threads: int
     executor: str | futures.Executor = "local"  #: one of ``NAMES``, or an executor, which is not shut down
-    _remote: _Pool | None = field(default=None, repr=False)
+    _remote: _Remote | None = field(default=None, repr=False)
     _open_stack: ExitStack | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -255,18 +238,18 @@ class Workers:
             return list(pool.map(function, items))
 
     @contextmanager
-    def _opened(self) -> Iterator[_Pool]:
+    def _opened(self) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
-            yield _Pool(self.executor, self.threads)
+            yield _Remote(self.executor, lambda: self.threads)
         elif _is_dask_address(self.executor):
             with _connect_dask(self.executor) as cluster:
-                yield cluster
+                yield _Remote(cluster.executor, cluster.parallel, cluster)
         elif self.executor == "local" or (pool := _processes(self.threads)) is None:
             with _thread_pool(self.threads) as threads:
-                yield _Pool(threads, self.threads)
+                yield _Remote(threads, lambda: self.threads)
         else:
             try:
-                yield _Pool(pool, self.threads)
+                yield _Remote(pool, lambda: self.threads)
                 pool.shutdown(wait=True)
             finally:
                 # After an error the processes end at once.
@@ -295,8 +278,16 @@ def _processes(count: int) -> ProcessPool | None:
         return pool
 
 
+class _Remote(NamedTuple):
+    """A running executor, its number of workers and its cluster, if any."""
+
+    executor: futures.Executor
+    parallel: Callable[[], int]
+    cluster: Cluster | None = None
+
+
 def _run_all(
-    remote: _Pool, function: Callable[..., Any], pickled: bool, tasks: Iterable[Task], finished: Finished
+    remote: _Remote, function: Callable[..., Any], pickled: bool, tasks: Iterable[Task], finished: Finished
 ) -> None:
     """Keep the executor busy until all tasks are done."""
     waiting: dict[futures.Future[Any], int] = {}
@@ -312,13 +303,13 @@ def _run_all(
             if not waiting:
                 return
             done, _ = futures.wait(waiting, CHECK_S, return_when=futures.FIRST_COMPLETED)
-            if not done:
-                remote.check()
+            if not done and remote.cluster is not None:
+                remote.cluster.check()
             for future in sorted(done, key=waiting.__getitem__):
                 answer = future.result()
                 finished(waiting.pop(future), pickle.loads(answer) if pickled else answer)
     except (futures.BrokenExecutor, futures.CancelledError) as error:
-        raise remote.lost(error) from None
+        raise _lost(remote, error) from None
     finally:
         for future in waiting:
             future.cancel()
@@ -333,12 +324,21 @@ def _pickled(task: Any) -> bytes:
         raise UsageError(f"a method cannot be sent to another process ({error}); {advice}") from None
 
 
+def _lost(remote: _Remote, error: BaseException) -> WorkersLost:
+    if remote.cluster is not None:
+        return remote.cluster.lost()
+    if isinstance(error, futures.BrokenExecutor):
+        return WorkersLost("a worker process ended unexpectedly (killed, or out of memory)")
+    return WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled its tasks")
+
+
 def _answer(key: str, task: bytes) -> bytes:
     """Run a pickled task in a worker; other code would give results with a wrong cache key."""
     if package_key() != key:
-        worker = f"a worker ({multiprocessing.current_process().name} on {os.uname().nodename})"
-        what = "runs another version of thesisrecon than this program; install the same version there"
-        raise UsageError(f"{worker} {what}")
+        raise UsageError(
+            f"a worker ({multiprocessing.current_process().name} on {os.uname().nodename}) runs another "
+            "version of thesisrecon than this program; install the same version there"
+        )
     try:
         function, given = pickle.loads(task)
     except (ImportError, AttributeError) as error:
