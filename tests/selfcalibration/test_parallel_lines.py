@@ -14,7 +14,6 @@ from thesisrecon.selfcalibration._frame import projective_scene
 from thesisrecon.selfcalibration.parallel_lines import (
     LineSegments,
     ParallelLines,
-    VanishingPoints,
     _find_parallel_directions,
     _normalize_segments,
     _propose_vanishing_points,
@@ -30,11 +29,9 @@ TURN = np.array([[0.8, 0.36, 0.48], [-0.6, 0.48, 0.64], [0.0, -0.8, 0.6]])
 
 def vanishing_points(scene, directions, views):
     """Exact vanishing points of directions (D, 3) in the named views."""
-    M = scene.K @ scene.R
-    xyh = np.concatenate([directions @ M[v].T for v in views])
-    return VanishingPoints(
-        np.repeat(views, len(directions)), np.tile(np.arange(len(directions)), len(views)), xyh
-    )
+    found = np.full((len(scene.K), len(directions), 3), np.nan)
+    found[views] = directions @ (scene.K @ scene.R)[views].swapaxes(1, 2)
+    return found
 
 
 def drawn_segments(scene, *, sigma_px, stray, seed):
@@ -67,7 +64,7 @@ def test_more_directions_and_points_at_infinity_do_no_harm():
     R0 = scene.R[0]
     level = np.array([R0[0], R0[1], R0[2], [0.3, -0.2, 0.9]])
     given = vanishing_points(scene, level, [0, 3, 6])
-    assert abs(given.xyh[0, 2]) < 1e-12
+    assert abs(given[0, 0, 2]) < 1e-12
     found, plane = scenes.setup(scene, seed=1)
     located = ParallelLines(given).locate(found, np.random.default_rng(0))
     np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
@@ -96,10 +93,9 @@ def test_two_directions_are_refused_with_their_number():
     scene = make_scene(seed=3)
     found, _ = scenes.setup(scene, seed=3)
     given = vanishing_points(scene, TURN, [0, 1])
-    one_view = replace(given, view=np.where(given.direction == 2, 0, given.view))
-    one_view = VanishingPoints(*(part[:5] for part in (one_view.view, one_view.direction, one_view.xyh)))
+    given[1, 2] = np.nan
     with pytest.raises(StageFailure, match=r"three directions.*2 have"):
-        ParallelLines(one_view).locate(found, np.random.default_rng(0))
+        ParallelLines(given).locate(found, np.random.default_rng(0))
 
 
 def test_a_direction_along_the_baseline_is_no_direction():
@@ -121,15 +117,9 @@ def test_directions_are_found_among_strays(sigma, stray, limit):
     frame = found.frame
     segments = _normalize_segments(frame, drawn_segments(scene, sigma_px=sigma, stray=stray, seed=5))
     rng = np.random.default_rng(1)
-    proposals = [
-        _propose_vanishing_points(
-            segments.subset(segments.camera == k), max_points=5, samples=300, tolerance_px=1.5, rng=rng
-        )
-        for k in range(6)
-    ]
-    X, direction = _find_parallel_directions(frame, segments, proposals, max_directions=3, tolerance_px=1.5)
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
-    again = _refined_point(P, segments, X[0] + [1e-3, -1e-3, 1e-3, 0.0], 1.5)
+    proposals = [_propose_vanishing_points(segments.subset(segments.camera == k), rng) for k in range(6)]
+    X, direction = _find_parallel_directions(frame.P, segments, proposals, 3)
+    again = _refined_point(frame.P, segments, X[0] + [1e-3, -1e-3, 1e-3, 0.0])
     np.testing.assert_allclose(again, X[0], atol=2e-4)
     truth = np.tile(np.concatenate([np.repeat([0, 1, 2], 40), np.full(stray, -1)]), 6)
     for d in range(3):

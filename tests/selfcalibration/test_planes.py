@@ -62,9 +62,7 @@ def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed
 @pytest.mark.parametrize("seed", range(4))
 def test_the_cheirality_bounds_hold_the_true_plane(seed):
     found, plane = setup(make_scene(seed=seed, sigma_px=0.0), seed=seed)
-    region = CheiralityRegion.of(
-        found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
-    )
+    region = CheiralityRegion.of(found.frame, found.reconstruction, np.random.default_rng(0))
     assert region.wrong_side_ratio(plane[None])[0] == 0.0
     planes = [np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0) for part in region.polytopes]
     inside = [part.contains(v[None, :3] / v[3])[0] for part, v in zip(region.polytopes, planes, strict=True)]
@@ -75,9 +73,7 @@ def test_samples_of_the_bounds_are_inside_them():
     rows = np.column_stack([np.vstack([np.eye(3), -np.eye(3)]), [1.0] * 3 + [2.0] * 3])
     np.testing.assert_allclose(_plane_box(rows), [[-1.0, 2.0]] * 3)
     found, _ = setup(make_scene(seed=2))
-    region = CheiralityRegion.of(
-        found.frame, found.reconstruction, max_points=200, rng=np.random.default_rng(0)
-    )
+    region = CheiralityRegion.of(found.frame, found.reconstruction, np.random.default_rng(0))
     for part in region.polytopes:
         v = part.sample(100, np.random.default_rng(1))
         assert part.contains(v).all()
