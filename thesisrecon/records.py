@@ -178,6 +178,13 @@ class Tracks:
     n_points: int
 
 
+def common_points(view: I64, point: I64, n_views: int) -> scipy.sparse.csr_array:
+    """Number of points that each two views observe (V, V), sparse."""
+    size = (n_views, int(point.max(initial=0)) + 1)
+    seen = scipy.sparse.csr_array((np.ones(len(view)), (view, point)), size)
+    return seen @ seen.T
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """Cameras and points in one stratum ("projective", "affine" or "metric"), with their tracks."""
@@ -205,9 +212,7 @@ class Reconstruction:
     def common_points(self) -> F64:
         """(V, V) number of points with an inlier in both views."""
         t, keep = self.tracks, self.inlier
-        where = (t.view_index[keep], t.point_index[keep])
-        seen = scipy.sparse.csr_array((np.ones(len(where[0])), where), (t.n_views, t.n_points))
-        return np.asarray((seen @ seen.T).toarray())
+        return np.asarray(common_points(t.view_index[keep], t.point_index[keep], t.n_views).toarray())
 
     def with_reasons(self, min_points: int) -> Reconstruction:
         """Give each unregistered view without a reason the number of reconstructed points that it sees.

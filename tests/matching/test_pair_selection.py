@@ -218,7 +218,7 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
 def test_photographs_of_one_wall_use_the_same_words(windows):
     sketches = [_subset_seeds(f.seeds, rotated=False) for f in windows.features if f.seeds]
     words = word_weights(
-        [s.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
+        [s.seeds.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
     )
     alike = (words @ words.T).toarray()
     np.testing.assert_allclose(alike, alike.T, atol=1e-12)

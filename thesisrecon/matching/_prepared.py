@@ -156,10 +156,7 @@ class PreparedImage:
 
     @cached_property
     def patches(self) -> F32:
-        """Normalised window (N, D) of each corner at its scale, zero outside the image.
-
-        Those of the channels stand side by side, so that products are mean correlations.
-        """
+        """Normalised windows (N, D) of the corners, the channels side by side; zero outside the image."""
         (_, levels, base), found = self.pyramid, self.features
         parts = [_corner_patches(c, levels, base, found.xy, found.scale, self.window) for c in self.channels]
         return parts[0] if len(parts) == 1 else np.hstack(parts) / np.float32(np.sqrt(len(parts)))

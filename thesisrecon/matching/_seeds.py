@@ -1,9 +1,13 @@
-"""First matches without a search radius: mutual nearest patches that pass the ratio test."""
+"""First matches without a search radius: mutual nearest patches that pass the ratio test.
+
+Nearest neighbours in an image are found by a grid of cells, faster than a tree for this many queries.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -11,7 +15,6 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._nearest_neighbours import nearest_neighbours
 from thesisrecon.matching._prepared import empty_matches, join_matches, select_found
 from thesisrecon.matching.track_alignment import strongest_distinct
 from thesisrecon.records import Features, Matches, Seeds
@@ -158,13 +161,9 @@ def _frame(seeds: Seeds) -> F64:
 
 
 def seed_matches(
-    features1: Features,
-    features2: Features,
-    pair: tuple[int, int],
-    *,
-    orientation: Literal["auto", "upright", "rotated"],
-    ratio: float,
-) -> Iterator[SeedSet]:
+    features1: Features, features2: Features, pair: tuple[int, int], *,
+    orientation: Literal["auto", "upright", "rotated"], ratio: float,
+) -> Iterator[SeedSet]:  # fmt: skip
     """Sets of matched seeds: one of each orientation, or one of all if there are simulated oblique views.
 
     Simulated views of one image are matched with the other image itself: if one of two views of a plane is
@@ -179,10 +178,8 @@ def seed_matches(
             yield match_seeds(seeds1, seeds2, pair, rotated=rotated, ratio=ratio), neighbour_support
         return
     ways = (_joined(seeds1, features1.oblique), seeds2), (seeds1, _joined(seeds2, features2.oblique))
-    found = [
-        match_seeds(*way, pair, rotated=rotated, ratio=ratio) for rotated in orientations for way in ways
-    ]
-    matches = join_matches(found)
+    each = product(orientations, ways)
+    matches = join_matches([match_seeds(*way, pair, rotated=kind, ratio=ratio) for kind, way in each])
     yield select_found(matches, strongest_distinct(matches, REACH_PX)), map_support
 
 
@@ -227,10 +224,7 @@ def neighbour_support(matches: Matches) -> F64:
 
 
 def map_support(matches: Matches) -> F64:
-    """Number (M,) of neighbours that each match predicts by its own map, as in :func:`neighbour_support`.
-
-    Unlike a common rotation and scale it holds for oblique surfaces, but needs maps that are affine.
-    """
+    """Like :func:`neighbour_support`, but of the own affine map of each match: holds for oblique surfaces."""
     if len(matches.xy1) < 2:
         return np.zeros(len(matches.xy1))
     xy1, xy2, back = matches.xy1, matches.xy2, np.asarray(np.linalg.inv(matches.affine), np.float64)
@@ -238,10 +232,7 @@ def map_support(matches: Matches) -> F64:
 
 
 def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
-    """Number (M,) of the nearest neighbours that are where the ``maps`` (M, 2, 2) predict them, weighted.
-
-    A single map (1, 2, 2) is used for all matches.
-    """
+    """Weighted number (M,) of nearest neighbours that are where the ``maps`` (M or 1, 2, 2) predict them."""
     near = nearest_neighbours(here, here, min(neighbours + 1, len(here)))
     offset = (here[near] - here[:, None]) @ maps.swapaxes(1, 2)
     off = there[near] - there[:, None] - offset
@@ -251,11 +242,7 @@ def _agreement(here: F64, there: F64, maps: F64, neighbours: int) -> F64:
 
 
 def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
-    """Matches of the corners ``xy1``, ``xy2`` (N, 2) at the positions of seed matches.
-
-    The corner nearest to a seed in image 1 and the corner nearest to its prediction by the local affine map
-    in image 2; one-to-one, best correlations first.
-    """
+    """Matches (one-to-one, best first) of the corners nearest to the seeds and to their predictions."""
     apart1, one = scipy.spatial.cKDTree(xy1).query(known.xy1)
     led = known.xy2 + np.einsum("mij,mj->mi", known.affine, xy1[one] - known.xy1)
     apart2, two = scipy.spatial.cKDTree(xy2).query(led)
@@ -266,3 +253,91 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
     order = order[np.argsort(one[order], kind="stable")]
     one, two = one[order].astype(np.int64), two[order].astype(np.int64)
     return Matches(known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order])
+
+
+@kernel
+def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
+    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2).
+
+    The nearest is first, of equally distant ones that with the smaller number.
+    """
+    low, cell, shape = _grid(xy)
+    start, order = _fill_cells(xy, low, cell, shape)
+    found, near = empty((len(of), count), np.int64), empty(count)
+    for n in range(len(of)):
+        x, y = of[n, 0] - low[0], of[n, 1] - low[1]
+        column = min(max(int(np.floor(x / cell)), 0), shape[0] - 1)
+        row = min(max(int(np.floor(y / cell)), 0), shape[1] - 1)
+        held, best = 0, found[n]
+        for ring in range(max(shape[0], shape[1])):
+            for r in range(max(row - ring, 0), min(row + ring, shape[1] - 1) + 1):
+                inside = abs(r - row) < ring
+                for c in range(column - ring, column + ring + 1, 2 * ring if inside else 1):
+                    if c < 0 or c >= shape[0]:
+                        continue
+                    first = r * shape[0] + c
+                    for at in range(start[first], start[first + 1]):
+                        m = order[at]
+                        dx, dy = xy[m, 0] - of[n, 0], xy[m, 1] - of[n, 1]
+                        held = _insert(m, dx * dx + dy * dy, best, near, held)
+            if held < count:
+                continue
+            # Every point within this distance is in the cells seen so far.
+            safe = np.inf
+            if column - ring > 0:
+                safe = min(safe, x - (column - ring) * cell)
+            if column + ring < shape[0] - 1:
+                safe = min(safe, (column + ring + 1) * cell - x)
+            if row - ring > 0:
+                safe = min(safe, y - (row - ring) * cell)
+            if row + ring < shape[1] - 1:
+                safe = min(safe, (row + ring + 1) * cell - y)
+            if near[count - 1] < safe * abs(safe):
+                break
+    return found
+
+
+@kernel(forceinline=True)
+def _insert(m: int, distance2: float, found: I64, near: F64, held: int) -> int:
+    """Insert a point into the sorted list of ``held`` numbers and squared distances; return its length."""
+    at = held
+    if held == len(near):
+        at = held - 1
+        if distance2 > near[at] or (distance2 == near[at] and m > found[at]):
+            return held
+    while at > 0 and (near[at - 1] > distance2 or (near[at - 1] == distance2 and found[at - 1] > m)):
+        near[at], found[at] = near[at - 1], found[at - 1]
+        at -= 1
+    near[at], found[at] = distance2, m
+    return min(held + 1, len(near))
+
+
+@kernel
+def _grid(xy: F64) -> tuple[F64, float, I64]:
+    """Lower corner (2,), side and numbers (2,) of square cells of about two points each."""
+    low, high, shape = empty(2), empty(2), empty(2, np.int64)
+    for a in range(2):
+        low[a] = high[a] = xy[0, a]
+        for n in range(len(xy)):
+            low[a], high[a] = min(low[a], xy[n, a]), max(high[a], xy[n, a])
+    width, height = high[0] - low[0], high[1] - low[1]
+    cell = max(np.sqrt(2.0 * width * height / len(xy)), 2.0 * max(width, height) / len(xy), 1e-9)
+    shape[0], shape[1] = int(width / cell) + 1, int(height / cell) + 1
+    return low, cell, shape
+
+
+@kernel
+def _fill_cells(xy: F64, low: F64, cell: float, shape: I64) -> tuple[I64, I64]:
+    """The points of cell c, row by row, are ``order[start[c]:start[c + 1]]``."""
+    place, start = empty(len(xy), np.int64), zeros(shape[0] * shape[1] + 1, np.int64)
+    for n in range(len(xy)):
+        column = min(int((xy[n, 0] - low[0]) / cell), shape[0] - 1)
+        place[n] = min(int((xy[n, 1] - low[1]) / cell), shape[1] - 1) * shape[0] + column
+        start[place[n] + 1] += 1
+    for c in range(len(start) - 1):
+        start[c + 1] += start[c]
+    order, fill = empty(len(xy), np.int64), start.copy()
+    for n in range(len(xy)):
+        order[fill[place[n]]] = n
+        fill[place[n]] += 1
+    return start, order

@@ -12,7 +12,6 @@ from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.matching._nearest_neighbours import nearest_neighbours
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
@@ -30,7 +29,13 @@ from thesisrecon.matching._prepared import (
     select_found,
     window_raster,
 )
-from thesisrecon.matching._seeds import SeedSet, corners_of_seeds, map_support, seed_matches
+from thesisrecon.matching._seeds import (
+    SeedSet,
+    corners_of_seeds,
+    map_support,
+    nearest_neighbours,
+    seed_matches,
+)
 from thesisrecon.matching.track_alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
@@ -132,13 +137,9 @@ def _solve_correction(
 
 @kernel
 def _match_guided(
-    view1: tuple[F32, I64, float],
-    corners1: tuple[F64, F32],
-    predicted: tuple[F64, F64, F64],
-    corners2: tuple[F64, F32, F32],
-    grid2: tuple[float, I64, I64, I64],
-    gate: tuple[F64, F64, float],
-) -> tuple[I64, F32, F32]:
+    view1: tuple[F32, I64, float], corners1: tuple[F64, F32], predicted: tuple[F64, F64, F64],
+    corners2: tuple[F64, F32, F32], grid2: tuple[float, I64, I64, I64], gate: tuple[F64, F64, float],
+) -> tuple[I64, F32, F32]:  # fmt: skip
     """Most similar corner of image 2 near the predicted position and epipolar line of each corner.
 
     ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
@@ -188,13 +189,9 @@ def _match_guided(
 
 @kernel
 def _corners_in_band(
-    xy1: F64,
-    search: tuple[F64, float],
-    epipolar: tuple[F64, float],
-    xy2: F64,
-    grid2: tuple[float, I64, I64, I64],
-    near: I64,
-) -> int:
+    xy1: F64, search: tuple[F64, float], epipolar: tuple[F64, float], xy2: F64,
+    grid2: tuple[float, I64, I64, I64], near: I64,
+) -> int:  # fmt: skip
     """Write to ``near`` the corners of image 2 inside radius and epipolar band; return their number."""
     position, radius = search
     F, band = epipolar
@@ -228,12 +225,9 @@ def _corners_in_band(
 
 @kernel(forceinline=True)
 def _warp_windows(
-    view1: tuple[F32, I64, float],
-    corner: tuple[F64, float],
-    local: tuple[F64, float],
-    sizes: F64,
+    view1: tuple[F32, I64, float], corner: tuple[F64, float], local: tuple[F64, float], sizes: F64,
     out: tuple[F32, B8, F32],
-) -> None:
+) -> None:  # fmt: skip
     """Sample the window of a corner of image 1 as seen in image 2, for each corner size there.
 
     Not ready if the corner would have another size, or the window leaves the image or is blank.
@@ -315,12 +309,9 @@ class SeedsAndGrowth:
     # Minimum half width of the epipolar band, relative to the long side; three standard deviations of the
     # epipolar line if that is more.
     band_rel = 0.002
-    # The ratio of guided matches, within their part of the epipolar band.
-    grown_ratio = 0.8
-    # Prior standard deviation of an affine coefficient in the alignment.
-    affine_std = 0.02
-    # Share of the corners and seeds that are matched first.
-    many_share = 0.5
+    grown_ratio = 0.8  # the ratio of guided matches, within their part of the epipolar band
+    affine_std = 0.02  # prior standard deviation of an affine coefficient in the alignment
+    many_share = 0.5  # share of the corners and seeds that are matched first
 
     def __post_init__(self) -> None:
         require_at_least(self, neighbours=1, oblique_pairs=0)
@@ -332,14 +323,9 @@ class SeedsAndGrowth:
         return prepare_image(image, features)
 
     def match(
-        self,
-        view1: PreparedImage,
-        view2: PreparedImage,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental,
-        rng: np.random.Generator,
-    ) -> Matches:
+        self, view1: PreparedImage, view2: PreparedImage, *, pair: tuple[int, int],
+        estimate_fundamental: EstimateFundamental, rng: np.random.Generator,
+    ) -> Matches:  # fmt: skip
         """See `thesisrecon.config.Matcher.match`."""
         features1, features2 = view1.features, view2.features
         if features1.seeds is None or features2.seeds is None:
@@ -395,17 +381,10 @@ class SeedsAndGrowth:
         return (chosen, seeds) if self.support == "auto" and not wide else (chosen,)
 
     def _grow_around_seeds(
-        self,
-        view1: PreparedImage,
-        view2: PreparedImage,
-        start: tuple[Matches, FundamentalFit],
-        estimate: EstimateFundamental,
-        rng: np.random.Generator,
-    ) -> Matches:
-        """Match corners near few seeds: align the seeds and their maps, then the matches of a first pass.
-
-        Pairs with a wide baseline have few seeds: their maps are accurate to 20 %, positions to a few px.
-        """
+        self, view1: PreparedImage, view2: PreparedImage, start: tuple[Matches, FundamentalFit],
+        estimate: EstimateFundamental, rng: np.random.Generator,
+    ) -> Matches:  # fmt: skip
+        """Match corners near few seeds, with maps accurate to 20 % and positions to a few pixels."""
         known, fit = start
         near = replace(self, neighbours=min(self.neighbours, 3))
         scale = np.full(len(known.xy1), view1.features.scale.max(), np.float32)
@@ -419,17 +398,10 @@ class SeedsAndGrowth:
         return grown if verified is None else near._grow_in_rounds(view1, view2, verified, estimate, rng)
 
     def _grow_in_rounds(
-        self,
-        view1: PreparedImage,
-        view2: PreparedImage,
-        start: tuple[Matches, FundamentalFit],
-        estimate: EstimateFundamental,
-        rng: np.random.Generator,
-    ) -> Matches:
-        """Match the corners of the coarser scale, then all corners twice, guided by the previous matches.
-
-        If the first pass over all corners matches enough, the second one is restricted to the other corners.
-        """
+        self, view1: PreparedImage, view2: PreparedImage, start: tuple[Matches, FundamentalFit],
+        estimate: EstimateFundamental, rng: np.random.Generator,
+    ) -> Matches:  # fmt: skip
+        """Match the corners of the coarser scale, then all, then all or the rest, guided by those before."""
         scale = view1.features.scale
         everything = np.arange(len(scale))
         if self.coarse_first:
@@ -462,13 +434,10 @@ class SeedsAndGrowth:
         std = epipolar_distance_std(fit.F, fit.covariance, xy1, position)
         band = np.fmax(self.band_rel * long_side, 3.0 * std)  # HZ 11.11; NaN: a method without covariance
         index, score, second_best = _match_guided(
-            view1.pyramid,
-            (xy1, scale1),
-            (affine, position, radius),
-            (view2.features.xy, view2.features.scale, view2.patches),
-            view2.cells,
+            view1.pyramid, (xy1, scale1), (affine, position, radius),
+            (view2.features.xy, view2.features.scale, view2.patches), view2.cells,
             (fit.F, band, MIN_CORRELATION),
-        )
+        )  # fmt: skip
         index[1.0 - score > self.grown_ratio**2 * (1.0 - second_best)] = -1
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]

@@ -6,16 +6,18 @@ made from the images themselves. Verified pairs that match repeated structure ar
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.arrays import B8, F32, F64, I64, rows_of_views
 from thesisrecon.errors import UsageError, require_at_least
-from thesisrecon.matching._prepared import MapAll
+from thesisrecon.matching._prepared import MapAll, select_found
 from thesisrecon.matching._seeds import mutual_best
 from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 
@@ -29,8 +31,7 @@ FEW_VIEWS = 40
 STRONG = 0.1
 """A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
 views."""
-MAX_STEPS = 5
-"""Maximum number of strong pairs on the shortest path between two views of the same place."""
+MAX_STEPS = 5  # maximum number of strong pairs on the shortest path between two views of the same place
 
 
 def _pair_array(pairs: Iterable[Iterable[int]]) -> I64:
@@ -67,9 +68,8 @@ class SequenceWindow:
 
     def __post_init__(self) -> None:
         if self.window < 1:
-            raise ValueError(
-                f"window (number of following images to match) must be at least 1; got {self.window}"
-            )
+            rule = "window (number of following images to match) must be at least 1"
+            raise ValueError(f"{rule}; got {self.window}")
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
@@ -153,14 +153,10 @@ class OverlapEstimate:
     most: int = 10
     spread: int = 2
 
-    # Number of images up to which all pairs are taken.
-    all_up_to = 30
-    # Minimum -log10 of the number of false alarms.
-    min_evidence = 0.5
-    # Number of images that each is compared with.
-    shortlist = 30
-    # Largest size of the vocabulary; an eighth of the patches of the images if that is less.
-    words = 65536
+    all_up_to = 30  # number of images up to which all pairs are taken
+    min_evidence = 0.5  # minimum -log10 of the number of false alarms
+    shortlist = 30  # number of images that each is compared with
+    words = 65536  # largest size of the vocabulary; an eighth of the patches of the images if that is less
 
     def __post_init__(self) -> None:
         require_at_least(self, nearest=1, most=1, spread=0)
@@ -171,13 +167,13 @@ class OverlapEstimate:
         """See `thesisrecon.config.PairSelector.select`."""
         n = len(names)
         if n <= self.all_up_to:
-            how = f"all pairs (at most {self.all_up_to} images)"
-            return PairChoice(_pair_array(combinations(range(n), 2)), how)
+            every = _pair_array(combinations(range(n), 2))
+            return PairChoice(every, f"all pairs (at most {self.all_up_to} images)")
         subsets = map_all(self._subsets, features)
         if n - 1 <= self.shortlist:
             words, compared = scipy.sparse.csr_array((n, 1)), _pair_array(combinations(range(n), 2))
         else:
-            kinds = [[subset[kind].patches for subset in subsets] for kind in (0, 1)]
+            kinds = ([subset[kind].seeds.patches for subset in subsets] for kind in (0, 1))
             weights = [word_weights(k, self.words, map_all=map_all, rng=rng) for k in kinds]
             words = scipy.sparse.hstack(weights, format="csr")
             compared = _most_similar(words, self.shortlist)
@@ -189,13 +185,11 @@ class OverlapEstimate:
         taken = (rank < self.most) | (steps[1] > steps[0])
         chosen = compared[(enough & taken.any(axis=0)) | (rank < self.nearest).any(axis=0)]
         chosen = _pair_array([*chosen, *_connecting_pairs(chosen, compared, evidence, words)])
-        how = (
-            f"pairs with overlap evidence among {len(compared)} compared pairs, and the best "
-            f"{self.nearest} of each image"
-        )
+        best = f"the best {self.nearest} of each image"
+        how = f"pairs with overlap evidence among {len(compared)} compared pairs, and {best}"
         return PairChoice(chosen, how, compared=len(compared))
 
-    def _subsets(self, features: Features) -> tuple[_FeatureSubset, _FeatureSubset]:
+    def _subsets(self, features: Features) -> tuple[_Subset, _Subset]:
         if features.seeds is None:
             raise UsageError(
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "
@@ -205,10 +199,7 @@ class OverlapEstimate:
 
 
 def _most_similar(words: scipy.sparse.csr_array, count: int) -> I64:
-    """Pairs (M, 2) of each image with the ``count`` most similar ones by word weights (N, W); sorted.
-
-    Only the similarities of some rows are in memory.
-    """
+    """Pairs (M, 2), sorted, of each image with the ``count`` most similar ones by word weights (N, W)."""
     n, pairs, inverted = words.shape[0], list[F64](), words.T.tocsr()
     for first in range(0, n, ROWS_AT_ONCE):
         similarity = (words[first : first + ROWS_AT_ONCE] @ inverted).toarray()
@@ -271,67 +262,60 @@ def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> 
     return int(near.sum(axis=1).max()) - 1
 
 
-@dataclass(frozen=True)
-class _FeatureSubset:
-    """Seeds of one image: px, angles rad, unit patches (S, D), and the extent of all its seeds px."""
+class _Subset(NamedTuple):
+    """Seeds of one image, and the extent px of all its seeds."""
 
-    xy: F64
-    scale: F64
-    angle: F64
-    patches: F32
-    size: F64
+    seeds: Seeds
+    extent: F64
 
 
-def _subset_seeds(seeds: Seeds, *, rotated: bool) -> _FeatureSubset:
+def _subset_seeds(seeds: Seeds, *, rotated: bool) -> _Subset:
     """Select the strongest seeds of each scale, of patches ``rotated`` to their dominant gradient or not."""
     use = np.flatnonzero((seeds.angle != 0.0) == rotated)
     parts = [use[seeds.scale[use] == scale][:PER_SCALE] for scale in np.unique(seeds.scale[use])]
     kept = np.concatenate([np.empty(0, np.int64), *parts])
     extent = np.ptp(seeds.xy, axis=0) + 1.0 if len(seeds.xy) else np.ones(2)
-    return _FeatureSubset(
-        np.ascontiguousarray(seeds.xy[kept]),
-        seeds.scale[kept].astype(np.float64),
-        seeds.angle[kept].astype(np.float64),
-        np.ascontiguousarray(seeds.patches[kept]),
-        extent,
-    )
+    return _Subset(select_found(seeds, kept), extent)
 
 
-def _subsets(seeds: Seeds) -> tuple[_FeatureSubset, _FeatureSubset]:
+def _subsets(seeds: Seeds) -> tuple[_Subset, _Subset]:
+    """Upright and rotated seeds."""
     return _subset_seeds(seeds, rotated=False), _subset_seeds(seeds, rotated=True)
 
 
-def _evidence(a: tuple[_FeatureSubset, _FeatureSubset], b: tuple[_FeatureSubset, _FeatureSubset]) -> float:
+def _evidence(a: tuple[_Subset, _Subset], b: tuple[_Subset, _Subset]) -> float:
     upright = _overlap_evidence(a[0], b[0])
     # One false alarm in a million: the rotated patches are not compared.
     return upright if upright >= 6.0 else max(upright, _overlap_evidence(a[1], b[1]))
 
 
-def _overlap_evidence(a: _FeatureSubset, b: _FeatureSubset) -> float:
+def _overlap_evidence(a: _Subset, b: _Subset) -> float:
     """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms.
 
     M B(M - 1, k, p) for M matches, k that agree with the best similarity and p the relative area around a
     prediction, with B the tail of the binomial distribution (A. Desolneux, L. Moisan and J.-M. Morel,
     "Meaningful alignments", IJCV 40, 2000). 0 means one false alarm is expected.
     """
-    one, two = _match_subsets(a, b)
+    one, two = _match_subsets(a.seeds, b.seeds)
     if len(one) < 2:
         return -float(np.log10(max(len(one), 1)))
     # Position (wide because of parallax and perspective), log scale and angle, rad.
-    radius = 0.1 * float(b.size.max())
-    limits, scale = np.array([radius, 0.8, 0.8]), b.scale[two] / a.scale[one]
-    k = _count_agreeing(a.xy[one], b.xy[two], scale, b.angle[two] - a.angle[one], limits)
-    chance = min(1.0, np.pi * radius**2 / float(np.prod(b.size)))
+    radius = 0.1 * float(b.extent.max())
+    first, second = select_found(a.seeds, one), select_found(b.seeds, two)
+    scale = np.divide(second.scale, first.scale, dtype=np.float64)
+    turn = np.subtract(second.angle, first.angle, dtype=np.float64)
+    k = _count_agreeing(first.xy, second.xy, scale, turn, np.array([radius, 0.8, 0.8]))
+    chance = min(1.0, np.pi * radius**2 / float(np.prod(b.extent)))
     tail = float(scipy.special.bdtrc(k - 1, len(one) - 1, chance)) if k > 0 else 1.0
     # The tail may underflow.
     return -(float(np.log10(len(one))) + max(float(np.log10(max(tail, 1e-320))), -300.0))
 
 
-def _match_subsets(a: _FeatureSubset, b: _FeatureSubset) -> tuple[I64, I64]:
+def _match_subsets(a: Seeds, b: Seeds) -> tuple[I64, I64]:
     if not (len(a.xy) and len(b.xy)):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     correlation = a.patches @ b.patches.T
-    apart2 = ((8.0 * b.scale) ** 2).astype(np.float32)
+    apart2 = (8.0 * b.scale) ** 2
     index, value, second_best = mutual_best([correlation], b.xy.astype(np.float32), apart2)
     one = np.flatnonzero(index >= 0)
     value, second_best = value[one], second_best[one]
@@ -366,8 +350,7 @@ def word_weights(
     return scipy.sparse.csr_array((weight, (image, word)), (len(patches), vocabulary[1][:, :, 0].size))
 
 
-_Vocabulary = tuple[F32, F32]
-"""Unit centres (B, D) of branches, and of the words (B, B, D) of each."""
+_Vocabulary = tuple[F32, F32]  # unit centres (B, D) of branches, and of the words (B, B, D) of each
 
 
 def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Generator) -> _Vocabulary:
@@ -375,12 +358,9 @@ def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Gen
     branches = max(int(np.sqrt(words)), 1)
     sample = patches[rng.permutation(len(patches))[: 8 * branches**2]]
     top = _centres(sample, branches)
-    branch = np.argmax(sample @ top.T, axis=1)
+    inside = rows_of_views(np.argmax(sample @ top.T, axis=1), branches)
     leaves = np.repeat(top[:, None], branches, axis=1)
-    inside = [sample[branch == b] for b in range(branches)]
-    used = [b for b in range(branches) if len(inside[b])]
-    found = map_all(lambda b: _centres(inside[b], branches), used)
-    for b, centres in zip(used, found, strict=True):
+    for b, centres in enumerate(map_all(lambda rows: _centres(sample[rows], branches), inside)):
         leaves[b, : len(centres)] = centres
     return top, leaves
 
@@ -388,7 +368,7 @@ def _vocabulary(patches: F32, words: int, *, map_all: MapAll, rng: np.random.Gen
 def _centres(sample: F32, count: int) -> F32:
     """Centres (at most ``count``, D) of spherical k-means, initialised by the first rows."""
     centres = sample[:count]
-    for _ in range(4):
+    for _ in range(4 if len(sample) else 0):
         nearest = np.argmax(sample @ centres.T, axis=1)
         order = np.argsort(nearest, kind="stable")
         found, start = np.unique(nearest[order], return_index=True)
@@ -403,12 +383,10 @@ def _words_of(patches: F32, vocabulary: _Vocabulary) -> I64:
     top, leaves = vocabulary
     if not len(patches):
         return np.empty(0, np.int64)
-    branch = np.argmax(patches @ top.T, axis=1)
-    order = np.argsort(branch, kind="stable")
-    found, start = np.unique(branch[order], return_index=True)
-    word = np.empty(len(patches), np.int64)
-    for b, rows in zip(found, np.split(order, start[1:]), strict=True):
-        word[rows] = b * len(top) + np.argmax(patches[rows] @ leaves[b].T, axis=1)
+    branch, word = np.argmax(patches @ top.T, axis=1), np.empty(len(patches), np.int64)
+    for b, rows in enumerate(rows_of_views(branch, len(top))):
+        if len(rows):
+            word[rows] = b * len(top) + np.argmax(patches[rows] @ leaves[b].T, axis=1)
     return word
 
 
@@ -429,7 +407,7 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     steps = _steps_within(graph + graph.T, np.unique(i[~strong]), MAX_STEPS)
     weak = ~strong & (group[i] == group[j])
-    apart = set(zip(i[weak].tolist(), j[weak].tolist(), strict=True)) - set(map(tuple, steps.tolist()))
+    apart = {*map(tuple, np.column_stack([i, j])[weak].tolist())} - {*map(tuple, steps.tolist())}
     reason = (
         "its {} matches are few compared with those of each image's best pair, and "
         f"at least {MAX_STEPS + 1} strong pairs separate the images: probably repeated structure"
@@ -466,10 +444,7 @@ def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:
 
 
 def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView], most: int) -> list[int]:
-    """Numbers of the rejected pairs that would connect the groups of matched images, of most evidence first.
-
-    Each image outside the largest group is in at most ``most``, those with the strongest overlap evidence.
-    """
+    """Rejected pairs that would connect matched groups, likeliest first; ``most`` of an outer image."""
     if not most:
         return []
     accepted = [(pair.i, pair.j) for pair in two_views if pair.accepted]
@@ -477,12 +452,11 @@ def pairs_to_connect(features: Sequence[Features], two_views: Sequence[TwoView],
     between = [n for n, pair in enumerate(two_views) if group[pair.i] != group[pair.j]]
     subsets = {v: _subsets(f.seeds) for v, f in enumerate(features) if f.seeds is not None and between}
     evidence = {n: _evidence(subsets[two_views[n].i], subsets[two_views[n].j]) for n in between}
-    chosen = set[int]()
-    outside = np.flatnonzero(group != np.argmax(np.bincount(group))).tolist()
-    of_view: dict[int, list[int]] = {view: [] for view in outside}
-    for n in between:
-        for view in of_view.keys() & {two_views[n].i, two_views[n].j}:
-            of_view[view].append(n)
-    for numbers in of_view.values():
-        chosen.update(sorted(numbers, key=lambda n: -evidence[n])[:most])
-    return sorted(chosen, key=lambda n: (-evidence[n], n))
+    best_first = sorted(between, key=lambda n: (-evidence[n], n))
+    chosen, taken, largest = list[int](), Counter[int](), np.argmax(np.bincount(group))
+    for n in best_first:
+        ends = [view for view in (two_views[n].i, two_views[n].j) if group[view] != largest]
+        if any(taken[view] < most for view in ends):
+            chosen.append(n)
+        taken.update(ends)
+    return chosen

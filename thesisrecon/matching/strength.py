@@ -21,8 +21,7 @@ from thesisrecon.matching._prepared import (
 from thesisrecon.matching.track_alignment import align_matches
 from thesisrecon.records import Features, Image, Matches
 
-# Tolerance of the relative difference of two displacements.
-TOLERANCE = 0.3
+TOLERANCE = 0.3  # tolerance of the relative difference of two displacements
 
 
 @kernel
@@ -49,12 +48,9 @@ def _relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) 
 
 @kernel
 def _strength_of_match(
-    correlation: F32,
-    xy: tuple[F64, F64],
-    near: tuple[I64, I64],
-    search: tuple[float, int, float],
+    correlation: F32, xy: tuple[F64, F64], near: tuple[I64, I64], search: tuple[float, int, float],
     tolerance: float,
-) -> tuple[I64, F32]:
+) -> tuple[I64, F32]:  # fmt: skip
     """Corner of image 2 of largest strength SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1), and SM; -1: none.
 
     ``correlation`` (N1, N2); ``near`` = neighbours (N1, M) and (N2, N) of each corner in its image, -1 for
@@ -100,12 +96,9 @@ def _best_candidates(
 
 @kernel
 def _neighbours_agree(
-    correlation: F32,
-    xy: tuple[F64, F64],
-    near: tuple[I64, I64],
-    pair: tuple[int, int],
+    correlation: F32, xy: tuple[F64, F64], near: tuple[I64, I64], pair: tuple[int, int],
     rule: tuple[float, float],
-) -> float:
+) -> float:  # fmt: skip
     """sum_m max_n (c_mn lambda_n) of one pair of corners, figure 4.3 step 1 (a) i."""
     xy1, xy2 = xy
     u, v = pair
@@ -176,9 +169,8 @@ class StrengthOfMatch:
 
     def __post_init__(self) -> None:
         if self.candidates < 1 or self.neighbours < 1:
-            raise ValueError(
-                f"candidates and neighbours must be at least 1; got {self.candidates} and {self.neighbours}"
-            )
+            got = f"{self.candidates} and {self.neighbours}"
+            raise ValueError(f"candidates and neighbours must be at least 1; got {got}")
         if self.window < 3 or self.window % 2 == 0:
             raise ValueError(f"window must be odd and at least 3; got {self.window}")
         if not self.radius_rel > 0.0:
@@ -191,14 +183,9 @@ class StrengthOfMatch:
         return prepare_image(image, features, window=self.window, colour=self.colour)
 
     def match(
-        self,
-        view1: PreparedImage,
-        view2: PreparedImage,
-        *,
-        pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental,
-        rng: np.random.Generator,
-    ) -> Matches:
+        self, view1: PreparedImage, view2: PreparedImage, *, pair: tuple[int, int],
+        estimate_fundamental: EstimateFundamental, rng: np.random.Generator,
+    ) -> Matches:  # fmt: skip
         """See `thesisrecon.config.Matcher.match`."""
         del estimate_fundamental, rng
         if min(len(view1.features.xy), len(view2.features.xy)) < 2:
@@ -209,12 +196,9 @@ class StrengthOfMatch:
         near1 = _nearest(xy1, self.neighbours, radius)
         near2 = _nearest(xy2, self.neighbours + self.neighbours // 2, radius)
         index, strength = _strength_of_match(
-            correlation,
-            (xy1, xy2),
-            (near1, near2),
-            (radius, self.candidates, self.min_correlation),
+            correlation, (xy1, xy2), (near1, near2), (radius, self.candidates, self.min_correlation),
             TOLERANCE if self.weight == "relative-difference" else 0.0,
-        )
+        )  # fmt: skip
         index[strength < self.min_strength * self.neighbours] = -1
         rows = one_to_one(index, strength)
         two = index[rows]

@@ -39,11 +39,9 @@ with anything and passes a correlation threshold."""
 
 @kernel
 def _align_windows(
-    view1: tuple[F32, I64, float],
-    view2: tuple[F32, I64, float],
-    matches: tuple[F64, F32, F64, F64],
+    view1: tuple[F32, I64, float], view2: tuple[F32, I64, float], matches: tuple[F64, F32, F64, F64],
     limits: tuple[int, float, float, float],
-) -> tuple[F64, F64, F32]:
+) -> tuple[F64, F64, F32]:  # fmt: skip
     """Align the window around each ``xy1`` with image 2, invariant to gain and bias.
 
     ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
@@ -78,11 +76,9 @@ def _align_windows(
         if d <= 1e-4 * normal[0, 0] * normal[1, 1]:
             continue
         value = _iterate(
-            (pixels2, levels2[k2], to2),
-            (template, gradient, normal, window, raster),
-            (xy2[n], affine[n]),
+            (pixels2, levels2[k2], to2), (template, gradient, normal, window, raster), (xy2[n], affine[n]),
             (iterations, affine_std, max_shift * size * m, size),
-        )
+        )  # fmt: skip
         # Variance of the position: that of a sample times the trace of the inverse normal matrix.
         variance = (1.0 - value * value) / SAMPLES * ((normal[0, 0] + normal[1, 1]) / d)
         if value == 0.0 or variance > largest_std * largest_std:
@@ -97,14 +93,9 @@ def _align_windows(
 # Inlined, as the next two kernels: they are called for every window or step.
 @kernel(forceinline=True)
 def _read_template(
-    pixels: F32,
-    level: I64,
-    to_level: float,
-    place: tuple[F64, float],
-    wide: tuple[F32, F32],
-    inner: F32,
+    pixels: F32, level: I64, to_level: float, place: tuple[F64, float], wide: tuple[F32, F32], inner: F32,
     out: tuple[F32, F32],
-) -> bool:
+) -> bool:  # fmt: skip
     """Sample the normalised window of image 1 and its derivatives by the unknowns.
 
     ``place`` = xy, sample spacing in px; ``wide`` = buffer and raster of a wider window, ``inner`` the raster
@@ -170,11 +161,9 @@ def _normal_matrix(gradient: F32) -> F64:
 
 @kernel(forceinline=True)
 def _iterate(
-    level2: tuple[F32, I64, float],
-    template: tuple[F32, F32, F64, F32, F32],
-    found: tuple[F64, F64],
+    level2: tuple[F32, I64, float], template: tuple[F32, F32, F64, F32, F32], found: tuple[F64, F64],
     limits: tuple[int, float, float, float],
-) -> float:
+) -> float:  # fmt: skip
     """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
 
     ``template`` = window of image 1, derivatives, normal matrix, buffer and raster of the window of image 2;
@@ -247,13 +236,9 @@ def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
 
 
 def align_corners(
-    view1: PreparedImage,
-    view2: PreparedImage,
-    matches: tuple[F64, F32, F64, F64],
-    *,
-    affine_std: float,
+    view1: PreparedImage, view2: PreparedImage, matches: tuple[F64, F32, F64, F64], *, affine_std: float,
     max_shift: float = 3.0,
-) -> tuple[F64, F64, F32]:
+) -> tuple[F64, F64, F32]:  # fmt: skip
     """Align corners of image 1 with image 2 to sub-pixel positions.
 
     Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and

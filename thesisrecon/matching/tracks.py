@@ -13,13 +13,12 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
-from thesisrecon.matching._prepared import MapAll, PreparedImage
+from thesisrecon.matching._prepared import MapAll, PreparedImage, select_found
 from thesisrecon.matching.track_alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.optimize.bundle.observations import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
-MERGE_PX = 1.0
-"""Default distance up to which positions become one corner: their noise from pair to pair."""
+MERGE_PX = 1.0  # default distance up to which positions become one corner: their noise from pair to pair
 Pair = TypeVar("Pair", Matches, TwoView)
 
 
@@ -105,10 +104,7 @@ def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle:
 
 @dataclass(frozen=True)
 class _Chains:
-    """Corners ``view, corner, track`` (K,), ``xy`` (K, 2), sorted by track and view.
-
-    ``edges`` (E, 2) are the two observations of each match, ``count`` is the number of tracks.
-    """
+    """Corners sorted by track and view, (K,) each, and the two observations (E, 2) of each match."""
 
     view: I64
     corner: I64
@@ -126,12 +122,9 @@ def _link_matches(corners: Sequence[F64], pairs: Sequence[TwoView]) -> _Chains:
     ends = [np.stack([first[p.i] + p.index1, first[p.j] + p.index2], 1) for p in pairs]
     edges = np.concatenate([np.empty((0, 2), np.int64), *ends])
     parent = _union_corners(edges, view_of, len(corners))
-    used, size = np.unique(parent, return_counts=True)
-    root = used[size >= 2]
-    node = np.flatnonzero(np.isin(parent, root))
-    track = np.searchsorted(root, parent[node])
-    order = np.lexsort((node, track))
-    node, track = node[order], track[order]
+    node = np.flatnonzero(np.bincount(parent, minlength=len(parent))[parent] >= 2)
+    node = node[np.argsort(parent[node], kind="stable")]
+    root, track = np.unique(parent[node], return_inverse=True)
     xy = np.concatenate([*corners, np.empty((0, 2))])[node]
     observation = np.full(first[-1], -1, np.int64)
     observation[node] = np.arange(len(node))
@@ -139,10 +132,7 @@ def _link_matches(corners: Sequence[F64], pairs: Sequence[TwoView]) -> _Chains:
 
 
 def _affines_from_middle_view(chains: _Chains, pairs: Sequence[TwoView]) -> tuple[F64, F64, I64]:
-    """Position (K, 2) px and map (K, 2, 2) of observations, chained from the middle one of their track (K,).
-
-    The middle observation has most matches in the track.
-    """
+    """Position (K, 2) px, map (K, 2, 2) and middle (K,), of most matches in the track, of observations."""
     xy, edges = chains.xy, chains.edges
     if not len(edges):
         return xy, np.tile(np.eye(2), (len(xy), 1, 1)), np.arange(len(xy))
@@ -201,12 +191,7 @@ class AlignedTracks:
     """
 
     def build(
-        self,
-        prepared: Sequence[PreparedImage],
-        pairs: Sequence[TwoView],
-        *,
-        map_all: MapAll,
-        rng: np.random.Generator,
+        self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator
     ) -> Tracks:
         """See `thesisrecon.config.TrackBuilder.build`."""
         accepted = _best_first(pairs)
@@ -219,14 +204,9 @@ class AlignedTracks:
 
         def align(groups: Sequence[tuple[int, int, I64]]) -> None:
             for i, j, group in groups:
-                view1, corner = prepared[i], chains.corner[middle[group]]
-                matches = (
-                    view1.features.xy[corner],
-                    view1.features.scale[corner],
-                    start[group],
-                    affine[group],
-                )
-                found, _, score = align_corners(view1, prepared[j], matches, affine_std=AFFINE_STD)
+                corner = select_found(prepared[i].features, chains.corner[middle[group]])
+                matches = corner.xy, corner.scale, start[group], affine[group]
+                found, _, score = align_corners(prepared[i], prepared[j], matches, affine_std=AFFINE_STD)
                 xy[group], kept[group] = found, score >= MIN_CORRELATION
 
         groups = _groups(chains.view[middle], chains.view, len(prepared))
@@ -257,26 +237,17 @@ def corners_from_matches(
     does not depend on the order of the pairs, and the pairs with ``index1`` and ``index2``. A corner is at
     most once in a pair: only its match with the least distances from the corners stays.
     """
-    ends = [end for p in pairs for end in ((p.i, p.xy1), (p.j, p.xy2))]
-    corners, index = _number_positions(ends, n_views, merge_px)
-    return corners, [
-        _numbered_pair(pair, corners, index[2 * n], index[2 * n + 1]) for n, pair in enumerate(pairs)
-    ]
-
-
-def _number_positions(
-    ends: Sequence[tuple[int, F64]], n_views: int, merge_px: float
-) -> tuple[list[F64], list[I64]]:
-    """Corners of every view, and the corner (M,) of each position of the ``ends`` (view, xy)."""
-    index, corners = [np.empty(0, np.int64)] * len(ends), []
-    for here in rows_of_views(np.array([view for view, _ in ends], dtype=np.int64), n_views):
-        xy = np.concatenate([np.empty((0, 2)), *(ends[n][1] for n in here)])
-        found, number = _merge_positions(xy, merge_px)
+    ends = [xy for p in pairs for xy in (p.xy1, p.xy2)]
+    lengths = [len(xy) for xy in ends]
+    view = np.repeat(np.array([i for p in pairs for i in (p.i, p.j)], dtype=np.int64), lengths)
+    xy, number = np.concatenate([np.empty((0, 2)), *ends]), np.empty(len(view), np.int64)
+    corners = []
+    for rows in rows_of_views(view, n_views):
+        found, number[rows] = _merge_positions(xy[rows], merge_px)
         corners.append(found)
-        parts = np.split(number, np.cumsum([len(ends[n][1]) for n in here]))
-        for n, part in zip(here, parts, strict=False):
-            index[n] = part
-    return corners, index
+    index = np.split(number, np.cumsum(lengths))
+    each = zip(pairs, index[::2], index[1::2], strict=False)
+    return corners, [_numbered_pair(pair, corners, one, two) for pair, one, two in each]
 
 
 def _numbered_pair(pair: Pair, corners: Sequence[F64], index1: I64, index2: I64) -> Pair:
@@ -339,12 +310,5 @@ def _tracks(chains: _Chains, xy: F64, kept: B8, n_views: int) -> Tracks:
     sizes = np.bincount(chains.track[kept], minlength=chains.count)
     use = kept & (sizes[chains.track] >= 2)
     number = np.cumsum(sizes >= 2) - 1
-    point, view, position = number[chains.track[use]], chains.view[use], xy[use]
-    order = np.lexsort((view, point))
-    return Tracks(
-        view_index=view[order].astype(np.int64),
-        point_index=point[order].astype(np.int64),
-        xy=np.ascontiguousarray(position[order]),
-        n_views=n_views,
-        n_points=int((sizes >= 2).sum()),
-    )
+    # Chains are sorted by track and view.
+    return Tracks(chains.view[use], number[chains.track[use]], xy[use], n_views, int((sizes >= 2).sum()))

@@ -32,15 +32,7 @@ from thesisrecon.optimize.bundle.metric import (
     refine_metric_bundle,
 )
 from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.optimize.bundle.scatter import (
-    BlockScatter,
-    LinearisedFit,
-    PoseUncertainty,
-    block_scatter,
-    linearise_fit,
-    point_blocks,
-    pose_uncertainty,
-)
+from thesisrecon.optimize.bundle.scatter import LinearisedFit, linearise_fit, point_blocks
 from thesisrecon.optimize.noise import best_huber_width, noise_from_distances
 from thesisrecon.records import IntrinsicsPrior
 
@@ -82,12 +74,9 @@ class MetricAdjustment:
     ) -> BundleOptions:
         """Weights and loss for the noise of a model."""
         return BundleOptions(
-            sigma_px=self.inflation * model.sigma_px,
-            loss_px=model.loss_sigmas * model.sigma_px,
-            max_iterations=iterations,
-            settled=settled,
-            threads=self.threads,
-        )
+            sigma_px=self.inflation * model.sigma_px, loss_px=model.loss_sigmas * model.sigma_px,
+            max_iterations=iterations, settled=settled, threads=self.threads,
+        )  # fmt: skip
 
     def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:
         """Prior of each row of ``model.cameras.intrinsics``, 8 columns."""
@@ -105,72 +94,38 @@ class MetricAdjustment:
         std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (dof + 2.0)), 0.0))
         unknown = ~np.isfinite(mean)
         mean[unknown] = model.cameras.intrinsics[unknown]
-        kinds = self.hierarchical
-        if kinds is None:
-            return IntrinsicsPrior.unshared(mean, std)
-        return IntrinsicsPrior.unshared(mean, std, kind=kinds.kind, spread=kinds.spread)
+        kinds = {} if self.hierarchical is None else vars(self.hierarchical)
+        return IntrinsicsPrior.unshared(mean, std, **kinds)
 
     def free(self, model: MetricEstimate) -> B8:
         """Which of the 8 intrinsics are estimated in some camera."""
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
-        self,
-        model: MetricEstimate,
-        *,
-        free: B8 | None = None,
-        fixed: B8 | None = None,
-        iterations: int = MAX_ITERATIONS,
-        settled: float = ROUND_SETTLED,
-        keep_noise: bool = False,
-    ) -> tuple[MetricEstimate, MetricBundleResult]:
-        """Adjust the model to its inliers, by default all that the prior leaves ``free``; measure noise.
-
-        ``fixed`` (V,) cameras do not move. With ``keep_noise`` the noise stays that of the
-        adjustment, and the result is its minimum.
-        """
-        prior, moves = self.row_prior(model), self.free(model)
+        self, model: MetricEstimate, *, free: B8 | None = None, fixed: B8 | None = None,
+        iterations: int = MAX_ITERATIONS, settled: float = ROUND_SETTLED, keep_noise: bool = False,
+    ) -> tuple[MetricEstimate, MetricBundleResult]:  # fmt: skip
+        """Adjust the model to its inliers, all that is ``free`` but ``fixed`` (V,) cameras; measure noise."""
+        moves, options = self.free(model), self.options(model, iterations=iterations, settled=settled)
         result = refine_metric_bundle(
-            model.cameras,
-            model.X,
-            _inlier_observations(model),
-            free=moves if free is None else moves & free,
-            prior=prior,
-            options=self.options(model, iterations=iterations, settled=settled),
-            fixed=fixed,
-        )
+            model.cameras, model.X, _inlier_observations(model), free=moves if free is None else moves & free,
+            prior=self.row_prior(model), options=options, fixed=fixed,
+        )  # fmt: skip
         model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)
         if keep_noise:
             return model, result
         norms = np.linalg.norm(result.residual_px, axis=1)
         sigma = max(noise_from_distances(norms), self.noise_floor_px)
         width = best_huber_width(np.abs(result.residual_px).ravel(), sigma)
-        model = replace(
-            model,
-            sigma_px=sigma,
-            # For a larger width it is least squares.
-            loss_sigmas=min(width / sigma, 20.0),
-            tail=tail_width(norms, sigma),
-        )
-        return model, result
+        # For a larger width it is least squares.
+        loss, tail = min(width / sigma, 20.0), tail_width(norms, sigma)
+        return replace(model, sigma_px=sigma, loss_sigmas=loss, tail=tail), result
 
-    def scatter(self, model: MetricEstimate) -> BlockScatter:
-        """Covariance of the cameras, and the scatter of their estimates between blocks of the scene."""
-        return block_scatter(self._linearised(model))
-
-    def poses(self, model: MetricEstimate) -> PoseUncertainty:
-        """Covariance of the poses, and what the intrinsics and faults of the camera model change in them."""
-        return pose_uncertainty(self._linearised(model))
-
-    def _linearised(self, model: MetricEstimate) -> LinearisedFit:
-        return linearise_fit(
-            model.cameras,
-            model.X,
-            _inlier_observations(model),
-            free=self.free(model),
-            prior=self.row_prior(model),
-            noise=(self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px),
-        )
+    def linearised(self, model: MetricEstimate) -> LinearisedFit:
+        """The linearised adjustment of a model at its minimum."""
+        noise = self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
+        seen, free, prior = _inlier_observations(model), self.free(model), self.row_prior(model)
+        return linearise_fit(model.cameras, model.X, seen, free=free, prior=prior, noise=noise)
 
 
 def _shares_a_lens(model: MetricEstimate) -> B8:
@@ -211,10 +166,7 @@ def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
 
 
 def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:
-    """Columns of intrinsics with one value per image, from the simplest richer camera model on.
-
-    Every model that frees all ``contradicted`` (8,) columns; known values stay known.
-    """
+    """Columns with one value per image that contain the ``contradicted`` (8,) ones, simplest model first."""
     if not contradicted.any():
         return
     unknown, richer = np.flatnonzero((prior.std > 0.0).any(axis=0)), (CENTRE, (FOCAL,), (FOCAL, *CENTRE))
@@ -239,10 +191,7 @@ def with_own_values(
 
 
 def held_out_observations(model: MetricEstimate) -> I64:
-    """Inliers of every fifth block of neighbouring points, other blocks in each view.
-
-    Correlated errors would carry over from the nearest neighbours; points keep two or more observations.
-    """
+    """Inliers of every fifth block of neighbouring points, others in each view; points keep two or more."""
     t = model.tracks
     count = np.bincount(t.point_index[model.inlier], minlength=t.n_points)
     block = point_blocks(model.X, count > 0)

@@ -8,8 +8,8 @@ which the pipeline replaces by the file name.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -26,7 +26,7 @@ from thesisrecon.metric._model import (
     residual_norms,
 )
 from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
-from thesisrecon.metric._uncertainty import USUAL_INFLATION
+from thesisrecon.metric._uncertainty import USUAL_INFLATION, Intervals
 from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
     excess_equations,
@@ -37,21 +37,18 @@ from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.noise import MAD_FACTOR, noise_from_distances
-from thesisrecon.records import IdentifiabilityReport, IntrinsicInterval, IntrinsicsPrior, SelfCalibration
+from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, SelfCalibration, common_points
 
 MIN_OBSERVATIONS = 30
-MIN_INLIER_RATIO = 0.5
-"""Inlier ratio of a view, wrong matches included."""
-MIN_CONFIRMED_RATIO = 0.6
-"""The same for points that other views determine. Correct cameras reach 0.9 (0.63 in blurred phone images),
-wrong ones stay below 0.5."""
+MIN_INLIER_RATIO, MIN_CONFIRMED_RATIO = 0.5, 0.6
+"""Inlier ratio of a view, wrong matches included, and for points that other views determine: correct cameras
+reach 0.9 (0.63 in blurred phone images), wrong ones stay below 0.5."""
 MIN_JOINED_SHARE = 0.5
 """Share of inliers among the tracks that join two parts of the images: right models reach 0.6, and parts
 joined by matches between similar places stay below 0.45."""
 
 
-@dataclass(frozen=True)
-class PerViewChecks:
+class PerViewChecks(NamedTuple):
     """Measurements of each view (V,), NaN where not registered or not measurable.
 
     ``inlier_ratio`` of the triangulable observations; ``confirmed`` the same for points that two or more
@@ -82,8 +79,7 @@ class PerViewChecks:
 
 def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     """Measure every registered view; ``sigmas`` is the gate of inliers in noise sigmas."""
-    t = model.tracks
-    n = t.n_views
+    t, n = model.tracks, model.tracks.n_views
     agree = inlier_mask(model, sigmas=sigmas)
     near = triangulable_observations(model)
     # Points that are inliers in two or more other views.
@@ -95,12 +91,10 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     rows = rows_of_views(t.view_index, n)
     own = [_own_camera(model, view, k[agree[k]]) for view, k in enumerate(rows)]
     return PerViewChecks(
-        _share(t.view_index, agree, near, n),
-        _share(t.view_index, agree, near & fixed, n),
-        _share(t.view_index, depth <= 0, known, n),
-        _noise_per_view(model, agree),
+        _share(t.view_index, agree, near, n), _share(t.view_index, agree, near & fixed, n),
+        _share(t.view_index, depth <= 0, known, n), _noise_per_view(model, agree),
         *(np.array(column) for column in zip(*own, strict=True)),
-    )
+    )  # fmt: skip
 
 
 def triangulable_observations(model: MetricEstimate) -> B8:
@@ -132,8 +126,7 @@ def _share(view: I64, good: B8, counted: B8, n: int) -> F64:
     return np.where(all_ > 0, right / np.maximum(all_, 1), np.nan)
 
 
-@dataclass(frozen=True)
-class Join:
+class Join(NamedTuple):
     """The ``views`` of the smaller of two parts; ``inliers`` of the ``tracks`` that both parts observe."""
 
     views: I64
@@ -155,18 +148,10 @@ def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
     of nearly coincident cameras are never inliers.
     """
     t, views = model.tracks, np.flatnonzero(model.registered)
-    place = np.full(t.n_views, -1)
-    place[views] = np.arange(len(views))
     k = np.flatnonzero(near)
-    view, point, inlier = place[t.view_index[k]], t.point_index[k], model.inlier[k]
-
-    def common(of: B8) -> scipy.sparse.csr_matrix:
-        seen = scipy.sparse.csr_matrix(
-            (np.ones(int(of.sum())), (view[of], point[of])), (len(views), t.n_points)
-        )
-        return scipy.sparse.triu(seen @ seen.T, 1).tocsr()
-
-    both, agree = common(np.ones(len(k), dtype=bool)), common(inlier).tocoo()
+    view, point, inlier = np.searchsorted(views, t.view_index[k]), t.point_index[k], model.inlier[k]
+    both = scipy.sparse.csr_matrix(common_points(view, point, len(views)))
+    agree = scipy.sparse.triu(common_points(view[inlier], point[inlier], len(views)), 1).tocoo()
     weight = agree.data**2 / np.asarray(both[agree.row, agree.col]).ravel()
     # Of least distances 1 / weight, since the tree of scipy is the minimum one.
     graph = scipy.sparse.csr_matrix((1.0 / weight, (agree.row, agree.col)), both.shape)
@@ -178,15 +163,14 @@ def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
         label = scipy.sparse.csgraph.connected_components(parts, directed=False)[1]
         side = label == label[tree.row[edge]]
         side = side if 2 * side.sum() <= len(side) else ~side
-        tracks = _on_both_sides(side[view], point, t.n_points)
-        agreeing = _on_both_sides(side[view[inlier]], point[inlier], t.n_points)
-        joins.append(Join(views[side], int(agreeing.sum()), int(tracks.sum())))
+        tracks = _on_both_sides(side[view], point)
+        joins.append(Join(views[side], _on_both_sides(side[view[inlier]], point[inlier]), tracks))
     return min(joins, key=lambda join: join.share, default=None)
 
 
-def _on_both_sides(side: B8, point: I64, n: int) -> B8:
-    here, there = (np.bincount(point[rows], minlength=n) > 0 for rows in (side, ~side))
-    return np.asarray(here & there)
+def _on_both_sides(side: B8, point: I64) -> int:
+    here, there = (np.bincount(point[of], minlength=int(point.max()) + 1) > 0 for of in (side, ~side))
+    return int((here & there).sum())
 
 
 def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
@@ -234,11 +218,7 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
 
 
 def self_check(
-    model: MetricEstimate,
-    calibration: SelfCalibration,
-    intervals: Sequence[Mapping[str, IntrinsicInterval]],
-    *,
-    sigmas: float,
+    model: MetricEstimate, calibration: SelfCalibration, intervals: Intervals, *, sigmas: float
 ) -> tuple[dict[str, float], list[str], list[str]]:
     """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
 
@@ -254,8 +234,8 @@ def self_check(
     focals = [intervals[v]["focal_px"] for v in views]
     agree, noise = inlier_mask(model, sigmas=sigmas), residual_norms(model)
     shift = np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest
-    names = ("principal_x_px", "principal_y_px")
-    uncertain = np.array([max(intervals[v][name].std for name in names) for v in views]) / longest
+    centres = [(intervals[v]["principal_x_px"].std, intervals[v]["principal_y_px"].std) for v in views]
+    uncertain = np.max(centres, axis=1) / longest
     change = np.abs(np.log(rows[both, 0] / before[both]))
     check = {
         "focal_min_long_sides": float((rows[:, 0] / longest).min()),
@@ -290,10 +270,7 @@ def self_check(
 
 
 def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:
-    """A sentence for the views that fail a check, and one for those that are only noisy.
-
-    Each view is reported once, for its most severe failure.
-    """
+    """A sentence for the views with each failure, the most severe one of each view, and for noisy views."""
     left = model.registered.copy()
 
     def take(bad: B8) -> I64:
@@ -360,14 +337,11 @@ def returned_cameras(model: MetricEstimate) -> UpgradedCameras:
 
 
 def check_returned(
-    model: MetricEstimate,
-    adjustment: MetricAdjustment,
-    metric: UpgradedCameras,
-    intervals: Sequence[Mapping[str, IntrinsicInterval]],
+    model: MetricEstimate, adjustment: MetricAdjustment, motion: Mapping[str, float], intervals: Intervals
 ) -> IdentifiabilityReport:
     """Check whether the images and the prior determine a model as it is, without adjusting it again.
 
-    The motion is that of all ``metric`` cameras, and the focal lengths are known as the ``intervals`` say.
+    ``motion`` are the measures of all cameras, and the focal lengths are known as the ``intervals`` say.
     Covariances are those of some of the views and observations.
     """
     part = runs_of_views(model)
@@ -384,13 +358,13 @@ def check_returned(
         MetricCameras(c.R[views], c.t[views], c.intrinsics[rows], own, c.shared[rows]),
         model.X,
         Observations(np.searchsorted(views, seen.view_index[used]), seen.point_index[used], seen.xy[used]),
-        IntrinsicsPrior.unshared(prior.mean[rows], prior.std[rows]),
-        max(model.sigma_px, 1e-3),
-        len(used) / max(int(model.inlier.sum()), 1),
-        model.sizes[views].max(axis=1).astype(np.float64),
-        views,
-    )
+        IntrinsicsPrior.unshared(prior.mean[rows], prior.std[rows]), max(model.sigma_px, 1e-3),
+        len(used) / max(int(model.inlier.sum()), 1), model.sizes[views].max(axis=1).astype(np.float64), views,
+    )  # fmt: skip
     focals = [intervals[v]["focal_px"] for v in views.tolist()]
     std = np.array([focal.std / focal.value for focal in focals])
     excess = excess_equations(adjustment.prior, model.registered)
-    return identifiability_report(problem, excess, metric=metric, focal_std=std)
+    everywhere = np.flatnonzero(model.registered)
+    focal = c.intrinsics[c.group[everywhere], FOCAL] / model.sizes[everywhere].max(axis=1)
+    motion = {**motion, "focal_long_sides": float(np.median(focal))}
+    return identifiability_report(problem, excess, motion=motion, focal_std=std)

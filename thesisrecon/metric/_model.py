@@ -19,8 +19,7 @@ from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
 EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
 """Residual gates of the early and the late rounds in noise sigmas."""
-MIN_ANGLE = float(np.radians(0.05))
-"""Smallest triangulation angle of a point."""
+MIN_ANGLE = float(np.radians(0.05))  # smallest triangulation angle of a point
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
 the views; of more than ``MANY_VIEWS`` each view gets the numbers below. A view has ``CELLS`` along a side."""
@@ -69,11 +68,7 @@ def seen_views(tracks: Tracks) -> int:
 
 
 def with_enough_points(model: MetricEstimate) -> MetricEstimate:
-    """The model with a selection of points that cover every image: known points first, then long tracks.
-
-    Up to ``MAX_OBSERVATIONS`` and ``MANY_VIEWS`` all points are used; beyond, the others would add little to
-    the precision of the cameras.
-    """
+    """The model with a selection of points that cover every image: known points first, then long tracks."""
     if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
         return model
     length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
@@ -105,10 +100,7 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
 
 
 def _select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I64:
-    """Select points in the sequence of ``order`` until every view has enough of them in each cell.
-
-    ``per_view`` is the number of points per view if there are more than ``MANY_VIEWS``.
-    """
+    """Select points in the ``order`` until every view (``per_view``) and cell has enough of them."""
     t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
     cell = (t.view_index * CELLS + cell[:, 0]) * CELLS + cell[:, 1]
@@ -171,9 +163,8 @@ def retriangulate_tracks(
     if again.any():
         Y = _triangulate(poses, normalized[again], view[again], point[again], t.n_points, loss)
         better = np.bincount(point[again], minlength=t.n_points) >= 2
-        model = select_inliers(
-            replace(model, X=np.where(better[:, None], Y, X)), sigmas=sigmas, min_angle=min_angle
-        )
+        model = replace(model, X=np.where(better[:, None], Y, X))
+        model = select_inliers(model, sigmas=sigmas, min_angle=min_angle)
     return model
 
 

@@ -38,12 +38,10 @@ observations of :func:`subsample_inliers` are too few for all."""
 OWN_STD = 0.01
 """Deviations of single images that a camera model may leave out: principal points in long sides
 (stabilisation), aspect ratio, and skew over the focal length (rolling shutter)."""
-READOUT_STEP, SMALL = 0.02, 1e-3
-"""Steps of numerical derivatives, in times between consecutive images."""
+READOUT_STEP, SMALL = 0.02, 1e-3  # steps of numerical derivatives, in times between consecutive images
 MIN_FOCAL_DIFFERENCE, MIN_CENTRE_DIFFERENCE = 0.01, 0.015
 """Smaller differences of focals (relative) and principal points (in long sides) are harmless."""
-ZOOM_STD = 0.03
-"""Assumed relative scatter of focals that cannot be tested."""
+ZOOM_STD = 0.03  # assumed relative scatter of focals that cannot be tested
 
 
 def runs_of_views(model: MetricEstimate) -> MetricEstimate:
@@ -72,17 +70,10 @@ _Case = tuple[MetricCameras, F64, Observations, B8, IntrinsicsPrior]
 
 
 def _per_view(
-    model: MetricEstimate,
-    adjustment: MetricAdjustment,
-    columns: tuple[int, ...],
-    *,
-    focal_spread: float = np.inf,
-    own_std: float = np.inf,
-) -> _Case:
-    """Give the views own values in some columns of intrinsics.
-
-    The own values are unknown, or within ``own_std`` of those of the model.
-    """
+    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...], *,
+    focal_spread: float = np.inf, own_std: float = np.inf,
+) -> _Case:  # fmt: skip
+    """Give the views own values in some columns, unknown or within ``own_std`` of those of the model."""
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
     cameras, seen = model.cameras, subsample_inliers(model)
     assert cameras.shared is not None
@@ -103,27 +94,24 @@ def _per_view(
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-    return (
-        MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared),
-        model.X,
-        seen._replace(view_index=np.searchsorted(views, seen.view_index)),
-        free,
-        known,
-    )
+    cameras = MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared)
+    seen = seen._replace(view_index=np.searchsorted(views, seen.view_index))
+    return cameras, model.X, seen, free, known
+
+
+def _adjusted(model: MetricEstimate, adjustment: MetricAdjustment, case: _Case) -> MetricBundleResult:
+    """Adjust a case at the noise of the model, with covariances."""
+    cameras, X, seen, free, prior = case
+    options = replace(adjustment.options(model), covariance=True, noise_floor_px=model.sigma_px)
+    return refine_metric_bundle(cameras, X, seen, free=free, prior=prior, options=options)
 
 
 def _adjust_per_view(
-    model: MetricEstimate,
-    adjustment: MetricAdjustment,
-    columns: tuple[int, ...],
-    *,
-    focal_spread: float = np.inf,
+    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...], spread: float = np.inf
 ) -> MetricBundleResult:
-    """Adjust the views with unknown own values in some columns of intrinsics, with covariances."""
-    cameras, X, seen, free, prior = _per_view(model, adjustment, columns, focal_spread=focal_spread)
-    options = replace(adjustment, inflation=1.0).options(model)
-    options = replace(options, covariance=True, noise_floor_px=model.sigma_px)
-    return refine_metric_bundle(cameras, X, seen, free=free, prior=prior, options=options)
+    """Adjust the views with unknown own values in some columns of intrinsics; ``spread`` of the focals."""
+    case = _per_view(model, adjustment, columns, focal_spread=spread)
+    return _adjusted(model, replace(adjustment, inflation=1.0), case)
 
 
 def focal_std_of_deviations(
@@ -206,9 +194,8 @@ def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustme
     slope, curvature = (high - low) / 2.0, high + low - 2.0 * before.cost
     if not (curvature > 0.0 and _beyond_chance(0.5 * slope**2 / curvature, 1)):
         return 0.0
-    found = scipy.optimize.minimize_scalar(
-        lambda readout: adjusted(readout).cost, bounds=(-1.0, 1.0), method="bounded", options={"xatol": 0.01}
-    )
+    search = {"bounds": (-1.0, 1.0), "method": "bounded", "options": {"xatol": 0.01}}
+    found = scipy.optimize.minimize_scalar(lambda readout: adjusted(readout).cost, **search)
     after = adjusted(float(found.x))
     if not _beyond_chance(before.cost - after.cost, 1):
         return 0.0
@@ -282,7 +269,9 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
     if focals:
         alone = _adjust_per_view(model, adjustment, freed)
         decrease = _beyond_chance(before.cost - alone.cost, sum(s.degrees_of_freedom for s in focals))
-        apart = [s for s in focals if decrease and _focals_apart(alone, s)]
+        own = (np.log(alone.cameras.intrinsics[s.places, FOCAL]) for s in focals)
+        far = [bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE) for log in own]
+        apart = [s for s, differs in zip(focals, far, strict=True) if decrease and differs]
         misfit = max(decrease, 1.0) if not apart else 1.0
         found += [_focals_differ(views, alone, s) for s in apart]
         contradicted[FOCAL] = bool(apart)
@@ -333,15 +322,10 @@ def _focal_std(fit: MetricBundleResult, rows: I64) -> F64:
     return np.where(np.isfinite(std) & (variance > 0.0), np.hypot(std, 2e-3), np.inf)
 
 
-def _focals_apart(alone: MetricBundleResult, s: _SharedGroup) -> bool:
-    log = np.log(alone.cameras.intrinsics[s.places, FOCAL])
-    return bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE)
-
-
 def _std_of_a_kind(model: MetricEstimate, adjustment: MetricAdjustment, s: _SharedGroup) -> float:
     """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
     # Standard deviations are inflated afterwards, the assumed scatter must not be.
-    scattered = _adjust_per_view(model, adjustment, (FOCAL,), focal_spread=ZOOM_STD / USUAL_INFLATION)
+    scattered = _adjust_per_view(model, adjustment, (FOCAL,), ZOOM_STD / USUAL_INFLATION)
     rows = model.cameras.group[np.flatnonzero(model.registered)[s.places]]
     off = np.log(scattered.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
     return float(np.hypot(_focal_std(scattered, s.places), off).max())
@@ -428,12 +412,8 @@ def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F
     shared[known, FOCAL] = shared[:, FOCAL].max() + 1 + alike
     std, free = prior.std.copy(), adjustment.free(model)
     std[:, FOCAL], free[FOCAL] = np.inf, True
-    options = replace(adjustment.options(model), covariance=True, noise_floor_px=model.sigma_px)
-    free_prior = IntrinsicsPrior.unshared(prior.mean, std)
-    result = refine_metric_bundle(
-        replace(cameras, shared=shared), model.X, subsample_inliers(model), free=free, prior=free_prior,
-        options=options,
-    )  # fmt: skip
-    group = cameras.group
+    known_rest, seen = IntrinsicsPrior.unshared(prior.mean, std), subsample_inliers(model)
+    case = (replace(cameras, shared=shared), model.X, seen, free, known_rest)
+    result, group = _adjusted(model, adjustment, case), cameras.group
     deviation = _focal_std(result, np.arange(len(std)))[group]
     return result.cameras.intrinsics[group, FOCAL], deviation, shared[group, FOCAL]

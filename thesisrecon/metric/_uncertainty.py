@@ -25,13 +25,11 @@ from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
 from thesisrecon.optimize.noise import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
 
-USUAL_INFLATION = 4.0
-"""Inflation of standard deviations if it cannot be measured; measured values are 2 to 5."""
+USUAL_INFLATION = 4.0  # inflation of standard deviations if it cannot be measured; measured values are 2 to 5
 MODEL_FLOOR_REL = 1e-3
 """Floor of standard deviations, relative to the focal length, if the data show lack of fit: pixels are square
 to one or two parts in a thousand."""
-MIN_BLOCKS = 4
-"""Fewer blocks give no inflation."""
+MIN_BLOCKS = 4  # fewer blocks give no inflation
 UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
 CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a richer camera model"
 _COLUMNS = {
@@ -39,6 +37,10 @@ _COLUMNS = {
     "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
     "k1": K1, "k2": K1 + 1, "k3": K1 + 2,
 }  # fmt: skip
+
+
+Intervals = Sequence[Mapping[str, IntrinsicInterval]]
+"""Intrinsics of each view by name, as in ``MetricResult``; empty where the view is not registered."""
 
 
 def lack_of_fit(scatter: BlockScatter, tail: float) -> float:
@@ -148,10 +150,7 @@ def apply_hierarchical_prior(
 
 @dataclass(frozen=True)
 class FocalShrinkage:
-    """Per view: relative standard deviation of the focal from its own matches, weight tau^2 / (tau^2 + s^2).
-
-    The weight is 1 without shrinkage.
-    """
+    """Relative deviation (V,) of the focal by own matches; weight tau^2 / (tau^2 + s^2), 1 if alone."""
 
     own_std: F64
     weight: F64
@@ -162,16 +161,10 @@ class FocalShrinkage:
 
     def warnings(self, registered: Sequence[int], least: float) -> tuple[str, ...]:
         """A sentence for each view whose matches determine its focal worse than ``least`` (relative)."""
-        others = np.where(
-            self.weight < 0.5,
-            "; the stated value rests on the other cameras",
-            ", and the other cameras of its kind hardly constrain it",
-        )
-        return tuple(
-            Notice("borrowed-focal", view, self.own_std[view], others[view])
-            for view in registered
-            if self.own_std[view] > least
-        )
+        rests = "; the stated value rests on the other cameras"
+        others = np.where(self.weight < 0.5, rests, ", and the other cameras of its kind hardly constrain it")
+        weak = (view for view in registered if self.own_std[view] > least)
+        return tuple(Notice("borrowed-focal", view, self.own_std[view], others[view]) for view in weak)
 
 
 def focal_shrinkage(
@@ -189,22 +182,15 @@ def focal_shrinkage(
 
 
 def intrinsic_intervals(
-    model: MetricEstimate,
-    adjustment: MetricAdjustment,
-    scatter: BlockScatter,
-    shrinkage: FocalShrinkage,
-) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter, shrinkage: FocalShrinkage
+) -> Intervals:
     """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval."""
     floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
     share = lack_of_fit(scatter, model.tail)
-    answer: list[Mapping[str, IntrinsicInterval]] = []
-    for view in range(len(model.registered)):
-        if not model.registered[view]:
-            answer.append({})
-            continue
-        g = int(model.cameras.group[view])
+    answer: list[dict[str, IntrinsicInterval]] = [{} for _ in model.registered]
+    for view in np.flatnonzero(model.registered).tolist():
+        g, intervals = int(model.cameras.group[view]), answer[view]
         row = model.cameras.intrinsics[g]
-        intervals = {}
         for name, column in _COLUMNS.items():
             value, variance = float(row[column]), float(scatter.variance[g, column])
             if not variance > 0.0:
@@ -219,24 +205,17 @@ def intrinsic_intervals(
                 how = "bundle adjustment; the interval is the camera-model error floor"
                 how += f" of {floor:.1%}" if column == FOCAL else ""
             else:
-                how = (
-                    f"bundle adjustment; standard deviation x {inflation * adjustment.inflation:.1f} "
-                    "from the scatter between blocks of the scene"
-                )
+                factor, why = inflation * adjustment.inflation, "from the scatter between blocks of the scene"
+                how = f"bundle adjustment; standard deviation x {factor:.1f} {why}"
             if column == FOCAL and shrinkage.is_shrunk(view, std):
-                how = (
-                    "shrunk towards the other cameras of its kind; own matches alone: "
-                    f"{shrinkage.own_std[view]:.2%} (1 sigma)"
-                )
+                alone = f"own matches alone: {shrinkage.own_std[view]:.2%} (1 sigma)"
+                how = f"shrunk towards the other cameras of its kind; {alone}"
             std *= row[FOCAL] if column == FOCAL else 1.0
             intervals[name] = IntrinsicInterval(value, float(std), how)
-        answer.append(intervals)
     return tuple(answer)
 
 
-def widen_unverified_focals(
-    intervals: Sequence[Mapping[str, IntrinsicInterval]], focal_std: F64
-) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+def widen_unverified_focals(intervals: Intervals, focal_std: F64) -> Intervals:
     """Widen the intervals of shared focals by the ``focal_std`` (V,) that the images cannot exclude."""
     answer: list[Mapping[str, IntrinsicInterval]] = []
     for own, rel in zip(intervals, focal_std, strict=True):
@@ -247,9 +226,7 @@ def widen_unverified_focals(
     return tuple(answer)
 
 
-def widen_by_camera_model(
-    intervals: Sequence[Mapping[str, IntrinsicInterval]], difference: tuple[float, float], misfit: float
-) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+def widen_by_camera_model(intervals: Intervals, difference: tuple[float, float], misfit: float) -> Intervals:
     """Add the differences to a richer camera model to the standard deviations, or scale these by the misfit.
 
     ``difference`` are those of the focal lengths and of the principal points, over the focal length. If both
@@ -257,28 +234,19 @@ def widen_by_camera_model(
     """
     moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
     factor = 1.0 if any(difference) else np.sqrt(misfit)
-    answer: list[Mapping[str, IntrinsicInterval]] = []
-    for own in intervals:
-        focal = own["focal_px"].value if own else 0.0
-        # The larger part names the interval.
-        wider = {
-            name: IntrinsicInterval(
-                own[name].value,
-                float(np.hypot(factor * own[name].std, off * focal)),
-                CAMERA_MODEL if factor > 1.0 or off * focal > own[name].std else own[name].source,
-            )
-            for name, off in moved.items()
-            if name in own and own[name].std > 0.0 and (off > 0.0 or factor > 1.0)
-        }
-        answer.append({**own, **wider})
+    answer: list[dict[str, IntrinsicInterval]] = [dict(own) for own in intervals]
+    for own in filter(None, answer):
+        for name, rel in moved.items():
+            if name in own and own[name].std > 0.0 and (rel > 0.0 or factor > 1.0):
+                std, off = own[name].std, rel * own["focal_px"].value
+                # The larger part names the interval.
+                source = CAMERA_MODEL if factor > 1.0 or off > std else own[name].source
+                own[name] = replace(own[name], std=float(np.hypot(factor * std, off)), source=source)
     return tuple(answer)
 
 
 def pose_std(
-    model: MetricEstimate,
-    poses: PoseUncertainty,
-    scatter: BlockScatter,
-    intervals: Sequence[Mapping[str, IntrinsicInterval]],
+    model: MetricEstimate, poses: PoseUncertainty, scatter: BlockScatter, intervals: Intervals
 ) -> F64:
     """Standard deviations (V, 6) of rotations and centres as in ``MetricResult.pose_std``.
 

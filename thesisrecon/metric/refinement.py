@@ -8,6 +8,7 @@ cameras of the same kind that are not shared get a hierarchical prior. The resul
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -63,7 +64,12 @@ from thesisrecon.metric._uncertainty import (
     widen_unverified_focals,
 )
 from thesisrecon.optimize.bundle.identifiability import excess_noise
-from thesisrecon.optimize.bundle.scatter import BlockScatter
+from thesisrecon.optimize.bundle.scatter import (
+    BlockScatter,
+    LinearisedFit,
+    block_scatter,
+    pose_uncertainty,
+)
 from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.records import (
     IntrinsicsPrior,
@@ -82,7 +88,14 @@ NOT_EXPLAINED = (
 )
 
 
-_Finished = tuple[MetricEstimate, MetricAdjustment, PerCameraEstimates, BlockScatter]
+class _Finished(NamedTuple):
+    model: MetricEstimate
+    adjustment: MetricAdjustment
+    own: PerCameraEstimates
+    fit: LinearisedFit
+    scatter: BlockScatter
+
+
 _Settled = tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]
 
 
@@ -91,14 +104,9 @@ class MetricRefinement:
     """Metric refinement of a calibrated projective reconstruction (6.7)."""
 
     def refine(
-        self,
-        reconstruction: Reconstruction,
-        calibration: SelfCalibration,
-        *,
-        prior: IntrinsicsPrior,
-        rng: np.random.Generator,
-        threads: int = 1,
-    ) -> MetricResult:
+        self, reconstruction: Reconstruction, calibration: SelfCalibration, *,
+        prior: IntrinsicsPrior, rng: np.random.Generator, threads: int = 1,
+    ) -> MetricResult:  # fmt: skip
         """See `thesisrecon.config.MetricRefiner.refine`."""
         adjustment = MetricAdjustment(prior, lens_std=0.02, noise_floor_px=0.02, threads=threads)
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
@@ -108,9 +116,7 @@ class MetricRefinement:
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
-        reasons = tuple(
-            "" if model.registered[v] else rejected.get(v, "") for v in range(len(model.registered))
-        )
+        reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
         return _assess(settled, reconstruction.tracks, calibration, reasons)
@@ -121,17 +127,18 @@ def _assess(
 ) -> MetricResult:
     """State the intervals of a final model with all ``tracks``, and check it."""
     final, sharing, enlarged, difference = settled
-    model, adjustment, own, scatter = final
+    model, adjustment, own, fit, scatter = final
     shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
     intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
     intervals = widen_unverified_focals(intervals, sharing.focal_std)
     intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
     complete = with_tracks(model, tracks)
-    returned = returned_cameras(complete)
-    critical = nearest_critical_motion(measure_motion(returned))[1] < 1.0
+    motion = measure_motion(returned_cameras(complete))
+    critical = nearest_critical_motion(motion)[1] < 1.0
     deviations = focal_std_of_deviations(model, adjustment, critical=critical, contradicted=bool(enlarged))
     intervals = widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
-    report = check_returned(model, adjustment, returned, intervals)
+    report = check_returned(model, adjustment, motion, intervals)
+    poses = pose_std(model, pose_uncertainty(fit), scatter, intervals)
     model = complete
     check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted.
@@ -143,7 +150,6 @@ def _assess(
         failed_checks.append(Notice("focal-by-camera-model", deviations))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
-    poses = pose_std(final[0], adjustment.poses(final[0]), scatter, intervals)
     return MetricResult(
         _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
         warnings, (*enlarged, *limitations), report, poses,
@@ -192,11 +198,11 @@ def settle_camera_model(simple: _Finished) -> _Settled:
     for columns in richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
-        rich = finish_metric(*with_own_values(*simple[:2], columns))
+        rich = finish_metric(*with_own_values(simple.model, simple.adjustment, columns))
         if remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
             chosen, sharing = rich, check_shared_cameras(*rich[:2])
-            limitations, difference = (differences_of_images(rich[0], columns),), (0.0, 0.0)
-        elif (change := camera_differences(chosen[0], rich[0])).harmless:
+            limitations, difference = (differences_of_images(rich.model, columns),), (0.0, 0.0)
+        elif (change := camera_differences(chosen.model, rich.model)).harmless:
             difference = max(difference[0], change.focal), max(difference[1], change.principal_point)
     if sharing.failed_checks and any(difference):
         limitations += tuple(f"{fact}. {NOT_EXPLAINED}" for fact, _ in sharing.found)
@@ -207,7 +213,7 @@ def settle_camera_model(simple: _Finished) -> _Settled:
 def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finished:
     """Adjust everything, then again with the noise that blocks of the scene show and a hierarchical prior."""
     model = _iterate_inliers(model, adjustment)
-    scatter = adjustment.scatter(model)
+    scatter = block_scatter(adjustment.linearised(model))
     own = per_camera_estimates(model, adjustment, scatter)
     assert model.cameras.shared is not None
     hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
@@ -216,20 +222,15 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     if hierarchical is not None:
         model, adjustment = apply_hierarchical_prior(model, adjustment, hierarchical)
     model = _iterate_inliers(with_expected_centres(model, adjustment.prior), adjustment)
-    alone, scatter = replace(adjustment, hierarchical=None), adjustment.scatter(model)
-    own = per_camera_estimates(model, alone, scatter if hierarchical is None else alone.scatter(model))
-    return model, adjustment, own, scatter
-
-
-def _selected(model: MetricEstimate) -> MetricEstimate:
-    return select_inliers(model, sigmas=LATE_SIGMAS, min_angle=MIN_ANGLE)
+    fit, alone = adjustment.linearised(model), replace(adjustment, hierarchical=None)
+    scatter = block_scatter(fit)
+    single = scatter if hierarchical is None else block_scatter(alone.linearised(model))
+    return _Finished(model, adjustment, per_camera_estimates(model, alone, single), fit, scatter)
 
 
 def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
-    """Adjust and triangulate until the inliers stay the same, then adjust to convergence.
-
-    The noise and the inliers of the result are those of its last adjustment, so that it is their minimum.
-    """
+    """Adjust and triangulate until the inliers stay, then adjust to the minimum of these very inliers."""
+    gate = {"sigmas": LATE_SIGMAS, "min_angle": MIN_ANGLE}
     for _ in range(4):
         before = model.inlier
         model = adjustment.run(model)[0]
@@ -238,8 +239,8 @@ def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> Met
             break
     # Noise and inliers change less each time.
     for _ in range(2):
-        model = adjustment.run(_selected(model))[0]
-    return adjustment.run(_selected(model), settled=SETTLED, keep_noise=True)[0]
+        model = adjustment.run(select_inliers(model, **gate))[0]
+    return adjustment.run(select_inliers(model, **gate), settled=SETTLED, keep_noise=True)[0]
 
 
 def _adjust_to_precise_points(
@@ -260,11 +261,8 @@ def _adjust_to_precise_points(
 
 def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
     if not prior.focal_known.any():
-        return StageFailure(
-            "no candidate calibration gives a metric model",
-            f"{tried} were tried",
-            "take images from more directions",
-        )
+        reason, advice = "no candidate calibration gives a metric model", "take images from more directions"
+        return StageFailure(reason, f"{tried} were tried", advice)
     wide = float(prior.std[prior.focal_known, 0].max())
     return StageFailure(
         "the images contradict the given focal length",

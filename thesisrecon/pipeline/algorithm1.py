@@ -21,9 +21,8 @@ from thesisrecon.pipeline.large_sets import (
     cameras_from_parts,
     from_metric,
     prior_of_views,
-    register_more,
 )
-from thesisrecon.pipeline.left_over import join_left_over, known_cameras
+from thesisrecon.pipeline.left_over import groups_left_over, join_left_over, known_cameras, register_more
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (
     REPLACED_FILES,
@@ -48,19 +47,13 @@ from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run_folder import RunDirectory
 
-ATTEMPTS = 3
-"""Maximum number of initial pairs to try until the self-check passes."""
-MAX_NAMED = 10
-"""Images that one warning names."""
-Source = Mapping[str, str]
-"""Name and digest of the matches or tracks that a run starts from."""
+ATTEMPTS = 3  # maximum number of initial pairs to try until the self-check passes
+MAX_NAMED = 10  # images that one warning names
+Source = Mapping[str, str]  # name and digest of the matches or tracks that a run starts from
 
 
 def algorithm1(job: Job) -> Iterator[RunResult]:
-    """Yield the result after each stage up to ``job.until``; ``StageFailure`` ends it.
-
-    Of images in several groups that do not overlap, the largest group is reconstructed.
-    """
+    """Yield the result of the largest group of images after each stage; ``StageFailure`` ends it."""
     run, front, until = job.run, job.front, job.until
     job.require_images()
     precompile(until, run.workers.threads, run.progress)
@@ -116,11 +109,7 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
 def metric_cameras(
     job: Job, result: RunResult, views: Sequence[Any], pairs: Sequence[TwoView]
 ) -> Iterator[RunResult]:
-    """Reconstruct, calibrate and refine, from other initial pairs until a result is trusted.
-
-    Then register the images that are still missing, with matches of rejected pairs and as models that are
-    joined by common points.
-    """
+    """Calibrate and refine, from other initial pairs until a result is trusted, then add missing images."""
     tried, failures = list[RunResult](), list[StageFailure]()
     for attempt in range(ATTEMPTS):
         # Large sets are divided once.
@@ -158,11 +147,10 @@ def attempt_cameras(
     aligned, keys = None, list[str]()
     if in_parts:
         aligned, keys = cameras_from_parts(job, tracks, pairs, ATTEMPTS)
-    start, known = (
-        (calibrated_part(projective, calibration), calibration)
-        if aligned is None
-        else (aligned, from_metric(aligned, calibration))
-    )
+    if aligned is None:
+        start, known = calibrated_part(projective, calibration), calibration
+    else:
+        start, known = aligned, from_metric(aligned, calibration)
     yield replace(result, metric=refine_metric(job, start, known, attempt, keys))
 
 
@@ -192,20 +180,6 @@ def groups_of(job: Job, pairs: Sequence[TwoView]) -> list[list[int]]:
     return groups if len(groups) > 1 else []
 
 
-def groups_left_over(job: Job, result: RunResult) -> list[list[int]]:
-    """The groups of images that overlap with each other but are not registered in the model of this job."""
-    model = result.best_reconstruction
-    # A projective run may end at the core of a large set.
-    if (
-        model is None
-        or not model.registered.any()
-        or job.until == "projective"
-        or not job.config.images.groups
-    ):
-        return []
-    return image_groups(len(model.registered), pairs_of_group(job, result.pairs), ~model.registered)
-
-
 def run_job(job: Job) -> RunResult:
     """Reconstruct the largest group of images, then the rest; write outputs, of failures too."""
     result, failure = _last_named(job)
@@ -230,11 +204,11 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
     """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
     run, folder, places, further = job.run, job.run.directory.path, dict[int, str](), list[RunResult]()
     known = known_cameras(job.prior, result.metric)
-    pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *groups_left_over(job, result)])
+    pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *_unregistered_groups(job, result)])
     while pending:
         views, name = pending.popleft(), f"group-{len(run.groups) + 2}"
         part, found = _run_group(job, result, name, views, prior_of_views(known, views))
-        pending.extend([views[k] for k in rest] for rest in groups_left_over(part, found))
+        pending.extend([views[k] for k in rest] for rest in _unregistered_groups(part, found))
         if (model := found.best_reconstruction) is not None:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
             further.append(found)
@@ -256,6 +230,15 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
     return replace(_with_group_reasons(result, places), further_models=tuple(further))
 
 
+def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
+    """The groups of images that the model of this job leaves over; none without a model."""
+    model = result.best_reconstruction
+    # A projective run may end at the core of a large set.
+    if model is None or not model.registered.any() or job.until == "projective":
+        return []
+    return groups_left_over(job, pairs_of_group(job, result.pairs), model)
+
+
 def _name_linked_images(job: Job, pairs: Sequence[TwoView], registered: set[int]) -> None:
     """Warn of images in no model that accepted pairs connect with one."""
     ends = {end for p in pairs if p.accepted and {p.i, p.j} & registered for end in (p.i, p.j)}
@@ -267,10 +250,7 @@ def _name_linked_images(job: Job, pairs: Sequence[TwoView], registered: set[int]
 def _run_group(
     whole: Job, result: RunResult, name: str, views: Sequence[int], known: IntrinsicsPrior
 ) -> tuple[Job, RunResult]:
-    """Reconstruct a group as a run of its own, and add its entry to the summary of the whole.
-
-    ``known`` is the prior of its intrinsics, with those that another model determined.
-    """
+    """Reconstruct a group as a run with the prior ``known``; add it to the summary of the whole."""
     directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
     inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
     front = FromRun(whole, views, result.features, result.pairs)
@@ -299,18 +279,12 @@ def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResu
     """The result in which the reason against each image that another model contains is that model."""
 
     def named(found: Reconstruction) -> Reconstruction:
-        reasons = [
-            Notice("other-group", places[i]) if i in places else reason
-            for i, reason in enumerate(found.reasons)
-        ]
-        return replace(found, reasons=tuple(reasons))
+        elsewhere = {i: Notice("other-group", name) for i, name in places.items()}
+        return replace(found, reasons=tuple(elsewhere.get(i, why) for i, why in enumerate(found.reasons)))
 
-    if result.projective is not None:
-        result = replace(result, projective=named(result.projective))
-    if result.metric is not None:
-        metric = replace(result.metric, reconstruction=named(result.metric.reconstruction))
-        result = replace(result, metric=metric)
-    return result
+    projective, metric = result.projective and named(result.projective), result.metric
+    metric = metric and replace(metric, reconstruction=named(metric.reconstruction))
+    return replace(result, projective=projective, metric=metric)
 
 
 @contextmanager

@@ -20,8 +20,7 @@ from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | np.ndarray | Image
 """A file, a uint8 array (H, W), (H, W, 3) or (H, W, 4), or an :class:`Image`."""
-MASK_REACH = 4.0
-"""Half width, in pixels of its scale, of the window that determines the position of a corner."""
+MASK_REACH = 4.0  # half width, in pixels of its scale, of the window that determines the position of a corner
 
 
 def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int) -> TwoView:
@@ -77,19 +76,14 @@ def values_at(pixels: Any, xy: Any) -> Any:
 
 
 def match_views(
-    config: PipelineConfig,
-    view1: Any,
-    view2: Any,
-    pair: tuple[int, int],
-    seed: int,
+    config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int,
     masks: tuple[B8 | None, B8 | None] = (None, None),
-) -> TwoView:
+) -> TwoView:  # fmt: skip
     """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
     rng = stream(seed, "matches", *pair)
     try:
-        matches = config.matching.match(
-            view1, view2, pair=pair, estimate_fundamental=config.epipolar.estimate, rng=rng
-        )
+        estimate = config.epipolar.estimate
+        matches = config.matching.match(view1, view2, pair=pair, estimate_fundamental=estimate, rng=rng)
         if type(config.matching) not in OWN_MATCHERS:
             matches = matches_of(config.matching, matches, pair, (view1, view2))
     except StageFailure as failure:

@@ -25,15 +25,14 @@ from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import tracks_of_part
 from thesisrecon.pipeline.matching import FromImages, report_choice, report_matches, report_tracks
 from thesisrecon.pipeline.run import Batch, Run, stream
-from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView
+from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView, common_points
 from thesisrecon.runtime._run_folder import key_of
 
 PairMatches = I64 | tuple[F64, F64]
 """Matches of a pair: rows (M, 2) of the keypoints of both images, or positions (M, 2) in both images."""
 MAX_OUTSIDE_REL = 0.02
 """Largest distance of a keypoint from its image, in long sides: detectors may pass the border a little."""
-MIN_COMMON_POINTS = 16
-"""Pairs of images with fewer common tracks are not verified."""
+MIN_COMMON_POINTS = 16  # pairs of images with fewer common tracks are not verified
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,8 @@ class Given:
         """The pairs with given matches."""
         pairs = np.array([(m.i, m.j) for m in self.matches], dtype=np.int64).reshape(-1, 2)
         key = job.run.key("pairs", "given", pairs)
-        choice: PairChoice = job.run.cached(
-            "pairs", "choice", key, partial(PairChoice, pairs, "the pairs with matches")
-        )
+        compute = partial(PairChoice, pairs, "the pairs with matches")
+        choice: PairChoice = job.run.cached("pairs", "choice", key, compute)
         report_choice(job, choice)
         return choice
 
@@ -105,10 +103,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Views:
-    """Names and original sizes (V, 2) of the images; the images or their folder, None if not given.
-
-    The sizes are those after EXIF rotation, or with ``as_stored`` those of the pixels in the files.
-    """
+    """Names, original sizes (V, 2) and images (or folder) of a set; sizes are upright or ``as_stored``."""
 
     names: list[str]
     sizes: I64
@@ -172,26 +167,19 @@ def given_matches(
     found: list[Matches] = []
     for key, given in sorted(matches.items()):
         i, j = _pair(key, count, matches)
-        pair = (
-            given if isinstance(given, tuple | list) and len(given) == 2 and np.ndim(given[0]) == 2 else None
-        )
-        if pair is not None:
-            xy1, xy2 = _positions(pair[0], i, views), _positions(pair[1], j, views)
+        where = f"matches of images {i} and {j}"
+        if isinstance(given, tuple | list) and len(given) == 2 and np.ndim(given[0]) == 2:
+            xy1, xy2 = _positions(given[0], i, views), _positions(given[1], j, views)
             if len(xy1) != len(xy2):
-                raise UsageError(
-                    f"matches of images {i} and {j} need as many positions in both images; "
-                    f"got {len(xy1)} and {len(xy2)}"
-                )
-            none = np.full(len(xy1), -1)
-            found.append(_match_record((i, j), none, none, xy1, xy2))
+                rule = "need as many positions in both images"
+                raise UsageError(f"{where} {rule}; got {len(xy1)} and {len(xy2)}")
+            rows = np.full((len(xy1), 2), -1)
+        elif corners is None:
+            raise UsageError(f"{where} are rows of keypoints, but keypoints is None")
         else:
-            if corners is None:
-                raise UsageError(
-                    f"matches of images {i} and {j} are rows of keypoints, but keypoints is None"
-                )
             rows = _rows(given, (i, j), corners)
             xy1, xy2 = corners[i][rows[:, 0]], corners[j][rows[:, 1]]
-            found.append(_match_record((i, j), rows[:, 0], rows[:, 1], xy1, xy2))
+        found.append(_match_record((i, j), rows[:, 0], rows[:, 1], xy1, xy2))
     if not found:
         raise UsageError("there are no matches")
     positions = [bool(len(m.xy1) and m.index1[0] < 0) for m in found]
@@ -199,7 +187,8 @@ def given_matches(
         raise UsageError("matches must all be rows of keypoints or all be positions")
     if any(positions) or corners is None:
         corners, found = corners_from_matches(found, count)
-    return Given(corners, [_forward(m) for m in found])
+    turned = (m if m.i < m.j else _match_record((m.j, m.i), m.index2, m.index1, m.xy2, m.xy1) for m in found)
+    return Given(corners, list(turned))
 
 
 def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
@@ -208,9 +197,8 @@ def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
     except (TypeError, ValueError):
         raise UsageError(f"a key of matches is (i, j), two image numbers; got {key!r}") from None
     if i == j or not (0 <= i < count and 0 <= j < count):
-        raise UsageError(
-            f"matches of images {i} and {j}: two different numbers from 0 to {count - 1} are needed"
-        )
+        rule = f"two different numbers from 0 to {count - 1} are needed"
+        raise UsageError(f"matches of images {i} and {j}: {rule}")
     if i > j and (j, i) in matches:
         raise UsageError(f"matches of images {j} and {i} are given twice")
     return i, j
@@ -232,11 +220,9 @@ def _positions(xy: Any, i: int, views: Views) -> F64:
     outside = np.maximum(-found, found - size + 1).max()
     if outside > MAX_OUTSIDE_REL * size.max():
         x, y = found.max(axis=0)
+        where = f"reach ({x:.0f}, {y:.0f}), {outside:.0f} px outside {size[0]} x {size[1]} px"
         advice = "sizes are (width, height), positions (x, y)"
-        raise UsageError(
-            f"keypoints of {name!r} reach ({x:.0f}, {y:.0f}), {outside:.0f} px outside "
-            f"{size[0]} x {size[1]} px: {advice}"
-        )
+        raise UsageError(f"keypoints of {name!r} {where}: {advice}")
     return found
 
 
@@ -247,14 +233,11 @@ def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
         return np.zeros((0, 2), dtype=np.int64)
     where = f"matches of images {pair[0]} and {pair[1]}"
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        raise UsageError(
-            f"{where} must be (M, 2) whole numbers, rows of keypoints; got {rows.shape} {rows.dtype}"
-        )
-    limits = [len(corners[view]) for view in pair]
-    if rows.min() < 0 or (rows.max(axis=0) >= limits).any():
-        raise UsageError(
-            f"{where} point to a keypoint that does not exist ({limits[0]} and {limits[1]} are given)"
-        )
+        rule = "must be (M, 2) whole numbers, rows of keypoints"
+        raise UsageError(f"{where} {rule}; got {rows.shape} {rows.dtype}")
+    one, two = (len(corners[view]) for view in pair)
+    if rows.min() < 0 or (rows.max(axis=0) >= (one, two)).any():
+        raise UsageError(f"{where} point to a keypoint that does not exist ({one} and {two} are given)")
     rows = rows.astype(np.int64)
     # Detectors repeat a position with another orientation or scale.
     for side, view in enumerate(pair):
@@ -269,11 +252,6 @@ def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
 def _match_record(pair: tuple[int, int], index1: I64, index2: I64, xy1: F64, xy2: F64) -> Matches:
     score, affine = np.ones(len(xy1), dtype=np.float32), np.tile(np.eye(2), (len(xy1), 1, 1))
     return Matches(*pair, index1, index2, xy1, xy2, score, affine)
-
-
-def _forward(m: Matches) -> Matches:
-    """The matches with i < j."""
-    return m if m.i < m.j else _match_record((m.j, m.i), m.index2, m.index1, m.xy2, m.xy1)
 
 
 def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
@@ -299,16 +277,14 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
     here = rows_of_views(view, count)
     corners = [_positions(xy[rows], i, views) for i, rows in enumerate(here)]
     found: list[Matches] = []
-    seen = scipy.sparse.csr_matrix((np.ones(len(view), dtype=np.int32), (view, point)))
-    common = scipy.sparse.triu(seen @ seen.T, 1).tocoo()
+    common = scipy.sparse.triu(common_points(view, point, count), 1).tocoo()
     pairs = np.column_stack([common.row, common.col])[common.data >= MIN_COMMON_POINTS]
     for i, j in pairs[np.lexsort(pairs.T[::-1])].tolist():
         _, a, b = np.intersect1d(point[here[i]], point[here[j]], return_indices=True)
         found.append(_match_record((i, j), a, b, corners[i][a], corners[j][b]))
     if not found:
-        raise UsageError(
-            f"no two images share {MIN_COMMON_POINTS} of the {counted(tracks.n_points, 'point')}"
-        )
+        points = counted(tracks.n_points, "point")
+        raise UsageError(f"no two images share {MIN_COMMON_POINTS} of the {points}")
     _, number = np.unique(point, return_inverse=True)
     return Given(corners, found, Tracks(view, number, xy, count, int(number.max()) + 1))
 
@@ -325,9 +301,8 @@ def outside_masks(given: Given, images: Sequence[Image]) -> Given:
     t = given.tracks
     if t is None:
         return replace(given, matches=matches)
-    kept = np.zeros(len(t.xy), bool)
-    for rows, here in zip(rows_of_views(t.view_index, t.n_views), clear, strict=True):
-        kept[rows] = here
+    kept = np.empty(len(t.xy), bool)
+    kept[np.argsort(t.view_index, kind="stable")] = np.concatenate(clear)
     kept &= np.bincount(t.point_index[kept], minlength=t.n_points)[t.point_index] >= 2
     numbers, point = np.unique(t.point_index[kept], return_inverse=True)
     tracks = Tracks(t.view_index[kept], point, t.xy[kept], t.n_views, len(numbers))
@@ -343,13 +318,10 @@ def at_working_size(given: Given, images: Sequence[Image]) -> Given:
     def scaled(xy: F64, scale: Any) -> F64:
         return np.asarray((xy + 0.5) * scale - 0.5)
 
-    matches = [
-        replace(m, xy1=scaled(m.xy1, scales[m.i]), xy2=scaled(m.xy2, scales[m.j])) for m in given.matches
-    ]
-    tracks = given.tracks
-    if tracks is not None:
-        tracks = replace(tracks, xy=scaled(tracks.xy, scales[tracks.view_index][:, None]))
-    return Given([scaled(xy, s) for xy, s in zip(given.corners, scales, strict=True)], matches, tracks)
+    corners, found, t = zip(given.corners, scales, strict=True), given.matches, given.tracks
+    tracks = None if t is None else replace(t, xy=scaled(t.xy, scales[t.view_index][:, None]))
+    matches = [replace(m, xy1=scaled(m.xy1, scales[m.i]), xy2=scaled(m.xy2, scales[m.j])) for m in found]
+    return Given([scaled(xy, s) for xy, s in corners], matches, tracks)
 
 
 def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:

@@ -58,8 +58,7 @@ class Job:
     inputs: ImageSet
     front: FrontEnd
     until: Until
-    surface_required: bool = False
-    """Whether a surface that fails is a failure; otherwise it is a warning."""
+    surface_required: bool = False  # whether a surface that fails is a failure; otherwise it is a warning
     known: IntrinsicsPrior | None = None
     """Prior of the intrinsics, if another model determined them."""
 
@@ -78,12 +77,12 @@ class Job:
         """File names of the images."""
         return [image.name for image in self.images]
 
-    @property
+    @cached_property
     def sizes(self) -> I64:
         """Working sizes (V, 2) of the images."""
         return np.array([image.size for image in self.images], dtype=np.int64)
 
-    @property
+    @cached_property
     def prior(self) -> IntrinsicsPrior:
         """Prior of the intrinsics at working size."""
         if self.known is not None:

@@ -29,8 +29,7 @@ FEWER, FINAL = "-fewer", "final"
 """Suffix of the records of pairs matched with part of the corners, and name of the record of final pairs."""
 MIN_VERIFIED = 240
 """Number of verified matches from part of the corners above which a pair is not matched again with all."""
-MIN_GROUP = 3
-"""Minimum number of images of a group that is reconstructed separately."""
+MIN_GROUP = 3  # minimum number of images of a group that is reconstructed separately
 CACHE_BYTES = 2**30
 """Prepared views take several times the memory of their image and are quickly prepared again."""
 OBLIQUE_PAIRS = 64
@@ -101,10 +100,8 @@ class FromImages:
         run, accepted = job.run, [(pair.i, pair.j) for pair in pairs if pair.accepted]
         key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, accepted, run.seed)
         build, map_all, rng = job.config.tracks.build, run.workers.map_all, stream(run.seed, "tracks")
-        tracks: Tracks = run.cached(
-            "tracks", "tracks", key, lambda: build(views, pairs, map_all=map_all, rng=rng)
-        )
-        return report_tracks(run, tracks)
+        compute = partial(build, views, pairs, map_all=map_all, rng=rng)
+        return report_tracks(run, run.cached("tracks", "tracks", key, compute))
 
 
 class FromRun:
@@ -228,10 +225,7 @@ def batch_pairs(
 def _pairs_of_few_views(
     left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
 ) -> Iterator[tuple[int, int]]:
-    """Yield pairs of a growing set of views; the view added next has most pairs with the set and few others.
-
-    The caller removes each pair from ``left`` and from ``near`` (view -> views of its pairs).
-    """
+    """Yield pairs of a growing set of views, which the caller removes from ``left`` and ``near``."""
     views, ties = set[int](), Counter[int]()
     while left:
         added: tuple[int, ...]
@@ -335,11 +329,9 @@ def report_choice(job: Job, choice: PairChoice) -> None:
 
 
 def report_matches(
-    job: Job,
-    pairs: Sequence[TwoView],
-    kinds: Sequence[str] | None = None,
+    job: Job, pairs: Sequence[TwoView], kinds: Sequence[str] | None = None,
     rejected: Mapping[int, str] | None = None,
-) -> Sequence[TwoView]:
+) -> Sequence[TwoView]:  # fmt: skip
     """Report the matched pairs; return them.
 
     If the final pairs are not exactly the stored records, another record lists the final ones with their
@@ -405,13 +397,9 @@ def report_tracks(run: Run, tracks: Tracks) -> Tracks:
 
 
 def image_groups(n_views: int, pairs: Sequence[TwoView], among: B8 | None = None) -> list[list[int]]:
-    """The groups of images that accepted pairs connect, the largest first; ``among``: of these images only.
-
-    Groups of less than ``MIN_GROUP`` images are left out.
-    """
+    """Groups of ``MIN_GROUP`` images or more (``among``) that accepted pairs connect, largest first."""
     inside = np.ones(n_views, dtype=bool) if among is None else among
-    label = connected_groups(
-        n_views, [(p.i, p.j) for p in pairs if p.accepted and inside[p.i] and inside[p.j]]
-    )
+    links = [(p.i, p.j) for p in pairs if p.accepted and inside[p.i] and inside[p.j]]
+    label = connected_groups(n_views, links)
     groups = [group.tolist() for group in rows_of_views(label, label.max() + 1)]
-    return sorted((group for group in groups if len(group) >= MIN_GROUP), key=lambda group: -len(group))
+    return sorted((group for group in groups if len(group) >= MIN_GROUP), key=len, reverse=True)

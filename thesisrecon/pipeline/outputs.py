@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -52,8 +53,7 @@ WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (
 """Files that a run writes beside the results of its stages."""
 TILE_FACES, TILE_MB = 100_000, 10.0
 """Largest number of faces and largest size of a tile in megabytes (10^6 bytes)."""
-MAX_AFFINE = 1e3
-"""Largest affine coordinate in affine.ply, in median depths of the best observed view."""
+MAX_AFFINE = 1e3  # largest affine coordinate in affine.ply, in median depths of the best observed view
 
 
 def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
@@ -73,8 +73,7 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     later = _later_end(run.directory.path, until) if failure is None else None
     if later is None:
         return _write(run, result, until, failure)
-    kept = "its summary and report are kept"
-    run.warnings.append(Notice("older-outputs", later, kept))
+    run.warnings.append(Notice("older-outputs", later, "its summary and report are kept"))
     return _described(run, result, until, failure)
 
 
@@ -106,12 +105,9 @@ def _later_end(out: Path, until: str) -> str | None:
 
 
 def _described(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    result = replace(
-        result,
-        warnings=(*run.warnings, *_failure_warnings(result)),
-        reports=tuple(run.reports.values()),
-        failure=str(failure) if failure is not None else "",
-    )
+    warnings, reports = (*run.warnings, *_failure_warnings(result)), tuple(run.reports.values())
+    text = "" if failure is None else str(failure)
+    result = replace(result, warnings=warnings, reports=reports, failure=text)
     return replace(result, summary=summarize(result) | _run_facts(run, until))
 
 
@@ -135,9 +131,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             colors=colors,
             affine=affine,
             model=made("the model in report.html", for_page.result, warnings, None),
-            depths=made(
-                "a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]()
-            ),
+            depths=made("a depth map in report.html", lambda: _thinned_maps(result), warnings, {}),
             until=None if until == "model" else until,
             end=failure,
         )
@@ -152,17 +146,7 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
 
 
 def folder_with(result: RunResult) -> Path | None:
-    """Return the output folder of a result if the folder still contains this result.
-
-    Parameters
-    ----------
-    result : RunResult
-        Compared by its summary, which contains times and so differs from that of every other run.
-
-    Returns
-    -------
-    Path or None
-    """
+    """Return the folder of a result if it still contains it: summaries contain times and so differ."""
     out = result.out
     return out if out is not None and read_json(out / SUMMARY) == as_read(result.summary) else None
 
@@ -183,10 +167,7 @@ def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
-    """Write the mesh as GLB, above ``max_mb`` reduced, with the whole mesh in one file and in tiles.
-
-    Returns warnings.
-    """
+    """Write the mesh as GLB, above ``max_mb`` reduced, with the whole in one file and in tiles; warnings."""
     mesh, path, whole = result.mesh, directory.path / "model.glb", directory.path / "model-full.glb"
     directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:
@@ -251,30 +232,24 @@ def _write_exports(
         plane = calibration.plane_at_infinity
         affine = made("the affine points", lambda: upgrade_to_affine(projective, plane), warnings, None)
     if affine is not None:
-        place, upgraded = directory.path / "affine.ply", affine
-        made(
-            place.name,
-            lambda: write_affine(place, upgraded, point_colors(upgraded, images)),
-            warnings,
-            None,
-        )
+        path, upgraded = directory.path / "affine.ply", affine
+        made(path.name, lambda: write_affine(path, upgraded, point_colors(upgraded, images)), warnings, None)
     return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
 
 
 def _failure_warnings(result: RunResult) -> list[str]:
     """Warnings that the result is not trusted or the calibration not identifiable."""
-    failed_checks: list[str] = []
-    own: tuple[str, ...] = ()
-    if result.metric is not None and not result.metric.trusted:
-        own = tuple(dict.fromkeys(result.metric.failed_checks))
-        failed_checks.append(Notice("failed-self-check", "; ".join(own)))
-    tested = result.metric is not None and result.metric.identifiability is not None
-    if result.calibration is not None and not result.calibration.identifiable and not tested:
+    metric, calibration, warnings = result.metric, result.calibration, list[str]()
+    own = () if metric is None or metric.trusted else tuple(dict.fromkeys(metric.failed_checks))
+    if metric is not None and not metric.trusted:
+        warnings.append(Notice("failed-self-check", "; ".join(own)))
+    tested = metric is not None and metric.identifiability is not None
+    if calibration is not None and not calibration.identifiable and not tested:
         # The self-check may repeat the reasons of its calibration.
-        rest = [reason for reason in dict.fromkeys(result.calibration.reasons) if reason not in own]
+        rest = [reason for reason in dict.fromkeys(calibration.reasons) if reason not in own]
         if rest or not own:
-            failed_checks.append(Notice("undetermined-calibration", "; ".join(rest)))
-    return failed_checks
+            warnings.append(Notice("undetermined-calibration", "; ".join(rest)))
+    return warnings
 
 
 def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warnings: list[str]) -> None:
@@ -283,22 +258,18 @@ def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warning
     assert metric is not None
 
     def write() -> int:
+        names, scales = [image.name for image in images], np.array([1 / image.scale for image in images])
+        sizes = np.array([image.original_size for image in images])
         return write_colmap_model(
-            directory.path / "sparse" / "0",
-            metric.reconstruction,
-            [image.name for image in images],
-            colors=colors,
-            groups=result.groups,
-            scales=np.array([1 / image.scale for image in images]),
-            original_sizes=np.array([image.original_size for image in images]),
-        )
+            directory.path / "sparse" / "0", metric.reconstruction, names,
+            colors=colors, groups=result.groups, scales=scales, original_sizes=sizes,
+        )  # fmt: skip
 
     if skewed := made("sparse/0", write, warnings, -1):
         directory.remove(COLMAP_FILES)
     if skewed > 0:
-        warnings.append(
-            Notice("no-colmap-skew", skewed, counted(int(metric.reconstruction.registered.sum()), "camera"))
-        )
+        cameras = counted(int(metric.reconstruction.registered.sum()), "camera")
+        warnings.append(Notice("no-colmap-skew", skewed, cameras))
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:
@@ -340,10 +311,7 @@ def _thinned_maps(result: RunResult) -> dict[int, F32]:
 
 
 def write_tiles(directory: RunDirectory, whole: TexturedMesh, coarse: TexturedMesh) -> int:
-    """Write a mesh in tiles, and their list with ``coarse``, the mesh of model.glb; return their number.
-
-    Boxes are halved across their longest side until each tile is small enough.
-    """
+    """Write a mesh in tiles, halved until small, and a list with the ``coarse`` mesh; their number."""
     folder = directory.path / "tiles"
     entries = [{"file": "../model.glb", "level": 0, "faces": len(coarse.faces), "box": box_in_file(coarse)}]
     open_ = _halves(whole, np.arange(len(whole.faces)), TILE_FACES)
@@ -369,15 +337,13 @@ def _halves(mesh: TexturedMesh, faces: I64, largest: int) -> list[I64]:
 
 def best_result(tried: Sequence[RunResult]) -> RunResult:
     """The best result: metric before projective, then trusted, then with most cameras, then most points."""
-    return max(tried, key=_quality)
 
+    def quality(result: RunResult) -> tuple[bool, bool, int, int]:
+        metric, best = result.metric, result.best_reconstruction
+        size = (0, 0) if best is None else (int(best.registered.sum()), int(best.valid.sum()))
+        return metric is not None, metric is not None and metric.trusted, *size
 
-def _quality(result: RunResult) -> tuple[bool, bool, int, int]:
-    best = result.best_reconstruction
-    if best is None:
-        return False, False, 0, 0
-    trusted = result.metric is not None and result.metric.trusted
-    return result.metric is not None, trusted, int(best.registered.sum()), int(best.valid.sum())
+    return max(tried, key=quality)
 
 
 def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -> RunResult:
@@ -391,32 +357,20 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
     names = [view["name"] for view in views]
     unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
     features = tuple(stages["features"].values())
+    images = tuple(_image(view, size) for view, size in zip(views, sizes, strict=True))
+    groups = np.array([view["camera"] for view in views], dtype=np.int64)
     result = RunResult(
-        out=folder,
-        images=tuple(_image(view, size) for view, size in zip(views, sizes, strict=True)),
-        unread=unread,
-        features=features,
-        pairs=final_pairs(stages["matches"], features),
-        groups=np.array([view["camera"] for view in views], dtype=np.int64),
-        settings=run["settings"],
-        pair_choice=stages["pairs"].get("choice"),
-        tracks=stages["tracks"].get("tracks"),
-        mesh=stages["model"].get("model"),
-        held_out=stages["model"].get("held-out"),
+        folder, images, unread, features, final_pairs(stages["matches"], features), groups, run["settings"],
+        pair_choice=stages["pairs"].get("choice"), tracks=stages["tracks"].get("tracks"),
+        mesh=stages["model"].get("model"), held_out=stages["model"].get("held-out"),
         reports=tuple(report for report in reports if report is not None),
-        warnings=tuple(summary["warnings"]),
-        summary=summary,
-        failure=summary["failure"] or "",
+        warnings=tuple(summary["warnings"]), summary=summary, failure=summary["failure"] or "",
         further_models=tuple(_further_models(folder, summary)),
-    )
+    )  # fmt: skip
+    calibration, metric = stages["selfcalibration"].get, partial(_last_metric, stages["metric"])
     attempts = [
-        replace(
-            result,
-            projective=stages["projective"][item],
-            calibration=stages["selfcalibration"].get(item),
-            metric=_last_metric(stages["metric"], item),
-        )
-        for item in stages["projective"]
+        replace(result, projective=model, calibration=calibration(item), metric=metric(item))
+        for item, model in stages["projective"].items()
     ]
     return with_image_names(best_result(attempts or [result]))
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy
 
 from thesisrecon._numba import code_digest
 from thesisrecon.camera import Camera
@@ -38,18 +39,20 @@ from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, render_mesh, ssim
 
+T = TypeVar("T")
+
 MAP_BYTES = 2**29
 """Depth maps in memory, those before and those after confirmation; more are read when they are used."""
 
 
 def _cached(
-    job: Job, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], Any]
-) -> Any:
+    job: Job, stage: str, attempt: int, inputs: Any, compute: Callable[[np.random.Generator], T]
+) -> T:
     """The record of one attempt, which depends on ``inputs``."""
     run = job.run
     key = run.key(stage, run.variant_key(stage), inputs, run.seed, attempt)
     run.progress(stage, 0, 1)
-    found = run.cached(stage, f"attempt-{attempt}", key, lambda: compute(stream(run.seed, stage, attempt)))
+    found: T = run.cached(stage, f"attempt-{attempt}", key, lambda: compute(stream(run.seed, stage, attempt)))
     run.progress(stage, 1, 1)
     return found
 
@@ -57,17 +60,12 @@ def _cached(
 def reconstruct_projective(
     job: Job, tracks: Tracks, pairs: Sequence[TwoView], attempt: int = 0
 ) -> Reconstruction:
-    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair.
-
-    Of large sets only a core of ``projective.core_views`` views is reconstructed: the metric stage registers
-    the others by calibrated resection.
-    """
+    """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
     sizes, method = job.sizes, job.config.projective
-    projective: Reconstruction = _cached(
+    return _cached(
         job, "projective", attempt, [job.run.logs["tracks"].keys, sizes],
         lambda rng: method.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt),
     )  # fmt: skip
-    return projective
 
 
 def self_calibrate(job: Job, projective: Reconstruction, attempt: int) -> SelfCalibration:
@@ -75,11 +73,10 @@ def self_calibrate(job: Job, projective: Reconstruction, attempt: int) -> SelfCa
     prior, upstream = job.prior, job.run.logs["projective"].keys[f"attempt-{attempt}"]
     method, images = job.config.selfcalibration, job.images
     pixels = images if all(image.has_pixels for image in images) else ()
-    calibration: SelfCalibration = _cached(
+    return _cached(
         job, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
         lambda rng: calibrate_with_core(with_images(method, pixels), projective, prior=prior, rng=rng),
     )  # fmt: skip
-    return calibration
 
 
 def refine_metric(
@@ -87,11 +84,10 @@ def refine_metric(
 ) -> MetricResult:
     """Upgrade and refine a reconstruction, register the other views, and test the result (chapter 7)."""
     prior, threads = job.prior, job.run.workers.threads
-    metric: MetricResult = _cached(
+    return _cached(
         job, "metric", attempt, [job.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], upstream],
         lambda rng: job.config.metric.refine(start, calibration, prior=prior, rng=rng, threads=threads),
     )  # fmt: skip
-    return metric
 
 
 def report_projective(job: Job, result: RunResult) -> None:
@@ -176,15 +172,11 @@ def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap]
 
 def report_depth_maps(job: Job, maps: Sequence[DepthMap]) -> None:
     """Report the depth maps; raise ``StageFailure`` if none has a depth."""
-    known, depths, empty = [], 0, []
-    for m in maps:
-        finite = np.isfinite(m.depth)
-        known.append(float(finite.mean()))
-        depths += int(finite.sum())
-        empty += [] if known[-1] else [job.images[m.view].name]
+    known = [(m.view, int(np.isfinite(m.depth).sum()), m.depth.size) for m in maps]
+    depths = sum(count for _, count, _ in known)
+    warnings = [Notice("no-depth-values", job.images[view].name) for view, count, _ in known if not count]
     counts = {"views": len(known), "depths": depths}
-    warnings = [Notice("no-depth-values", name) for name in empty]
-    metrics = {"median_share_known": float(np.median(known))}
+    metrics = {"median_share_known": float(np.median([count / size for _, count, size in known]))}
     job.run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
     if not depths:
         evidence = f"none of {len(known)} views agrees with another on any surface"
@@ -211,21 +203,16 @@ def build_model(
     return mesh, held_out
 
 
-def _middle_view(views: Sequence[PinholeView]) -> PinholeView:
-    """The view with the smallest sum of distances to the other cameras."""
-    C = np.array([camera_centre(view.P) for view in views])
-    centres = C[:, :3] / C[:, 3:]
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2).sum(axis=1)
-    return views[int(np.argmin(apart))]
-
-
 def _compare_held_out(job: Job, views: Sequence[PinholeView], mesh: TexturedMesh) -> HeldOut | None:
     """Compare the middle view with the model textured without it; None if they cannot be compared."""
     threads = job.run.workers.threads
     # Of fewer than three views the others may not see the surface of the middle one.
     if len(views) < 3 or not len(mesh.faces):
         return None
-    view = _middle_view(views)
+    # The view with the smallest sum of distances to the other cameras.
+    C = np.array([camera_centre(view.P) for view in views])
+    centres = C[:, :3] / C[:, 3:]
+    view = views[int(np.argmin(scipy.spatial.distance.cdist(centres, centres).sum(axis=1)))]
     try:
         painted = job.config.model.color(mesh, views, without=view.view, threads=threads)
     except StageFailure:

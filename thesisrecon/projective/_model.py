@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse
 
 from thesisrecon._numba import full, kernel, zeros
-from thesisrecon.arrays import B8, F64, I64, rows_of_views
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.conditioning import centred_frame, pixel_from_unit, whitening_transform
 from thesisrecon.geometry.triangulation import triangulate_observations
@@ -23,6 +23,7 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.
 NO_PARALLAX = 0.95
+MORE_OVERLAP = "take images that overlap by more than half and show texture"
 _NO_PARALLAX_REASONS = {
     "pure rotation": "the camera only rotated about its centre (pure rotation)",
     "plane": (
@@ -62,11 +63,7 @@ def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView
 
 
 def select_core(pairs: Sequence[TwoView], n_views: int, size: int) -> B8:
-    """Select ``size`` well-connected views (V,): a view of the best pair, then always the best connected.
-
-    The connection of two views is the number of their matches that no homography explains, which is large
-    only with many matches and a baseline.
-    """
+    """Select ``size`` views (V,) of most matches that no homography explains, from the best pair on."""
     tie = np.zeros((n_views, n_views))
     for pair in pairs:
         if pair.accepted:
@@ -87,9 +84,8 @@ def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
     shares = [pair.homography_inlier_ratio for pair in accepted]
     kinds = Counter(pair.configuration for pair in accepted)
     if min(shares) >= NO_PARALLAX or all(kind in _NO_PARALLAX_REASONS for kind in kinds):
-        meaning = _NO_PARALLAX_REASONS.get(
-            kinds.most_common(1)[0][0], "the camera only rotates, hardly moves, or sees one plane"
-        )
+        usual = "the camera only rotates, hardly moves, or sees one plane"
+        meaning = _NO_PARALLAX_REASONS.get(kinds.most_common(1)[0][0], usual)
         raise StageFailure(
             f"the images show no parallax: {meaning}",
             f"in the least planar of {counted(len(shares), 'pair')} a homography explains "
@@ -107,30 +103,25 @@ def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
     """
     T1, T2 = pixel_from_unit(sizes)
     F = T2.T @ pair.F @ T1
-    best, most = None, -1.0
+    found = []
     for plane in quasi_euclidean_planes(F):
         P1, P2 = canonical_cameras(F, plane=plane)
         P = np.stack([T1 @ P1, T2 @ P2])
         X = triangulate_points(P, np.stack([pair.xy1, pair.xy2]), method="linear")
         first, second = np.sign(X @ P[0, 2]), np.sign(X @ P[1, 2])
         side = 1.0 if np.sum(first * second) >= 0 else -1.0
-        here = abs(float(np.sum(first * np.sign(X[:, 3]))))
-        if here > most:
-            best, most = (P[0], side * P[1]), here
-    assert best is not None
-    return best
+        found.append((abs(float(np.sum(first * np.sign(X[:, 3])))), (P[0], side * P[1])))
+    return max(found, key=lambda each: each[0])[1]
 
 
-# Cells of the grid over an image, along each side.
-_CELLS = 8
+_CELLS = 8  # cells of the grid over an image, along each side
 
 
 def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
     """Select tracks (N,) seen from several positions; undetermined depths of others distort the frame."""
     n, K = tracks.n_views, len(tracks.xy)
-    i, j = np.array(
-        [(p.i, p.j) for p in pairs if p.accepted and p.homography_inlier_ratio >= NO_PARALLAX], dtype=np.int64
-    ).reshape(-1, 2).T  # fmt: skip
+    flat = [(p.i, p.j) for p in pairs if p.accepted and p.homography_inlier_ratio >= NO_PARALLAX]
+    i, j = np.array(flat, dtype=np.int64).reshape(-1, 2).T
     rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
     near = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), (n, n))
     seen = scipy.sparse.csr_array((np.ones(K), (tracks.view_index, tracks.point_index)), (n, tracks.n_points))
@@ -139,28 +130,21 @@ def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
 
 
 def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int) -> B8:
-    """Select the longest ``usable`` tracks (N,), cell by cell of a grid over the points of each image."""
-    length = np.bincount(tracks.point_index, minlength=tracks.n_points)
+    """Select the longest ``usable`` tracks (N,), of each cell of a grid over the image in turn."""
+    t, length = _select_observations(tracks, usable[tracks.point_index]), np.bincount(tracks.point_index)
+    longest_first = -length[t.point_index]
+    in_cell = _places(observation_cells(t), longest_first)
     keep = np.zeros(tracks.n_points, dtype=bool)
-    for rows in rows_of_views(tracks.view_index, tracks.n_views):
-        k = rows[usable[tracks.point_index[rows]]]
-        keep[tracks.point_index[k][_by_cell_and_length(tracks, k, length)[:points_per_view]]] = True
+    keep[t.point_index[_places(t.view_index, longest_first, in_cell) < points_per_view]] = True
     return keep
 
 
-def _by_cell_and_length(tracks: Tracks, k: I64, length: I64) -> I64:
-    """Return the order of the observations k: one of each cell in turn, longest tracks first."""
-    if len(k) == 0:
-        return k
-    xy = tracks.xy[k]
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    cell = np.minimum((xy - low) / np.maximum(high - low, 1e-9) * _CELLS, _CELLS - 1).astype(np.int64)
-    cell_number = cell[:, 0] * _CELLS + cell[:, 1]
-    by_length = np.lexsort((k, -length[tracks.point_index[k]], cell_number))
-    sorted_cells = cell_number[by_length]
-    start = np.searchsorted(sorted_cells, sorted_cells)
-    rank = np.arange(len(k)) - start
-    return by_length[np.lexsort((by_length, -length[tracks.point_index[k]][by_length], rank))]
+def _places(group: I64, *keys: I64) -> I64:
+    """Place (K,) of each row in its ``group`` (K,), sorted by the ``keys`` (K,), the last one first."""
+    order = np.lexsort((*keys, group))
+    ordered, place = group[order], np.empty(len(group), np.int64)
+    place[order] = np.arange(len(order)) - np.searchsorted(ordered, ordered)
+    return place
 
 
 def observation_cells(tracks: Tracks) -> I64:
@@ -183,35 +167,33 @@ def working_tracks(tracks: Tracks, pairs: Sequence[TwoView], *, points_per_view:
     """Return the selected tracks with parallax, renumbered in the same order, and which (N,) they are."""
     usable = select_tracks_with_parallax(tracks, pairs)
     keep = select_tracks(tracks, usable, points_per_view=points_per_view)
-    chosen = keep[tracks.point_index]
-    point = (np.cumsum(keep) - 1)[tracks.point_index[chosen]]
-    return Tracks(tracks.view_index[chosen], point, tracks.xy[chosen], tracks.n_views, int(keep.sum())), keep
+    t = _select_observations(tracks, keep[tracks.point_index])
+    number = np.cumsum(keep) - 1
+    return replace(t, point_index=number[t.point_index], n_points=int(keep.sum())), keep
 
 
 def tracks_of_views(tracks: Tracks, views: B8) -> Tracks:
     """Return the observations of some views (V,); views and points keep their numbers."""
-    k = np.flatnonzero(views[tracks.view_index])
-    return replace(
-        tracks, view_index=tracks.view_index[k], point_index=tracks.point_index[k], xy=tracks.xy[k]
-    )
+    return _select_observations(tracks, views[tracks.view_index])
+
+
+def _select_observations(t: Tracks, k: B8) -> Tracks:
+    return replace(t, view_index=t.view_index[k], point_index=t.point_index[k], xy=t.xy[k])
 
 
 def expand_to_all_tracks(
     reconstruction: Reconstruction, tracks: Tracks, keep: B8, views: B8 | None = None
 ) -> Reconstruction:
     """Express the reconstruction of :func:`working_tracks`, all or of ``views``, in the numbers of all."""
-    X = np.zeros((tracks.n_points, 4))
-    X[keep] = reconstruction.X
-    valid = np.zeros(tracks.n_points, dtype=bool)
-    valid[keep] = reconstruction.valid
+    X, valid = np.zeros((tracks.n_points, 4)), np.zeros(tracks.n_points, dtype=bool)
+    X[keep], valid[keep] = reconstruction.X, reconstruction.valid
     inlier = np.zeros(len(tracks.xy), dtype=bool)
     chosen = keep[tracks.point_index]
     inlier[chosen if views is None else chosen & views[tracks.view_index]] = reconstruction.inlier
     return replace(reconstruction, X=X, valid=valid, inlier=inlier, tracks=tracks)
 
 
-# Residual beyond which the loss of bundle adjustment is linear, in noise sigmas.
-LOSS_SIGMAS = 2.0
+LOSS_SIGMAS = 2.0  # residual beyond which the loss of bundle adjustment is linear, in noise sigmas
 # Predicted gain of the cameras, relative to the square of that residual, at which an adjustment ends.
 SETTLED = 1e-3
 # View pairs tried for a point with a wrong observation: all of them up to five observations.

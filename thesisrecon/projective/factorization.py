@@ -20,6 +20,7 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.projective._model import (
+    MORE_OVERLAP,
     NO_PARALLAX,
     ProjectiveModel,
     adjust_all,
@@ -34,13 +35,11 @@ from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _BALANCING_ITERATIONS = 10
-# Relative gain of an iteration below which the factors have converged.
-_MIN_GAIN_REL = 1e-4
+_MIN_GAIN_REL = 1e-4  # relative gain of an iteration below which the factors have converged
 # Minimum number of complete tracks.
 _MIN_POINTS = 16
 _MAX_ROUNDS = 5
-# Distances from a homography, in noise sigmas, of the points that it explains.
-_PLANE_SIGMAS = 3.0
+_PLANE_SIGMAS = 3.0  # distances from a homography, in noise sigmas, of the points that it explains
 
 Edge = tuple[int, int]
 
@@ -131,8 +130,7 @@ class Factorization:
     iterations: int = 50
     growth: IncrementalProjective = field(default_factory=IncrementalProjective)
 
-    # Minimum number of tracks seen in all views of the core.
-    core_points = 100
+    core_points = 100  # minimum number of tracks seen in all views of the core
 
     def __post_init__(self) -> None:
         require_at_least(self, iterations=0)
@@ -144,11 +142,8 @@ class Factorization:
         ranked = rank_initial_pairs(tracks, pairs)
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
-            raise StageFailure(
-                "no initial pair is left for the factorization",
-                f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted",
-                "take images that overlap by more than half and show texture",
-            )
+            found = f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted"
+            raise StageFailure("no initial pair is left for the factorization", found, MORE_OVERLAP)
         selected, keep = working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
@@ -167,10 +162,8 @@ class Factorization:
             tree = tree[:-1]
             table, edges = _complete_tracks(xy, tree)
         if table.shape[1] < _MIN_POINTS:
-            raise StageFailure(
-                Notice("few-common-tracks"),
-                f"{table.shape[1]} tracks, at least {_MIN_POINTS} are needed",
-            )
+            few = f"{table.shape[1]} tracks, at least {_MIN_POINTS} are needed"
+            raise StageFailure(Notice("few-common-tracks"), few)
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)
         growth, early, views = self.growth, self.growth.outlier_sigmas[0], _tree_views(tree)
         P, X, residual_px = _factorize_robustly(table, depths, growth.outlier_sigmas[1], self.iterations)

@@ -21,6 +21,7 @@ from thesisrecon.optimize.bundle.partial import refine_camera
 from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
+    MORE_OVERLAP,
     ProjectiveModel,
     adjust_all,
     adjust_locally,
@@ -53,7 +54,7 @@ def _projection_std_px(P: F64, covariance: F64, X: F64) -> F64:
 
 
 def _find_inconsistent_view(
-    P: F64, registered: B8, pairs: Sequence[TwoView], *, threshold_px: float, min_ratio: float
+    P: F64, registered: B8, pairs: Sequence[TwoView], threshold_px: float, min_ratio: float
 ) -> tuple[int, float] | None:
     """The view that agrees least with the verified matches of its pairs, and its ratio; None if all do."""
     total, agreed = np.zeros(len(P)), np.zeros(len(P))
@@ -73,8 +74,7 @@ def _find_inconsistent_view(
     return (worst, float(share_of_view[worst])) if share_of_view[worst] < min_ratio else None
 
 
-# Required share of inliers among the points that a camera sees.
-_MIN_INLIER_RATIO = 0.3
+_MIN_INLIER_RATIO = 0.3  # required share of inliers among the points that a camera sees
 # Quantile over all points of the projection standard deviations that is tested.
 _STD_QUANTILE = 0.8
 OUTSIDE_CORE = Notice("outside-core")
@@ -96,8 +96,7 @@ class IncrementalProjective:
     points_per_view: int = 1500
     core_views: int = 40
 
-    # Minimum number of matches for resection: twice the six of a minimal sample.
-    min_points = 12
+    min_points = 12  # minimum number of matches for resection: twice the six of a minimal sample
     # Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
     outlier_sigmas, noise_floor_px = (12.0, 7.0), 0.3
     # Largest 80 % quantile of the projection standard deviations over all points, as a share of the long
@@ -110,8 +109,7 @@ class IncrementalProjective:
     # Growth factor of the number of cameras after which everything is adjusted, and number of views that are
     # adjusted with each new one.
     global_bundle_growth, local_bundle_views = 1.2, 4
-    # Initial pairs tried in one attempt while usable views are missing.
-    max_initial_pairs = 3
+    max_initial_pairs = 3  # initial pairs tried in one attempt while usable views are missing
 
     def __post_init__(self) -> None:
         require_at_least(self, points_per_view=1, core_views=0)
@@ -124,19 +122,14 @@ class IncrementalProjective:
         inside = [pair for pair in pairs if core[pair.i] and core[pair.j]]
         ranked = rank_initial_pairs(tracks, inside)
         if not ranked:
-            raise StageFailure(
-                "no image pair was accepted",
-                f"none of {counted(len(pairs), 'pair')} was verified",
-                "take images that overlap by more than half and show texture",
-            )
+            found = f"none of {counted(len(pairs), 'pair')} was verified"
+            raise StageFailure("no image pair was accepted", found, MORE_OVERLAP)
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
-            raise StageFailure(
-                Notice("no-other-initial-pair"), f"all {len(ranked)} accepted image pairs were tried"
-            )
-        selected, keep = working_tracks(
-            tracks_of_views(tracks, core), inside, points_per_view=self.points_per_view
-        )
+            tried = f"all {len(ranked)} accepted image pairs were tried"
+            raise StageFailure(Notice("no-other-initial-pair"), tried)
+        seen = tracks_of_views(tracks, core)
+        selected, keep = working_tracks(seen, inside, points_per_view=self.points_per_view)
         best = self._best_model(selected, inside, sizes, ranked[attempt:], rng)
         for view in np.flatnonzero(~core):
             best.reasons[view] = OUTSIDE_CORE
@@ -177,9 +170,8 @@ class IncrementalProjective:
 
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> ProjectiveModel:
         """Reconstruct the initial pair: cameras (3.42) and points."""
-        model = ProjectiveModel.empty(
-            tracks, sizes, sigma_px=pair.sigma_px, noise_floor_px=self.noise_floor_px
-        )
+        noise = {"sigma_px": pair.sigma_px, "noise_floor_px": self.noise_floor_px}
+        model = ProjectiveModel.empty(tracks, sizes, **noise)
         views = [pair.i, pair.j]
         model.P[views] = initial_cameras(pair, sizes[views])
         model.registered[views] = True
@@ -261,9 +253,7 @@ class IncrementalProjective:
         reason = Notice("few-inlier-points", counts[view], shares[view])
         if shares[view] >= _MIN_INLIER_RATIO:
             threshold, ratio = self.outlier_sigmas[0] * model.sigma_px, self.min_epipolar_inlier_ratio
-            found = _find_inconsistent_view(
-                model.P, model.registered, pairs, threshold_px=threshold, min_ratio=ratio
-            )
+            found = _find_inconsistent_view(model.P, model.registered, pairs, threshold, ratio)
             if found is None:
                 return False
             view, share = found
@@ -300,9 +290,8 @@ class SequentialProjective:
         neighbours = [p for p in accepted if p.j == p.i + 1]
         candidates = sorted(neighbours or accepted, key=lambda p: (-p.inliers, p.i, p.j))
         if attempt >= len(candidates):
-            raise StageFailure(
-                Notice("no-initial-pair"), f"{counted(len(candidates), 'image pair')} accepted"
-            )
+            accepted_pairs = f"{counted(len(candidates), 'image pair')} accepted"
+            raise StageFailure(Notice("no-initial-pair"), accepted_pairs)
         incremental = _WithoutAdjustment()
         model = incremental.begin(tracks, candidates[attempt], sizes)
         while incremental.add_next_camera(model, rng) is not None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.critical_motions import nearest_critical_motion, projective_infinity_shifts
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.optimize.bundle.identifiability import (
@@ -33,7 +34,7 @@ from thesisrecon.records import (
     Tracks,
     Upgrade,
 )
-from thesisrecon.selfcalibration._frame import ReferenceFrame, build_frame, metric_from_calibration
+from thesisrecon.selfcalibration._frame import ReferenceFrame, build_frame, cannot_be_calibrated
 from thesisrecon.selfcalibration._refinement import RotationCriterion, focal_std
 
 _MAX_OBSERVATIONS = 12000
@@ -50,15 +51,12 @@ def check_identifiability(
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows the effect
     of the prior of these.
     """
-    problem = None
-    if reconstruction.inlier.any():
-        problem = _bundle_problem(reconstruction, upgrade, prior)
-    else:
-        # Without points the world may be mirrored: the optical axes then meet behind the cameras.
-        for side in (1.0, -1.0):
-            metric = np.diag([1.0, 1.0, 1.0, side]) @ upgrade.metric_from_projective
-            one = replace(upgrade, metric_from_projective=metric)
-            problem = problem or _bundle_problem(_with_virtual_points(reconstruction, one), one, prior)
+    problem = _bundle_problem(reconstruction, upgrade, prior) if reconstruction.inlier.any() else None
+    # Without points the world may be mirrored: the optical axes then meet behind the cameras.
+    for side in () if reconstruction.inlier.any() else (1.0, -1.0):
+        metric = np.diag([1.0, 1.0, 1.0, side]) @ upgrade.metric_from_projective
+        one = replace(upgrade, metric_from_projective=metric)
+        problem = problem or _bundle_problem(_with_virtual_points(reconstruction, one), one, prior)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
     excess = excess_equations(prior, reconstruction.registered)
@@ -69,7 +67,7 @@ def identifiability_without_calibration(
     reconstruction: Reconstruction, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
     """Report the nearest critical motion of the projective cameras alone, after self-calibration failed."""
-    frame = build_frame(reconstruction, prior)
+    frame = build_frame(reconstruction, prior, pixel_from_unit(reconstruction.sizes))
     evidence = projective_infinity_shifts(frame.A, frame.a)
     motion, distance = nearest_critical_motion(evidence)
     motion = motion if distance < 1.0 else ""
@@ -110,8 +108,12 @@ def _bundle_problem(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> CalibrationProblem | None:
     """Return upgraded cameras and points with a subset of their observations; None with too few of them."""
-    views = np.flatnonzero(reconstruction.registered)
-    R, T, X, usable = _metric_frame(reconstruction, upgrade, views)
+    H, views = upgrade.metric_from_projective, np.flatnonzero(reconstruction.registered)
+    R, T, _ = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
+    X, usable, spread = upgrade_points(reconstruction.X, reconstruction.valid, H)
+    # A very distant point has no information on the focal length and dominates the conditioning.
+    usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
+    T, X = T / spread, X / spread
     t, index = reconstruction.tracks, _usable_observations(reconstruction, R, T, X, usable)
     total = len(index)
     index = index[_subsample(t.point_index[index])]
@@ -146,9 +148,8 @@ def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
 def _usable_observations(reconstruction: Reconstruction, R: F64, T: F64, X: F64, usable: B8) -> I64:
     """Return inliers of finite points in front of their cameras, at least two per point and ten per view."""
     t, views = reconstruction.tracks, np.flatnonzero(reconstruction.registered)
-    index = np.flatnonzero(
-        reconstruction.inlier & reconstruction.registered[t.view_index] & usable[t.point_index]
-    )
+    there = reconstruction.registered[t.view_index] & usable[t.point_index]
+    index = np.flatnonzero(reconstruction.inlier & there)
     place = np.searchsorted(views, t.view_index[index])
     depth = np.einsum("kj,kj->k", R[place, 2], X[t.point_index[index]]) + T[place, 2]
     index = index[depth > 1e-6]
@@ -169,31 +170,16 @@ def _subsample(point: I64) -> I64:
     return np.flatnonzero(np.isin(point, order[chosen]))
 
 
-def _metric_frame(reconstruction: Reconstruction, upgrade: Upgrade, views: I64) -> tuple[F64, F64, F64, B8]:
-    """Return R and t of the upgraded views, points (N, 3), and which points are finite."""
-    H = upgrade.metric_from_projective
-    R, t, _ = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
-    X, usable, spread = upgrade_points(reconstruction.X, reconstruction.valid, H)
-    # A very distant point has no information on the focal length and dominates the conditioning.
-    usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
-    return R, t / spread, X / spread, usable
-
-
 Arguments = ParamSpec("Arguments")
 
-# Candidates whose log focal lengths differ by less than this are the same.
-_SAME_LOG_FOCAL = 0.03
-
+_SAME_LOG_FOCAL = 0.03  # candidates whose log focal lengths differ by less than this are the same
 _MAX_LOG_STD = 1e3
-
-# Focal lengths in long sides of the image: fields of view from 178 to 0.3 degrees.
-FOCAL_LIMITS = (0.02, 200.0)
+FOCAL_LIMITS = (0.02, 200.0)  # focal lengths in long sides: fields of view from 178 to 0.3 degrees
 
 
 def group_log_focals(frame: ReferenceFrame, K: F64) -> F64:
     """Return the median log focal length (G,) of each camera group for unit-free K (R, 3, 3)."""
-    log_f = 0.5 * np.log(K[:, 0, 0] * K[:, 1, 1])
-    return np.array([np.median(log_f[frame.group == g]) for g in range(frame.n_groups)])
+    return frame.group_medians(0.5 * np.log(K[:, 0, 0] * K[:, 1, 1]))
 
 
 @dataclass(frozen=True)
@@ -216,11 +202,7 @@ def as_stage_failure(calibrate: Callable[Arguments, SelfCalibration]) -> Callabl
             try:
                 return calibrate(*args, **kwargs)
             except np.linalg.LinAlgError as error:
-                raise StageFailure(
-                    "the projective cameras cannot be calibrated",
-                    f"a matrix decomposition failed: {error}",
-                    "take images from different positions",
-                ) from error
+                raise cannot_be_calibrated(f"a matrix decomposition failed: {error}") from error
 
     return inner
 
@@ -236,14 +218,14 @@ def square_pixel_calibrations(log_f: F64) -> F64:
 def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
     """Log focals (B, G) by w*_i = H_i K_r K_r' H_i' of planes (B, 3), medians of the cameras of a group."""
     f = np.clip(f_reference, *FOCAL_LIMITS)
-    H = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
+    H = frame.homographies(p)
     H[..., :2] *= f[:, None, None, None]
     ww = np.sum(H**2, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         log_f = 0.5 * np.log((ww[..., 0] + ww[..., 1]) / (2.0 * ww[..., 2]))
     low, high = np.log(FOCAL_LIMITS)
     log_f = np.clip(np.nan_to_num(log_f, nan=0.0, posinf=high, neginf=low), low, high)
-    groups = np.stack([np.median(log_f[:, frame.group == g], axis=1) for g in range(frame.n_groups)], axis=1)
+    groups = frame.group_medians(log_f)
     groups[:, frame.group[frame.reference]] = np.log(f)
     return groups
 
@@ -306,8 +288,14 @@ def select_candidate(
     frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion,
     candidates: Sequence[Candidate], *, max_candidates: int = 1, min_in_front_ratio: float = 0.5,
 ) -> SelfCalibration:  # fmt: skip
-    """Select the best candidates with enough points in front and check their identifiability."""
-    chosen = _distinct_upgrades(frame, reconstruction, candidates, max_candidates, min_in_front_ratio)
+    """Select the best candidates of different focals with enough points in front; check them."""
+    chosen: list[tuple[Candidate, Upgrade]] = []
+    for tried in sorted(candidates, key=lambda a: a.cost):
+        if len(chosen) == max_candidates or not np.isfinite(tried.cost):
+            break
+        if not any(_same_focals(frame, tried, other) for other, _ in chosen):
+            upgrade = _upgrade_of_candidate(frame, reconstruction, tried, min_in_front_ratio)
+            chosen += [(tried, upgrade)] if upgrade is not None else []
     if not chosen:
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
     candidate, best = chosen[0]
@@ -339,10 +327,8 @@ def _biased_focal(frame: ReferenceFrame, best: Upgrade, report: IdentifiabilityR
 
 def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction, tried: int) -> StageFailure:
     """Return the failure of a method that has no acceptable candidate."""
-    evidence = (
-        f"none of {counted(tried, 'candidate calibration')} of {counted(len(frame.views), 'view')} places "
-        "the points in front of the cameras"
-    )
+    candidates, views = counted(tried, "candidate calibration"), counted(len(frame.views), "view")
+    evidence = f"none of {candidates} of {views} places the points in front of the cameras"
     given = frame.views[frame.prior.focal_known[frame.views]]
     if len(given):
         # All candidates are near the given focal length, so the advice to give one does not help here.
@@ -360,13 +346,12 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
 
 def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_std: F64) -> F64:
     """Standard deviations (V, 3, 3) of K: the candidate's, else of focal lengths and prior, else NaN."""
-    if candidate.K_std is not None:
-        unit = frame.pixel_from_unit[frame.views]
-        K_std = np.zeros_like(K)
-        # The last row of K is known, so rows only change their unit.
-        K_std[frame.views] = np.diagonal(unit, axis1=1, axis2=2)[:, :, None] * candidate.K_std
-        return K_std
     K_std, rows = np.zeros_like(K), frame.views
+    if candidate.K_std is not None:
+        # The last row of K is known, so rows only change their unit.
+        unit = np.diagonal(frame.pixel_from_unit[rows], axis1=1, axis2=2)
+        K_std[rows] = unit[:, :, None] * candidate.K_std
+        return K_std
     prior = np.where(np.isfinite(frame.prior.std), frame.prior.std, np.nan)[rows]
     K_std[rows, 0, 0] = K[rows, 0, 0] * focal_std
     K_std[rows, 1, 1] = K[rows, 1, 1] * np.hypot(focal_std, prior[:, 1] / frame.prior.mean[rows, 1])
@@ -377,33 +362,15 @@ def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_
     return K_std
 
 
-def _distinct_upgrades(
-    frame: ReferenceFrame, reconstruction: Reconstruction, candidates: Sequence[Candidate],
-    max_candidates: int, min_in_front_ratio: float,
-) -> list[tuple[Candidate, Upgrade]]:  # fmt: skip
-    """Return the best candidates of different focal lengths with their upgrades."""
-    chosen: list[tuple[Candidate, Upgrade]] = []
-    for candidate in sorted(candidates, key=lambda a: a.cost):
-        if len(chosen) == max_candidates or not np.isfinite(candidate.cost):
-            break
-        if any(_same_focals(frame, candidate, other) for other, _ in chosen):
-            continue
-        upgrade = _upgrade_of_candidate(frame, reconstruction, candidate, min_in_front_ratio)
-        if upgrade is not None:
-            chosen.append((candidate, upgrade))
-    return chosen
-
-
 def _upgrade_of_candidate(
     frame: ReferenceFrame, reconstruction: Reconstruction, candidate: Candidate, min_in_front_ratio: float
 ) -> Upgrade | None:
     """Return the upgrade, mirrored if most points are behind; None if singular or with too few in front."""
-    K_reference = candidate.K[frame.reference]
-    if not (np.isfinite(candidate.plane).all() and np.isfinite(candidate.K).all()):
+    H, K_reference = np.eye(4), candidate.K[frame.reference]
+    H[:3, :3], H[3, :3] = K_reference, -candidate.plane @ K_reference  # HZ 19.2
+    if not (np.isfinite(candidate.K).all() and np.isfinite(H).all() and abs(np.linalg.det(H)) > 1e-300):
         return None
-    G = metric_from_calibration(candidate.plane, K_reference) @ frame.reference_from_projective
-    if not np.isfinite(G).all() or abs(np.linalg.det(G)) < 1e-300:
-        return None
+    G = np.linalg.inv(H) @ frame.reference_from_projective
     share = _share_in_front(reconstruction, G)
     if share < 0.5:
         G, share = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G, 1.0 - share

@@ -6,6 +6,7 @@ With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +23,7 @@ _N_INTRINSICS = 5
 # No skew, square pixels, principal point near the image centre.
 _SQUARE_PIXEL_STD = (0.0, HOMOGRAPHY_NOISE, HOMOGRAPHY_NOISE, 0.0)
 
-# Relative size below which a singular value, or a distance of centres, is rounding.
-_RANK_TOLERANCE = 1e-11
+_RANK_TOLERANCE = 1e-11  # relative size below which a singular value, or a distance of centres, is rounding
 
 # Relative standard deviation of an exactly known focal length; keeps every criterion finite.
 _KNOWN_FOCAL_STD = 1e-4
@@ -50,27 +50,32 @@ class ReferenceFrame:
     prior: IntrinsicsPrior
 
     @property
-    def n_groups(self) -> int:
-        """Number of different cameras among the registered views."""
-        return int(self.group.max()) + 1
+    def P(self) -> F64:
+        """Cameras (R, 3, 4)."""
+        return np.concatenate([self.A, self.a[:, :, None]], axis=2)
+
+    def homographies(self, planes: F64) -> F64:
+        """Infinite homographies A_i - a_i p' (3.29) of planes (B, 3), up to scale (B, R, 3, 3)."""
+        return np.asarray(self.A[None] - self.a[None, :, :, None] * planes[:, None, None, :])
+
+    def group_medians(self, values: F64) -> F64:
+        """Medians (..., G) over the cameras of each group of values (..., R)."""
+        groups = range(int(self.group.max()) + 1)
+        return np.stack([np.median(values[..., self.group == g], axis=-1) for g in groups], axis=-1)
 
     def subset(self, keep: I64) -> ReferenceFrame:
         """Return the same frame with the cameras at some places, the reference among them."""
         kept, groups = np.unique(self.group[keep], return_inverse=True)
-        place = int(np.flatnonzero(keep == self.reference)[0])
-        return ReferenceFrame(
-            self.A[keep], self.a[keep], self.views[keep], place, groups.astype(np.int64),
-            self.pixel_from_unit, self.reference_from_projective, self.focal_mean[kept],
-            self.focal_std[kept], self.prior,
+        return replace(
+            self, A=self.A[keep], a=self.a[keep], views=self.views[keep], group=groups.astype(np.int64),
+            reference=int(np.flatnonzero(keep == self.reference)[0]),
+            focal_mean=self.focal_mean[kept], focal_std=self.focal_std[kept],
         )  # fmt: skip
 
 
-def build_frame(
-    reconstruction: Reconstruction, prior: IntrinsicsPrior, *, unit: F64 | None = None
-) -> ReferenceFrame:
+def build_frame(reconstruction: Reconstruction, prior: IntrinsicsPrior, unit: F64) -> ReferenceFrame:
     """Transform the registered cameras to a reference frame with a median baseline of 1."""
     views = np.flatnonzero(reconstruction.registered)
-    unit = pixel_from_unit(reconstruction.sizes) if unit is None else unit
     P = np.linalg.inv(unit[views]) @ reconstruction.P[views]
     require_cameras_of_full_rank(P)
     seen = reconstruction.tracks.view_index[reconstruction.inlier]
@@ -117,40 +122,29 @@ def require_cameras_of_full_rank(P: F64) -> None:
         evidence = f"the camera centres are {apart:.1e} apart"
         if flat:
             evidence = f"{flat} of {len(P)} projective cameras have rank below 3"
-    raise StageFailure(
-        "the projective cameras cannot be calibrated", evidence, "take images from different positions"
-    )
+    raise cannot_be_calibrated(evidence)
+
+
+def cannot_be_calibrated(evidence: str) -> StageFailure:
+    advice = "take images from different positions"
+    return StageFailure("the projective cameras cannot be calibrated", evidence, advice)
 
 
 def normalized_frame(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ReferenceFrame:
     """Return a frame that absorbs the prior aspect and principal point: K = diag(f, f, 1) if they hold."""
     n = int(reconstruction.registered.sum())
     if n < 3:
-        raise StageFailure(
-            "self-calibration needs at least 3 registered images",
-            f"{n} were registered",
-            "add images with more overlap",
-        )
+        needed = "self-calibration needs at least 3 registered images"
+        raise StageFailure(needed, f"{n} were registered", "add images with more overlap")
     unit = pixel_from_unit(reconstruction.sizes)
     unit[:, 1, 1] *= prior.mean[:, 1]
     unit[:, :2, 2] = prior.mean[:, 3:5]
-    return build_frame(reconstruction, prior, unit=unit)
-
-
-def metric_from_calibration(p: F64, K: F64) -> F64:
-    """Return the upgrade H^-1 (4, 4) of plane p (3,) and reference K (HZ 19.2); NaN if K is singular."""
-    H = np.eye(4)
-    H[:3, :3] = K
-    H[3, :3] = -p @ K
-    try:
-        return np.asarray(np.linalg.inv(H), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.full((4, 4), np.nan)
+    return build_frame(reconstruction, prior, unit)
 
 
 def infinite_homographies(frame: ReferenceFrame, planes: F64) -> F64:
-    """Return A_i - a_i p' (3.29) of planes (B, 3) with determinant 1 (B, R, 3, 3); NaN through a centre."""
-    H = frame.A[None] - frame.a[None, :, :, None] * planes[:, None, None, :]
+    """Infinite homographies (B, R, 3, 3) of planes (B, 3) with determinant 1; NaN through a centre."""
+    H = frame.homographies(planes)
     det = np.linalg.det(H)
     size = np.linalg.norm(H, axis=(-2, -1)) ** 3
     det = np.where(np.abs(det) > 1e-13 * size, det, np.nan)
@@ -172,10 +166,9 @@ class SolverUnknowns:
     std: F64
 
     @property
-    def max_nonfocal_std(self) -> float:
-        """Largest standard deviation of an unknown other than a focal length, 0 if there is none."""
-        others = np.setdiff1d(np.arange(len(self.std)), self.index[:, 0])
-        return float(self.std[others].max(initial=0.0))
+    def focals(self) -> I64:
+        """Numbers of the unknown focal lengths."""
+        return np.unique(self.index[self.index[:, 0] >= 0, 0])
 
     def calibrations(self, unknowns: F64) -> F64:
         """Build the unit-free calibrations (B, R, 3, 3) of unknowns (B, D)."""
@@ -204,16 +197,15 @@ class SolverUnknowns:
 
     def with_focal_prior(self) -> SolverUnknowns:
         """Replace missing focal priors: 1.2 long sides within a factor of 2.5."""
-        focals = np.unique(self.index[self.index[:, 0] >= 0, 0])
         mean, std = self.mean.copy(), self.std.copy()
-        unknown = focals[~np.isfinite(std[focals])]
+        unknown = self.focals[~np.isfinite(std[self.focals])]
         mean[unknown], std[unknown] = np.log(1.2), np.log(2.5)
         return replace(self, mean=mean, std=std)
 
     def from_log_focals(self, log_f: F64) -> F64:
         """Return starts (B, D) for log focal lengths (B, R): their medians; prior means elsewhere."""
         unknowns = np.repeat(self.mean[None], len(log_f), axis=0)
-        for k in np.unique(self.index[self.index[:, 0] >= 0, 0]):
+        for k in self.focals:
             unknowns[:, k] = np.median(log_f[:, self.index[:, 0] == k], axis=1)
         return unknowns
 
@@ -296,8 +288,7 @@ class ProjectiveScene:
     orthogonal: F64 | None = None
 
 
-@dataclass(frozen=True)
-class PlaneCandidates:
+class PlaneCandidates(NamedTuple):
     """Candidate planes at infinity (B, 3), best first, with orthogonal directions as in the scene."""
 
     planes: F64

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,11 +32,10 @@ def quadratic_rows(x: F64, y: F64) -> F64:
     return np.stack(terms, axis=-1)
 
 
-def dual_image_residuals(A: F64, a: F64, K: F64, K_reference: F64, plane: F64) -> F64:
-    """Entries (B, R, 6) of K K' / |K K'| - P Q P' / |P Q P'| of unit-free cameras (IJCV 32(1), 1999)."""
-    C = (A[None] - a[None, :, :, None] * plane[:, None, None, :]) @ K_reference[:, None]
-    difference = _unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2))
-    return _weighted_entries(difference)
+def dual_image_residuals(frame: ReferenceFrame, K: F64, planes: F64) -> F64:
+    """Entries (B, R, 6) of K K' / |K K'| - P Q P' / |P Q P'| for K (B, R, 3, 3) (IJCV 32(1), 1999)."""
+    C = frame.homographies(planes) @ K[:, None, frame.reference]
+    return _weighted_entries(_unit(K @ K.swapaxes(-1, -2)) - _unit(C @ C.swapaxes(-1, -2)))
 
 
 def _unit(conic: F64) -> F64:
@@ -58,7 +56,7 @@ class RotationCriterion:
     def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Return the weighted entries (B, R, 6) of 3 C C' / tr(C C') - I for planes (B, 3), log_f (B, G)."""
         f = np.exp(log_f)[:, frame.group]
-        C = frame.A[None] - frame.a[None, :, :, None] * p[:, None, None, :]
+        C = frame.homographies(p)
         C[..., :2] *= f[:, frame.reference, None, None, None]
         C[..., :2, :] /= f[..., None, None]
         CC = C @ C.swapaxes(-1, -2)
@@ -85,41 +83,32 @@ class RotationCriterion:
         root_weights = (1.0 + norm2 / self.scale**2) ** -0.25
 
         def residuals(x: F64) -> F64:
-            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * root_weights[..., None]
+            weights = np.repeat(root_weights, len(x) // len(theta), axis=0)
+            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * weights[..., None]
             priors = self._focal_prior_residuals(frame, x[:, 3:])
             return np.concatenate([cameras.reshape(len(x), -1), priors], axis=1)
 
         return residuals(theta), numerical_jacobian(residuals, theta)
 
 
-class _Schedule(NamedTuple):
-    """Damping of the minimisation; with ``skip_nonfinite`` rows of non-finite cost count as finished."""
-
-    damping: float
-    decrease: float
-    max_damping: float
-    tolerance: float
-    skip_nonfinite: bool
-
-
 def _descend(
-    normal_equations: Callable[[F64], tuple[F64, F64]], cost_of: Callable[[F64], F64],
-    project: Callable[[F64], F64], x: F64, iterations: int, schedule: _Schedule,
+    normal_equations: Callable[[F64], tuple[F64, F64]], cost_of: Callable[[F64], F64], x: F64,
+    iterations: int, *, damping: float, decrease: float, max_damping: float, tolerance: float,
+    project: Callable[[F64], F64] = lambda x: x,
 ) -> tuple[F64, F64]:  # fmt: skip
     """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,)."""
-    cost, damping = cost_of(x), np.full(len(x), schedule.damping)
+    cost, damped = cost_of(x), np.full(len(x), damping)
     for _ in range(iterations):
         N, g = normal_equations(x)
         diagonal = np.einsum("bii->bi", N)
-        N = N + damping[:, None, None] * np.eye(x.shape[1]) * (diagonal + 1e-12)[:, None, :]
+        N = N + damped[:, None, None] * np.eye(x.shape[1]) * (diagonal + 1e-12)[:, None, :]
         trial = project(x - _solve_batch(N, g))
         trial_cost = cost_of(trial)
         better = np.asarray(trial_cost < cost)
-        finished = better & (cost - trial_cost <= schedule.tolerance * cost)
+        finished = (better & (cost - trial_cost <= tolerance * cost)) | ~np.isfinite(cost)
         x, cost = np.where(better[:, None], trial, x), np.where(better, trial_cost, cost)
-        damping = np.where(better, damping / schedule.decrease, damping * 4.0)
-        finished |= damping > schedule.max_damping
-        if (finished | (schedule.skip_nonfinite & ~np.isfinite(cost))).all():
+        damped = np.where(better, damped / decrease, damped * 4.0)
+        if (finished | (damped > max_damping)).all():
             break
     return x, cost
 
@@ -149,10 +138,9 @@ def refine_hypotheses(
         return np.einsum("bri,brj->bij", J, J), np.einsum("bri,br->bi", J, r)
 
     return _descend(
-        normal_equations,
-        lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]),
-        lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
-        theta, 25, _Schedule(1e-3, 5.0, 1e8, 1e-10, skip_nonfinite=False),
+        normal_equations, lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]), theta, 25,
+        damping=1e-3, decrease=5.0, max_damping=1e8, tolerance=1e-10,
+        project=lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
     )  # fmt: skip
 
 
@@ -184,21 +172,17 @@ def minimize_batch(
             squares = soft_l1(squares, loss_scale)[0]
         return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
 
-    schedule = _Schedule(1e-2, 6.0, 1e10, 1e-14, skip_nonfinite=True)
-    return _descend(normal_equations, cost_of, lambda x: x, starts, iterations, schedule)
+    return _descend(
+        normal_equations, cost_of, starts, iterations,
+        damping=1e-2, decrease=6.0, max_damping=1e10, tolerance=1e-14,
+    )  # fmt: skip
 
 
 def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
-    """Return the derivatives (B, M, D) of a batch by central differences."""
+    """Return the derivatives (B, M, D) at x (B, D) by central differences, all steps in one batch."""
     steps = 1e-6 * (1.0 + np.abs(x))
-    columns = []
-    for k in range(x.shape[1]):
-        shift = steps * (np.arange(x.shape[1]) == k)
-        columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
-    return np.stack(columns, axis=-1)
-
-
-def central_differences(residuals: Callable[[F64], F64], x: F64, steps: F64) -> F64:
-    """Return the derivatives (M, D) at one point (D,), in one call of the residuals for either side."""
-    shifts = np.diag(steps)
-    return np.asarray(((residuals(x + shifts) - residuals(x - shifts)) / (2.0 * steps[:, None])).T)
+    shifts = steps[:, None] * np.eye(x.shape[1])
+    moved = ((x[:, None] + side * shifts).reshape(x.size, x.shape[1]) for side in (1.0, -1.0))
+    after, before = map(residuals, moved)
+    slopes = (after - before).reshape(*x.shape, after.shape[1]) / (2.0 * steps[..., None])
+    return np.asarray(slopes.swapaxes(1, 2))

@@ -206,11 +206,8 @@ class FixedPlaneQuadric:
 
         def residuals(batch: F64) -> F64:
             K = unknown.calibrations(batch)
-            data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], plane[None])
-            data = data.reshape(len(batch), -1)
-            return np.asarray(
-                np.concatenate([data, HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
-            )
+            data = dual_image_residuals(frame, K, plane[None]).reshape(len(batch), -1)
+            return np.concatenate([data, HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
 
         nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
         found, cost = minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
@@ -224,10 +221,8 @@ class FixedPlaneQuadric:
 def _homographies(frame: ReferenceFrame, plane: F64) -> F64:
     H = infinite_homographies(frame, plane[None])[0]
     if not np.isfinite(H).all():
-        raise StageFailure(
-            Notice("plane-through-camera"),
-            f"image #{int(frame.views[~np.isfinite(H).all(axis=(1, 2))][0])} has no infinite homography",
-        )
+        view = frame.views[~np.isfinite(H).all(axis=(1, 2))][0]
+        raise StageFailure(Notice("plane-through-camera"), f"image #{view} has no infinite homography")
     return np.asarray(H, dtype=np.float64)
 
 
@@ -259,11 +254,9 @@ def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | Non
         s = conic.singular_values
         found = f"singular values {s[4] / max(s[0], 1e-300):.1e} and {s[5] / max(s[0], 1e-300):.1e} of 1"
     if angle < 1.0:
-        return StageFailure(
-            "the cameras do not rotate, so the plane at infinity does not determine the calibration",
-            f"largest rotation {angle:.1f} deg; {found}",
-            "rotate the camera between images",
-        )
+        reason = "the cameras do not rotate, so the plane at infinity does not determine the calibration"
+        found = f"largest rotation {angle:.1f} deg; {found}"
+        return StageFailure(reason, found, "rotate the camera between images")
     pixel = frame.pixel_from_unit[frame.views[frame.reference]] @ axis
     with np.errstate(divide="ignore", invalid="ignore"):
         place = pixel[:2] / pixel[2]

@@ -14,6 +14,7 @@ near the solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy
@@ -21,6 +22,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Reconstruction
 from thesisrecon.selfcalibration._frame import (
     ConicConstraints,
@@ -31,6 +33,8 @@ from thesisrecon.selfcalibration._frame import (
 )
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import solve_conic_batch
+
+MAX_POINTS = 2000  # maximum number of points in the linear programs
 
 
 @dataclass(frozen=True)
@@ -43,13 +47,12 @@ class Polytope:
 
     def contains(self, v: F64) -> B8:
         """Return whether planes (B, 3) of the quasi-affine frame satisfy every inequality."""
-        planes = np.column_stack([v, np.ones(len(v))])
-        parts = np.array_split(planes, max(1, len(planes) // 512))
+        parts = np.array_split(homogenize(v), max(1, len(v) // 512))
         return np.concatenate([(part @ self.rows.T > 0).all(axis=1) for part in parts])
 
     def reference_planes(self, v: F64) -> F64:
         """Return planes p (B, 3) of the reference frame from planes (B, 3) of the quasi-affine frame."""
-        back = np.column_stack([v, np.ones(len(v))]) @ self.quasi_affine
+        back = homogenize(v) @ self.quasi_affine
         return np.asarray(back[:, :3] / np.where(back[:, 3:] == 0, 1e-12, back[:, 3:]))
 
     def sample(self, n: int, rng: np.random.Generator) -> F64:
@@ -77,11 +80,25 @@ class CheiralityRegion:
 
     @classmethod
     def of(
-        cls, frame: ReferenceFrame, reconstruction: Reconstruction, *,
-        max_points: int, rng: np.random.Generator,
-    ) -> CheiralityRegion:  # fmt: skip
-        """Compute the region, without polytopes below eight usable points; ``rng`` selects ``max_points``."""
-        X, C = _cheirality_inequalities(frame, reconstruction, max_points=max_points, rng=rng)
+        cls, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
+    ) -> CheiralityRegion:
+        """Compute the region by up to ``MAX_POINTS`` points of three views or more; no polytopes below eight.
+
+        A single wrong two-view point, which no other view can contradict, would exclude the true plane.
+        Points whose depths have no consistent sign are omitted.
+        """
+        tracks, inlier = reconstruction.tracks, reconstruction.inlier
+        view, point = tracks.view_index[inlier], tracks.point_index[inlier]
+        views, points, _ = orient_signs(reconstruction.P, reconstruction.X, view, point)
+        P, X = reconstruction.P * views[:, None, None], reconstruction.X * points[:, None]
+        positive = np.einsum("kj,kj->k", P[view, 2], X[point]) > 0
+        seen = np.bincount(point, minlength=len(X))
+        chosen = np.flatnonzero((seen >= 3) & (np.bincount(point, positive, minlength=len(X)) == seen))
+        if len(chosen) > MAX_POINTS:
+            chosen = np.sort(rng.choice(chosen, MAX_POINTS, replace=False))
+        T = frame.reference_from_projective
+        C = unit_rows(camera_centre(P[frame.views] @ np.linalg.inv(T)) * np.sign(np.linalg.det(T)))
+        X = unit_rows(X[chosen] @ T.T)
         found = [_polytope_of(X, sign * C) for sign in (1.0, -1.0)] if len(X) >= 8 else []
         return cls(X, C, tuple(part for part in found if part is not None))
 
@@ -94,24 +111,21 @@ class CheiralityRegion:
 
     def wrong_side_ratio(self, planes: F64) -> F64:
         """Return the share (B,) of points and cameras on the wrong side of planes (B, 3)."""
-        v = np.column_stack([planes, np.ones(len(planes))])
-        behind = (v @ self.points.T <= 0).sum(axis=1), (v @ self.centres.T <= 0).sum(axis=1)
-        n, m = len(self.points), len(self.centres)
-        wrong = np.minimum(behind[0], n - behind[0]) + np.minimum(behind[1], m - behind[1])
-        return np.asarray(wrong / max(n + m, 1))
+        v, wrong, total = homogenize(planes), np.zeros(len(planes)), len(self.points) + len(self.centres)
+        for part in (self.points, self.centres):
+            behind = (v @ part.T <= 0).sum(axis=1)
+            wrong += np.minimum(behind, len(part) - behind)
+        return wrong / max(total, 1)
 
 
 def _polytope_of(X: F64, C: F64) -> Polytope | None:
-    """Return the polytope of oriented points (N, 4) and centres (R, 4) by linear programs.
-
-    None if it is empty, or if all points are one.
-    """
+    """The polytope of oriented points (N, 4) and centres (R, 4); None if empty or if all points are one."""
     v = _deepest_plane(np.concatenate([X, C]))
     extent = np.linalg.svd(X, compute_uv=False)
     if v is None or not extent[1] > 1e-12 * extent[0]:
         return None
     T = _quasi_affine_frame(X, v)
-    rows = _unit_rows(np.concatenate([X, C]) @ T.T)
+    rows = unit_rows(np.concatenate([X, C]) @ T.T)
     box = _plane_box(rows)
     return None if box is None else Polytope(rows, T, box)
 
@@ -126,43 +140,15 @@ def distinct_planes(planes: F64, cost: F64) -> list[int]:
     return kept
 
 
-def _cheirality_inequalities(
-    frame: ReferenceFrame, reconstruction: Reconstruction, *, max_points: int, rng: np.random.Generator
-) -> tuple[F64, F64]:
-    """Return oriented points (N, 4) and camera centres (R, 4) in the reference frame, unit norm.
-
-    Only points of at least three views are used: a single wrong two-view point, which no other view can
-    contradict, would exclude the true plane. Points whose depths have no consistent sign are omitted.
-    """
-    tracks, inlier = reconstruction.tracks, reconstruction.inlier
-    view, point = tracks.view_index[inlier], tracks.point_index[inlier]
-    views, points, _ = orient_signs(reconstruction.P, reconstruction.X, view, point)
-    P = reconstruction.P * views[:, None, None]
-    X = reconstruction.X * points[:, None]
-    positive = np.einsum("kj,kj->k", P[view, 2], X[point]) > 0
-    seen = np.bincount(point, minlength=len(X))
-    usable = (seen >= 3) & (np.bincount(point, positive, minlength=len(X)) == seen)
-    chosen = np.flatnonzero(usable)
-    if len(chosen) > max_points:
-        chosen = np.sort(rng.choice(chosen, max_points, replace=False))
-    T = frame.reference_from_projective
-    sign = np.sign(np.linalg.det(T))
-    X_reference = X[chosen] @ T.T
-    P_reference = P[frame.views] @ np.linalg.inv(T)
-    C = camera_centre(P_reference) * sign
-    return _unit_rows(X_reference), _unit_rows(C)
-
-
-def _unit_rows(A: F64) -> F64:
+def unit_rows(A: F64) -> F64:
     return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
 
 
 def _deepest_plane(rows: F64) -> F64 | None:
     """Return the plane v with rows v >= d, |v| <= 1 and the largest d (HZ 21); None unless d > 0."""
     A = np.column_stack([-rows, np.ones(len(rows))])
-    solution = scipy.optimize.linprog(
-        [0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=[(-1, 1)] * 4 + [(None, None)]
-    )
+    bounds = [(-1, 1)] * 4 + [(None, None)]
+    solution = scipy.optimize.linprog([0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=bounds)
     if solution.x is None or not solution.x[4] > 0:
         return None
     return np.asarray(solution.x[:4], dtype=np.float64)
@@ -202,14 +188,9 @@ class CheiralitySearch:
     whose equations have exactly one solution are the candidates.
     """
 
-    # Grid steps per axis of the bounding box.
-    steps = 16
-    # Maximum number of local minima.
-    max_candidates = 10
-    # Descent steps from each of them.
-    refine_iterations = 15
-    # Maximum number of points in the linear programs.
-    max_points = 2000
+    steps = 16  # grid steps per axis of the bounding box
+    max_candidates = 10  # maximum number of local minima
+    refine_iterations = 15  # descent steps from each of them
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """Candidate planes at infinity, best first; ``StageFailure`` if there is none."""
@@ -227,7 +208,7 @@ class CheiralitySearch:
         rng: np.random.Generator,
     ) -> tuple[F64, F64]:  # fmt: skip
         """Planes p (B, 3), best first, and unit-free focal lengths (B,) of the reference camera."""
-        region = CheiralityRegion.of(frame, reconstruction, max_points=self.max_points, rng=rng)
+        region = CheiralityRegion.of(frame, reconstruction, rng)
         parts = [self._minima(frame, constraints, polytope) for polytope in region.polytopes]
         if not parts:
             return np.zeros((0, 3)), np.zeros(0)
@@ -306,14 +287,9 @@ def _modulus_residuals(coefficients: F64, planes: F64) -> tuple[F64, F64]:
 class ModulusConstraint:
     """Plane at infinity by least squares of the modulus constraint over all pairs of one constant K."""
 
-    # Number of planes drawn from the cheirality bounds of either orientation.
-    starts = 300
-    # Maximum number of solutions: three views have up to 21, four or more have one.
-    max_candidates = 21
-    # Largest accepted share of points and cameras on the wrong side of a plane.
-    max_wrong_side_ratio = 0.02
-    # Maximum number of points in the linear programs.
-    max_points = 2000
+    starts = 300  # number of planes drawn from the cheirality bounds of either orientation
+    max_candidates = 21  # maximum number of solutions: three views have up to 21, four or more have one
+    max_wrong_side_ratio = 0.02  # largest accepted share of points and cameras on the wrong side of a plane
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""
@@ -325,13 +301,12 @@ class ModulusConstraint:
                 f"{counted(len(pairs), 'pair')} of views share all intrinsics",
                 "set constant intrinsics, or use another method for the plane at infinity",
             )
-        region = CheiralityRegion.of(frame, scene.reconstruction, max_points=self.max_points, rng=rng)
+        region = CheiralityRegion.of(frame, scene.reconstruction, rng)
         starts = region.sample(self.starts, rng)
         coefficients = _modulus_coefficients(frame.A, frame.a, pairs)
-        planes, cost = minimize_batch(
-            lambda p: _modulus_residuals(coefficients, p)[0], starts, iterations=60, loss_scale=0.05
-        )
-        is_rotation = np.abs(_modulus_residuals(coefficients, planes)[1]) <= 3.05
+        residuals = partial(_modulus_residuals, coefficients)
+        planes, cost = minimize_batch(lambda p: residuals(p)[0], starts, iterations=60, loss_scale=0.05)
+        is_rotation = np.abs(residuals(planes)[1]) <= 3.05
         fit = np.isfinite(cost) & (is_rotation.mean(axis=1) >= 0.9)
         fit[fit] = region.wrong_side_ratio(planes[fit]) <= self.max_wrong_side_ratio
         planes, cost = planes[fit], cost[fit]
@@ -347,6 +322,4 @@ class ModulusConstraint:
 
 def _pairs_of_constant_cameras(first: I64) -> I64:
     """Return pairs (M, 2) of places whose cameras have the same constant K."""
-    i, j = np.triu_indices(len(first), 1)
-    same = first[i] == first[j]
-    return np.column_stack([i[same], j[same]])
+    return np.argwhere(np.triu(first[:, None] == first, 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._candidates import (
-    Candidate,
     as_stage_failure,
     candidates_from_parameters,
     distinct_candidates,
@@ -21,7 +19,6 @@ from thesisrecon.selfcalibration._candidates import (
 )
 from thesisrecon.selfcalibration._frame import (
     ReferenceFrame,
-    SolverUnknowns,
     normalized_frame,
     solver_unknowns,
     square_pixel_constraints,
@@ -54,14 +51,11 @@ class HypothesesAndRefinement:
     focal_range: tuple[float, float] = (0.2, 40.0)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
-    # Number of scanned focal lengths.
-    focal_steps = 45
-    # Number of random camera subsets for the quadric.
-    camera_subsets = 6
+    focal_steps = 45  # number of scanned focal lengths
+    camera_subsets = 6  # number of random camera subsets for the quadric
     # Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
     max_refined, max_full_refined = 40, 8
-    # Maximum number of candidates for bundle adjustment.
-    max_candidates = 3
+    max_candidates = 3  # maximum number of candidates for bundle adjustment
     # Required share of observations with positive depth.
     min_in_front_ratio = 0.95
     criterion = RotationCriterion()
@@ -79,24 +73,19 @@ class HypothesesAndRefinement:
         theta, cost = refine_hypotheses(self.criterion, frame, theta)
         candidates = candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
         unknown = solver_unknowns(frame, prior)
-        if unknown.max_nonfocal_std > _MAX_OFFSET_STD or unknown.known[:, 2].any():
-            candidates = self._with_all_intrinsics(frame, unknown, candidates)
+        others = np.setdiff1d(np.arange(len(unknown.std)), unknown.focals)
+        if unknown.std[others].max(initial=0.0) > _MAX_OFFSET_STD or unknown.known[:, 2].any():
+            candidates = [
+                minimize_quadric(
+                    frame, unknown, candidate.plane, group_log_focals(frame, candidate.K)[frame.group],
+                    method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
+                )
+                for candidate in distinct_candidates(frame, candidates, self.max_full_refined)
+            ]  # fmt: skip
         return select_candidate(
             frame, reconstruction, self.criterion, candidates,
             max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
         )  # fmt: skip
-
-    def _with_all_intrinsics(
-        self, frame: ReferenceFrame, unknown: SolverUnknowns, candidates: Sequence[Candidate]
-    ) -> list[Candidate]:
-        """Return the best distinct candidates, refined over all unknown intrinsics."""
-        return [
-            minimize_quadric(
-                frame, unknown, candidate.plane, group_log_focals(frame, candidate.K)[frame.group],
-                method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
-            )
-            for candidate in distinct_candidates(frame, candidates, self.max_full_refined)
-        ]  # fmt: skip
 
     def _propose(
         self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator

@@ -13,6 +13,7 @@ infinity does not appear: more motions are critical than for the quadric, but no
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,23 +38,20 @@ from thesisrecon.selfcalibration._frame import (
     normalized_frame,
     solver_unknowns,
 )
-from thesisrecon.selfcalibration._refinement import RotationCriterion, central_differences, refine_hypotheses
+from thesisrecon.selfcalibration._refinement import RotationCriterion, numerical_jacobian, refine_hypotheses
 
 _ROOT2 = np.sqrt(2.0)
-# Number of planes to refine for each calibration.
-_MAX_PLANES = 8
+_MAX_PLANES = 8  # number of planes to refine for each calibration
 # Residual of a good pair, the noise to which the priors are weighted, and residual that is rounding.
 _NOISE, _ROUNDING = 0.01, 1e-9
 # Standard deviation of the log focal length from which it is undetermined, and the step of its derivative.
 _MAX_FOCAL_STD, _STEP = 0.15, 0.05
-# Prior of the principal point in long sides, as for all methods by default.
-_CENTRE_STD = 0.01
+_CENTRE_STD = 0.01  # prior of the principal point in long sides, as for all methods by default
 # Difference of log focal lengths below which they are the same; ratio of residuals of equally good solutions.
 _SAME, _ALIKE = 0.03, 2.0
 
 
-@dataclass(frozen=True)
-class _Pairs:
+class _Pairs(NamedTuple):
     """F (M, 3, 3) of camera pairs at places i, j (M,): x_j' F x_i = 0 in unit-free coordinates, unit norm."""
 
     i: I64
@@ -66,7 +64,7 @@ def _overlapping_pairs(frame: ReferenceFrame, reconstruction: Reconstruction, mi
     common = reconstruction.common_points[np.ix_(frame.views, frame.views)]
     if not reconstruction.inlier.any():
         common[:] = np.inf  # cameras without points: all pairs
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    P = frame.P
     places, found = [], []
     for i, j in np.argwhere(np.triu(common >= min_common, 1)):
         try:
@@ -117,7 +115,7 @@ def _minimize_kruppa(
 
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], start,
-        jacobian=lambda x: central_differences(residuals, x, np.full(len(x), 1e-6)),
+        jacobian=lambda x: numerical_jacobian(residuals, x[None])[0],
         loss=lambda s: soft_l1(s, loss_scale), max_iterations=80, tolerance=1e-14,
     )  # fmt: skip
     return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
@@ -154,16 +152,11 @@ class KruppaEquations:
 
     focal_range: tuple[float, float] = (0.2, 40.0)
 
-    # Number of scanned focal lengths.
-    focal_steps = 90
-    # Number of minima to refine.
-    starts = 4
-    # Residual of a pair beyond which it counts linearly (soft L1).
-    loss_scale = 0.02
-    # Minimum number of common observations of a pair.
-    min_common_points = 20
-    # Criterion that selects the candidate.
-    criterion = RotationCriterion()
+    focal_steps = 90  # number of scanned focal lengths
+    starts = 4  # number of minima to refine
+    loss_scale = 0.02  # residual of a pair beyond which it counts linearly (soft L1)
+    min_common_points = 20  # minimum number of common observations of a pair
+    criterion = RotationCriterion()  # criterion that selects the candidate
 
     @as_stage_failure
     def calibrate(
@@ -173,11 +166,9 @@ class KruppaEquations:
         frame = normalized_frame(reconstruction, prior)
         pairs = _overlapping_pairs(frame, reconstruction, self.min_common_points)
         if len(pairs.i) < 2:
-            raise StageFailure(
-                "the Kruppa equations need at least 2 pairs of images",
-                f"{counted(len(pairs.i), 'pair')} with at least {self.min_common_points} common points",
-                "add images with more overlap",
-            )
+            needed = "the Kruppa equations need at least 2 pairs of images"
+            found = f"{counted(len(pairs.i), 'pair')} with at least {self.min_common_points} common points"
+            raise StageFailure(needed, found, "add images with more overlap")
         unknown = solver_unknowns(frame, prior)
         candidates = []
         for K, K_std, _ in self._solutions(pairs, unknown, len(frame.views)):
@@ -188,7 +179,7 @@ class KruppaEquations:
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
         """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
         found, weakest = [], np.inf
-        given = float(unknown.std[np.unique(unknown.index[unknown.index[:, 0] >= 0, 0])].max(initial=0.0))
+        given = float(unknown.std[unknown.focals].max(initial=0.0))
         for log_f in self._scan(pairs, n):
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
             K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)

@@ -28,7 +28,7 @@ from thesisrecon.selfcalibration._frame import (
     require_cameras_of_full_rank,
 )
 from thesisrecon.selfcalibration._refinement import minimize_batch
-from thesisrecon.selfcalibration.cheirality import CheiralityRegion
+from thesisrecon.selfcalibration.cheirality import CheiralityRegion, unit_rows
 
 _BINS = 8
 _ANY_NEIGHBOUR = np.ones((3, 3), dtype=np.int64)
@@ -63,9 +63,8 @@ def _support_regions(angle: F32, strong: B8) -> I64:
     A pixel votes for the larger of its two regions; regions with most of their votes are kept.
     """
     width = 2.0 * np.pi / _BINS
-    both = [
-        _label_bins(np.floor(angle / width + shift).astype(np.int64) % _BINS, strong) for shift in (0.0, 0.5)
-    ]
+    bins = (np.floor(angle / width + shift).astype(np.int64) % _BINS for shift in (0.0, 0.5))
+    both = [_label_bins(part, strong) for part in bins]
     offset = int(both[0].max())
     both[1] = np.where(both[1] > 0, both[1] + offset, 0)
     sizes = np.bincount(np.concatenate([part.ravel() for part in both]))
@@ -112,14 +111,12 @@ def _fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
     keep = place[region] >= 0
     xy, of, n = xy[keep], place[region[keep]], n[regions].astype(np.float64)
     mean = np.column_stack([np.bincount(of, xy[:, k], minlength=len(regions)) for k in (0, 1)]) / n[:, None]
-    d = xy - mean[of]
-    xx, xy_, yy = (
-        np.bincount(of, d[:, a] * d[:, b], minlength=len(regions)) / n for a, b in ((0, 0), (0, 1), (1, 1))
-    )
+    dx, dy = (xy - mean[of]).T
+    xx, xy_, yy = (np.bincount(of, p, minlength=len(regions)) / n for p in (dx * dx, dx * dy, dy * dy))
     angle = 0.5 * np.arctan2(2.0 * xy_, xx - yy)
     along = np.column_stack([np.cos(angle), np.sin(angle)])
     least = 0.5 * (xx + yy - np.hypot(xx - yy, 2.0 * xy_))
-    position = np.sum(d * along[of], axis=1)
+    position = dx * along[of, 0] + dy * along[of, 1]
     low, high = np.zeros(len(regions)), np.zeros(len(regions))
     np.minimum.at(low, of, position)
     np.maximum.at(high, of, position)
@@ -127,8 +124,10 @@ def _fit_segments(xy: F64, region: I64) -> tuple[F64, F64]:
     return np.column_stack(ends), np.sqrt(np.maximum(least, 0.0))
 
 
-# Segments within this many tolerances of a direction are not used for another one.
-_NEAR_TOLERANCES = 4.0
+# Largest endpoint distance of a supporting segment, and of one that is not used for another direction.
+TOLERANCE_PX, _NEAR_PX = 1.5, 6.0
+# Segment pairs per proposal, and maximum numbers of proposals per image and of directions.
+_SAMPLES, _PROPOSALS, _MAX_DIRECTIONS = 400, 6, 6
 _AMBIGUOUS = -2
 _FIRST_NOISE_PX, _MIN_NOISE_PX = 0.5, 1e-3
 _MIN_SEGMENTS = 6
@@ -155,6 +154,11 @@ class _SegmentSet:
         across = towards[..., 0] * self.along[:, 1] - towards[..., 1] * self.along[:, 0]
         return np.asarray(across / norm * self.half)
 
+    def support(self, v: F64) -> F64:
+        """Return the support (..., S) of points v (..., S, 3): length times fit, 0 beyond the tolerance."""
+        miss = self.endpoint_distances_px(v) / TOLERANCE_PX
+        return np.asarray(self.half * np.maximum(1.0 - miss**2, 0.0))
+
 
 def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> _SegmentSet:
     """Return pixel segments (S_i, 4) of each registered camera in the coordinates of the frame."""
@@ -170,79 +174,58 @@ def _normalize_segments(frame: ReferenceFrame, segments: list[F64]) -> _SegmentS
     return _SegmentSet(camera.astype(np.int64), middle, along, half)
 
 
-def _support(segments: _SegmentSet, v: F64, tolerance_px: float) -> F64:
-    """Return the support (..., S) of points v (..., S, 3): length times fit, 0 beyond the tolerance."""
-    miss = segments.endpoint_distances_px(v) / tolerance_px
-    return np.asarray(segments.half * np.maximum(1.0 - miss**2, 0.0))
-
-
-def _propose_vanishing_points(
-    segments: _SegmentSet, *, max_points: int, samples: int, tolerance_px: float, rng: np.random.Generator
-) -> F64:
+def _propose_vanishing_points(segments: _SegmentSet, rng: np.random.Generator) -> F64:
     """Return homogeneous vanishing points (K, 3) of one image, each from the segments left by the others."""
     found: list[F64] = []
     left = segments
-    while len(found) < max_points and len(left.half) >= 5:
+    while len(found) < _PROPOSALS and len(left.half) >= 5:
         weight = left.half / left.half.sum()
-        first, second = (rng.choice(len(weight), samples, p=weight) for _ in range(2))
+        first, second = (rng.choice(len(weight), _SAMPLES, p=weight) for _ in range(2))
         lines = np.cross(homogenize(left.middle), np.column_stack([left.along, np.zeros(len(left.half))]))
         v = np.cross(lines[first], lines[second])
         v = v[np.linalg.norm(v, axis=1) > 1e-9]
         if not len(v):
             break
-        v /= np.linalg.norm(v, axis=1, keepdims=True)
-        total = _support(left, v[:, None], tolerance_px).sum(axis=1)
-        best = v[total.argmax()]
-        mine = _support(left, best[None], tolerance_px) > 0
+        v = unit_rows(v)
+        best = v[left.support(v[:, None]).sum(axis=1).argmax()]
+        mine = left.support(best[None]) > 0
         if mine.sum() < 4:
             break
-        unit = lines[mine] / np.linalg.norm(lines[mine], axis=1, keepdims=True)
-        best = np.linalg.svd(unit * left.half[mine][:, None], full_matrices=False)[2][2]
+        weighted = unit_rows(lines[mine]) * left.half[mine][:, None]
+        best = np.linalg.svd(weighted, full_matrices=False)[2][2]
         found.append(best)
-        left = left.subset(
-            ~mine & (np.abs(left.endpoint_distances_px(best[None])) > _NEAR_TOLERANCES * tolerance_px)
-        )
+        left = left.subset(~mine & (np.abs(left.endpoint_distances_px(best[None])) > _NEAR_PX))
     return np.array(found).reshape(-1, 3)
 
 
 def _triangulate_directions(P: F64, v: F64) -> tuple[F64, B8]:
-    """Unit space points (B, 4) by v x P X = 0 for v (B, n, 3) in P (B, n, 3, 4), and whether determined (B,).
-
-    If all v are epipoles, all points of the baseline satisfy the equations.
-    """
+    """Points (B, 4) with v x P X = 0, v (B, n, 3), P (B, n, 3, 4), and (B,) if some v is no epipole."""
     rows = np.cross(v[..., None], P, axisa=-2, axisb=-2, axisc=-2)
     values, vectors = np.linalg.eigh(np.einsum("bnri,bnrj->bij", rows, rows))
     return np.asarray(vectors[:, :, 0]), np.asarray(values[:, 1] > _MIN_SPREAD**2 * values[:, 3])
 
 
 def _find_parallel_directions(
-    frame: ReferenceFrame, segments: _SegmentSet, proposals: list[F64], *,
-    max_directions: int, tolerance_px: float,
-) -> tuple[F64, I64]:  # fmt: skip
-    """Match vanishing points over all images; return points at infinity (D, 4), directions of segments (S,).
-
-    Best supported first, -1 for no direction. Each has support in three cameras, since the third confirms the
-    two that define it.
-    """
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
+    P: F64, segments: _SegmentSet, proposals: list[F64], max_directions: int = _MAX_DIRECTIONS
+) -> tuple[F64, I64]:
+    """Points at infinity (D, 4), best supported first, in three or more cameras; direction (S,) or -1."""
     candidates = _triangulated_pairs(P, proposals)
     direction = np.full(len(segments.half), -1, dtype=np.int64)
     found: list[F64] = []
     while len(found) < max_directions and len(candidates):
         free = np.flatnonzero(direction == -1)
         left = segments.subset(free)
-        total = np.concatenate([
-            _support(left, np.einsum("sij,bj->bsi", P[left.camera], part), tolerance_px).sum(axis=1)
-            for part in np.array_split(candidates, max(1, len(candidates) // 64))
-        ])  # fmt: skip
-        X = _refined_point(P, left, candidates[total.argmax()], tolerance_px)
-        mine = _support(left, (P @ X)[left.camera], tolerance_px) > 0
+        parts = np.array_split(candidates, max(1, len(candidates) // 64))
+        seen = (np.einsum("sij,bj->bsi", P[left.camera], part) for part in parts)
+        total = np.concatenate([left.support(v).sum(axis=1) for v in seen])
+        X = _refined_point(P, left, candidates[total.argmax()])
+        mine = left.support((P @ X)[left.camera]) > 0
         if mine.sum() < 8 or len(np.unique(left.camera[mine])) < 3:
             break
         direction[free[mine]] = len(found)
         found.append(X)
         # Segments that nearly fit must not form another direction.
-        near = np.abs(left.endpoint_distances_px((P @ X)[left.camera])) < _NEAR_TOLERANCES * tolerance_px
+        near = np.abs(left.endpoint_distances_px((P @ X)[left.camera])) < _NEAR_PX
         direction[free[near & ~mine]] = _AMBIGUOUS
     return np.array(found).reshape(-1, 4), np.maximum(direction, -1)
 
@@ -261,10 +244,10 @@ def _triangulated_pairs(P: F64, proposals: list[F64]) -> F64:
     return np.asarray(X[sine.max(axis=1) < 0.1])
 
 
-def _refined_point(P: F64, segments: _SegmentSet, X: F64, tolerance_px: float) -> F64:
+def _refined_point(P: F64, segments: _SegmentSet, X: F64) -> F64:
     """Return X (4,) refined to minimum distances of its segments, which are selected again each time."""
     for _ in range(3):
-        mine = segments.subset(_support(segments, (P @ X)[segments.camera], tolerance_px) > 0)
+        mine = segments.subset(segments.support((P @ X)[segments.camera]) > 0)
         if len(mine.half) < 4:
             break
         tangent = np.linalg.svd(X[None])[2][1:]
@@ -272,7 +255,7 @@ def _refined_point(P: F64, segments: _SegmentSet, X: F64, tolerance_px: float) -
         def residuals(step: F64, X: F64 = X, tangent: F64 = tangent, mine: _SegmentSet = mine) -> F64:
             return mine.endpoint_distances_px(np.einsum("sij,bj->bsi", P[mine.camera], X + step @ tangent))
 
-        step = minimize_batch(residuals, np.zeros((1, 3)), iterations=10, loss_scale=tolerance_px / 2.0)[0][0]
+        step = minimize_batch(residuals, np.zeros((1, 3)), iterations=10, loss_scale=TOLERANCE_PX / 2.0)[0][0]
         X = X + step @ tangent
         X = X / np.linalg.norm(X)
     return X
@@ -304,9 +287,8 @@ def _plane_residuals(frame: ReferenceFrame, segments: _SegmentSet, of: I64, plan
     """Return endpoint distances (B, S) px: directions ``of`` (S,), planes (B, 3), points v (B, D, 3)."""
     w, camera = v[:, of], segments.camera
     depth = np.einsum("bsi,bi->bs", w, plane)
-    return segments.endpoint_distances_px(
-        np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None]
-    )
+    seen = np.einsum("sij,bsj->bsi", frame.A[camera], w) - frame.a[camera] * depth[..., None]
+    return segments.endpoint_distances_px(seen)
 
 
 def _fit_plane(
@@ -322,25 +304,7 @@ def _fit_plane(
         lambda x: _plane_residuals(frame, segments, of, plane + x[:, :3], moved(x)),
         np.zeros((1, 3 + 2 * len(v))), iterations=30, loss_scale=noise,
     )  # fmt: skip
-    points = moved(x)[0]
-    return plane + x[0, :3], points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-@dataclass(frozen=True)
-class VanishingPoints:
-    """Given vanishing points.
-
-    Parameters
-    ----------
-    view, direction : ndarray (M,) of int
-        View number and number of the parallel lines.
-    xyh : ndarray (M, 3)
-        Homogeneous pixels, third coordinate 0 at infinity.
-    """
-
-    view: I64
-    direction: I64
-    xyh: F64
+    return plane + x[0, :3], unit_rows(moved(x)[0])
 
 
 @dataclass(frozen=True)
@@ -349,62 +313,44 @@ class ParallelLines:
 
     Parameters
     ----------
-    points : VanishingPoints, optional
-        Given points, each direction in at least two views; otherwise directions are detected in the images.
+    points : ndarray (V, D, 3), optional
+        Vanishing points of D directions in homogeneous pixels, each in at least two views, NaN where not
+        seen; otherwise directions are detected in the images.
     images : tuple of Image
         One image per view.
     orthogonal_directions : bool
         The three best supported (of given points: first) directions are orthogonal: v_a' w v_b = 0 (HZ 8.6).
     """
 
-    points: VanishingPoints | None = field(default=None, metadata={"given": True})
+    points: F64 | None = field(default=None, metadata={"given": True})
     images: tuple[Image, ...] = field(default=(), metadata={"given": True}, repr=False)
     orthogonal_directions: bool = False
 
-    # Maximum numbers of proposals per image and of directions.
-    vanishing_points_per_image, max_directions = 6, 6
-    # Number of segment pairs per proposal.
-    samples = 400
-    # Largest endpoint distance of a supporting segment.
-    tolerance_px = 1.5
-    # Largest accepted share of points and cameras on the wrong side of a plane.
-    max_wrong_side_ratio = 0.02
+    max_wrong_side_ratio = 0.02  # largest accepted share of points and cameras on the wrong side of a plane
     # Maximum number of planes.
     max_candidates = 5
     detector = LineSegments()
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; one plane of given points."""
+        frame = scene.frame
         if self.points is not None:
-            X = _points_at_infinity(scene.frame, self.points)
-            v = X[:, :3] / np.linalg.norm(X[:, :3], axis=1, keepdims=True)
-            return PlaneCandidates(_plane_through_points(X)[None], self._orthogonal(v))
+            unit = np.linalg.inv(frame.pixel_from_unit[frame.views])
+            X = _points_at_infinity(frame.P, np.einsum("vij,vdj->vdi", unit, self.points[frame.views]))
+            return PlaneCandidates(_plane_through_points(X)[None], self._orthogonal(unit_rows(X[:, :3])))
         if len(self.images) != len(scene.reconstruction.P):
-            raise ValueError(
-                "ParallelLines needs vanishing points, or an image for each of the "
-                f"{len(scene.reconstruction.P)} views; got {len(self.images)} images"
-            )
-        return self._from_images(scene, rng)
+            views, needed = len(scene.reconstruction.P), "vanishing points, or an image for each of the"
+            raise ValueError(f"ParallelLines needs {needed} {views} views; got {len(self.images)} images")
+        pixels = [self.detector.detect(self.images[view].gray) for view in frame.views]
+        segments = _normalize_segments(frame, pixels)
+        of_view = (segments.subset(segments.camera == place) for place in range(len(frame.views)))
+        proposals = [_propose_vanishing_points(mine, rng) for mine in of_view]
+        X, direction = _find_parallel_directions(frame.P, segments, proposals)
+        region = CheiralityRegion.of(frame, scene.reconstruction, rng)
+        return self._best_triples(frame, segments, region, X, direction)
 
     def _orthogonal(self, v: F64) -> F64 | None:
         return v[[(0, 1), (0, 2), (1, 2)]] if self.orthogonal_directions else None
-
-    def _from_images(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
-        frame = scene.frame
-        pixels = [self.detector.detect(self.images[view].gray) for view in frame.views]
-        segments = _normalize_segments(frame, pixels)
-        proposals = [
-            _propose_vanishing_points(
-                segments.subset(segments.camera == place), samples=self.samples,
-                max_points=self.vanishing_points_per_image, tolerance_px=self.tolerance_px, rng=rng,
-            )
-            for place in range(len(frame.views))
-        ]  # fmt: skip
-        X, direction = _find_parallel_directions(
-            frame, segments, proposals, max_directions=self.max_directions, tolerance_px=self.tolerance_px
-        )
-        region = CheiralityRegion.of(frame, scene.reconstruction, max_points=2000, rng=rng)
-        return self._best_triples(frame, segments, region, X, direction)
 
     def _best_triples(
         self, frame: ReferenceFrame, segments: _SegmentSet, region: CheiralityRegion, X: F64, direction: I64
@@ -418,11 +364,10 @@ class ParallelLines:
                 plane = _plane_through_points(X[chosen])
             except StageFailure:
                 continue
-            v = X[chosen, :3] / np.linalg.norm(X[chosen, :3], axis=1, keepdims=True)
-            renumbered = np.full(len(direction), -1)
-            for k, old in enumerate(chosen):
-                renumbered[direction == old] = k
-            plane, v, _ = _refine_plane(frame, segments, renumbered, plane, v)
+            # The place of each direction in the triple.
+            place = np.array([chosen.index(d) if d in chosen else -1 for d in range(-1, len(X))])
+            v = unit_rows(X[chosen, :3])
+            plane, v, _ = _refine_plane(frame, segments, place[direction + 1], plane, v)
             if region.wrong_side_ratio(plane[None])[0] <= self.max_wrong_side_ratio:
                 planes.append(plane)
                 scores.append(1.0 / float(counts[chosen].min()))
@@ -438,75 +383,49 @@ class ParallelLines:
         return PlaneCandidates(np.array(planes)[order], self._orthogonal(points[order[0]]))
 
 
-def _points_at_infinity(frame: ReferenceFrame, given: VanishingPoints) -> F64:
-    """Return triangulated points (D, 4) in the reference frame of the given directions that determine one."""
-    place = {int(view): k for k, view in enumerate(frame.views)}
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)
-    unit = np.linalg.inv(frame.pixel_from_unit)
-    found: list[F64] = []
-    for d in np.unique(given.direction):
-        mine = [m for m in np.flatnonzero(given.direction == d) if int(given.view[m]) in place]
-        if len(mine) < 2:
-            continue
-        v = np.array([unit[given.view[m]] @ given.xyh[m] for m in mine])
-        v /= np.linalg.norm(v, axis=1, keepdims=True)
-        X, determined = _triangulate_directions(P[[place[int(given.view[m])] for m in mine]][None], v[None])
-        found += list(X[determined])
-    if len(found) < 3:
-        raise _too_few_directions(len(found))
-    return np.array(found)
+def _points_at_infinity(P: F64, v: F64) -> F64:
+    """Triangulated points (D', 4) of the directions that vanishing points v (V, D, 3) in P determine."""
+    v = v / np.linalg.norm(v, axis=2, keepdims=True)
+    seen = np.isfinite(v).all(axis=2)
+    used = np.flatnonzero(seen.sum(axis=0) >= 2)
+    found = [_triangulate_directions(P[None, seen[:, d]], v[None, seen[:, d], d]) for d in used]
+    X = [point for points, determined in found for point in points[determined]]
+    if len(X) < 3:
+        raise StageFailure(
+            "the plane at infinity needs three directions of parallel lines",
+            f"{len(X)} have vanishing points in two registered images that are not both epipoles",
+            "give the vanishing points of another direction, not parallel to the baseline",
+        )
+    return np.stack(X)
 
 
 def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
-    """The plane at infinity (4,), unit norm, from vanishing points xyh (V, D, 3), D >= 3, NaN where not seen.
-
-    ``unit`` (V, 3, 3) are the pixels from unit-free coordinates.
-    """
+    """The unit plane at infinity (4,) from vanishing points xyh (V, D, 3), NaN where not seen."""
     require_cameras_of_full_rank(P)
     cameras = np.linalg.inv(unit) @ P
     cameras = cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
     # In this frame of space the rows of the cameras are orthonormal.
     M = np.linalg.qr(cameras.reshape(-1, 4))[1]
-    cameras, v = cameras @ np.linalg.inv(M), np.einsum("vij,vdj->vdi", np.linalg.inv(unit), xyh)
-    v = v / np.linalg.norm(v, axis=2, keepdims=True)
-    seen = np.isfinite(v).all(axis=2)
-    used = np.flatnonzero(seen.sum(axis=0) >= 2)
-    found = [_triangulate_directions(cameras[None, seen[:, d]], v[None, seen[:, d], d]) for d in used]
-    X = [point for points, determined in found for point in points[determined]]
-    if len(X) < 3:
-        raise _too_few_directions(len(X))
-    plane = M.T @ _null_plane(np.stack(X))
+    X = _points_at_infinity(cameras @ np.linalg.inv(M), np.einsum("vij,vdj->vdi", np.linalg.inv(unit), xyh))
+    plane = M.T @ _null_plane(X)
     return np.asarray(plane / np.linalg.norm(plane))
 
 
-def _too_few_directions(found: int) -> StageFailure:
-    return StageFailure(
-        "the plane at infinity needs three directions of parallel lines",
-        f"{found} have vanishing points in two registered images that are not both epipoles",
-        "give the vanishing points of another direction, not parallel to the baseline",
-    )
-
-
-def _null_plane(X: F64) -> F64:
-    """Return the plane (4,) through three or more points (D, 4), by SVD; ``StageFailure`` on one line."""
-    _, s, Vt = np.linalg.svd(X / np.linalg.norm(X, axis=1, keepdims=True))
-    if not s[2] > _MIN_SPREAD * s[0]:
-        raise _one_plane(float(s[2] / s[0]))
+def _null_plane(X: F64, *, finite: bool = False) -> F64:
+    """Return the plane (4,) through three or more points (D, 4); ``finite``: not through the origin."""
+    _, s, Vt = np.linalg.svd(unit_rows(X))
+    ratio = float(s[2] / s[0]) if not finite or abs(Vt[-1, 3]) > 1e-9 else 0.0
+    if not ratio > _MIN_SPREAD:
+        raise StageFailure(
+            "the directions of the parallel lines lie in one plane, so their vanishing points do not "
+            "determine the plane at infinity",
+            f"the third singular value is {ratio:.1e} of the first",
+            "give lines of a direction outside that plane",
+        )
     return np.asarray(Vt[-1])
 
 
 def _plane_through_points(X: F64) -> F64:
-    """Return p (3,) of the plane (p, 1) through three or more points (D, 4), by SVD."""
-    plane = _null_plane(X)
-    if abs(plane[3]) < 1e-9:
-        raise _one_plane(abs(plane[3]))
+    """Return p (3,) of the plane (p, 1) through three or more points (D, 4)."""
+    plane = _null_plane(X, finite=True)
     return np.asarray(plane[:3] / plane[3])
-
-
-def _one_plane(ratio: float) -> StageFailure:
-    return StageFailure(
-        "the directions of the parallel lines lie in one plane, so their vanishing points do not "
-        "determine the plane at infinity",
-        f"the third singular value is {ratio:.1e} of the first",
-        "give lines of a direction outside that plane",
-    )

@@ -31,15 +31,14 @@ from thesisrecon.selfcalibration._frame import (
 )
 from thesisrecon.selfcalibration._refinement import (
     RotationCriterion,
-    central_differences,
     dual_image_residuals,
+    numerical_jacobian,
     quadratic_rows,
 )
 
 _MIN_NOISE = 1e-9
 _REWEIGHTINGS = 4
-# Maximum number of noise estimates.
-_NOISE_PASSES = 6
+_NOISE_PASSES = 6  # maximum number of noise estimates
 
 
 def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
@@ -49,7 +48,7 @@ def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
     by w33 of the previous iterate; the first iteration divides by the norm of the row of w33, since the 1 of
     the paper depends on the camera scale. Q has unit norm, and rank 4 under noise.
     """
-    P = np.concatenate([frame.A, frame.a[:, :, None]], axis=2)[None].repeat(len(focals), axis=0)
+    P = frame.P[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= focals[:, None, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
     w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
@@ -121,14 +120,12 @@ def _minimize(
 ) -> tuple[F64, float, F64, float]:
     def residuals(batch: F64) -> F64:
         K = unknown.calibrations(batch[:, 3:])
-        data = dual_image_residuals(frame.A, frame.a, K, K[:, frame.reference], batch[:, :3])
-        return np.concatenate(
-            [data.reshape(len(batch), -1), noise * unknown.prior_residuals(batch[:, 3:])], axis=1
-        )
+        data = dual_image_residuals(frame, K, batch[:, :3]).reshape(len(batch), -1)
+        return np.concatenate([data, noise * unknown.prior_residuals(batch[:, 3:])], axis=1)
 
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], theta,
-        jacobian=lambda x: central_differences(residuals, x, 1e-6 * (1.0 + np.abs(x))),
+        jacobian=lambda x: numerical_jacobian(residuals, x[None])[0],
         loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]
@@ -165,8 +162,7 @@ class LinearQuadric:
 
     normalising_focal: float = 1.67
 
-    # Criterion that orders the candidates.
-    criterion = RotationCriterion()
+    criterion = RotationCriterion()  # criterion that orders the candidates
 
     @as_stage_failure
     def calibrate(
@@ -198,14 +194,10 @@ class NonlinearQuadric:
 
     focal_range: tuple[float, float] = (0.2, 40.0)
 
-    # Number of these focal lengths.
-    focal_steps = 45
-    # Number of hypotheses to refine over all unknown intrinsics.
-    starts = 5
-    # Residual beyond which an entry counts linearly (Huber).
-    loss_scale = 0.05
-    # Criterion that selects the starts.
-    criterion = RotationCriterion()
+    focal_steps = 45  # number of these focal lengths
+    starts = 5  # number of hypotheses to refine over all unknown intrinsics
+    loss_scale = 0.05  # residual beyond which an entry counts linearly (Huber)
+    criterion = RotationCriterion()  # criterion that selects the starts
 
     @as_stage_failure
     def calibrate(

@@ -46,12 +46,9 @@ class Stratified:
     calibration: LinearAbsoluteConic | FixedPlaneQuadric = field(default_factory=LinearAbsoluteConic)
     refine: bool = True
 
-    # Maximum number of candidates to return.
-    max_candidates = 1
-    # Required share of observations with positive depth.
-    min_in_front_ratio = 0.5
-    # Criterion for the standard deviations of the focal lengths.
-    criterion = RotationCriterion()
+    max_candidates = 1  # maximum number of candidates to return
+    min_in_front_ratio = 0.5  # required share of observations with positive depth
+    criterion = RotationCriterion()  # criterion for the standard deviations of the focal lengths
 
     def with_images(self, images: Iterable[Image]) -> Stratified:
         """The same method with one image per view, if the plane is estimated from them."""
@@ -91,7 +88,7 @@ class Stratified:
             except StageFailure as failure:
                 failures.append(failure)
                 continue
-            r = dual_image_residuals(frame.A, frame.a, K[None], K[None, frame.reference], plane[None])
+            r = dual_image_residuals(frame, K[None], plane[None])
             candidates.append(Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), method))
         if not candidates:
             raise failures[0]

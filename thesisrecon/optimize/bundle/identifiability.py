@@ -145,21 +145,21 @@ class CalibrationProblem:
 
 def identifiability_report(
     problem: CalibrationProblem, excess: int, *, iterations: int = 0,
-    metric: UpgradedCameras | None = None, focal_std: F64 | None = None,
+    motion: Mapping[str, float] | None = None, focal_std: F64 | None = None,
 ) -> IdentifiabilityReport:  # fmt: skip
     """Return the report; focal lengths in long sides, ``focal_std_rel`` of the worst view, others medians.
 
-    The motion and the relative standard deviations of the focal lengths (V,) are those of ``metric`` cameras
-    and of ``focal_std``, by default those of the adjusted problem.
+    The measures of the ``motion`` with the median focal length, and the relative standard deviations of the
+    focal lengths (V,) are by default those of the adjusted problem.
     """
     fit = problem.adjust(iterations=iterations)
     free = problem.with_free_intrinsics(fit).adjust(iterations=0)
     cameras, views = fit.cameras, problem.views
-    if metric is None:
-        focal = cameras.intrinsics[cameras.group, 0]
-        metric = UpgradedCameras(focal / problem.longest, cameras.R, cameras.centres, fit.X)
-    evidence = measure_motion(metric)
-    motion, distance = nearest_critical_motion(evidence)
+    focal = cameras.intrinsics[cameras.group, 0] / problem.longest
+    adjusted = UpgradedCameras(focal, cameras.R, cameras.centres, fit.X)
+    evidence = dict(motion or measure_motion(adjusted))
+    long_sides = evidence.pop("focal_long_sides", float(np.median(focal)))
+    nearest, distance = nearest_critical_motion(evidence)
     evidence["critical_motion_distance"] = distance
     own, free_std = _focal_std(fit, problem), _focal_std(free, problem)
     std = own if focal_std is None else focal_std
@@ -170,7 +170,7 @@ def identifiability_report(
     root_share = float(np.sqrt(problem.share))
     projective_px = max(problem.projective_px, 3e-5 * float(np.median(problem.longest)))
     evidence |= {
-        "focal_long_sides": float(np.median(metric.focal)),
+        "focal_long_sides": long_sides,
         "focal_std_rel": float(std.max()),
         "focal_std_rel_median": float(np.median(std)),
         "focal_std_rel_free": float(np.median(free_std)),
@@ -195,9 +195,9 @@ def identifiability_report(
     contradicted = _has_excess_noise(evidence)
     identifiable = determined and not contradicted
     given = float(problem.prior.std[:, 0].max())
-    sentences = identifiability_sentences(motion, evidence, identifiable=identifiable, focal_std=given)
+    sentences = identifiability_sentences(nearest, evidence, identifiable=identifiable, focal_std=given)
     views_without = tuple(int(v) for v in undetermined)
-    found = (motion, distance < 1.0, evidence, sentences, views_without)
+    found = (nearest, distance < 1.0, evidence, sentences, views_without)
     return IdentifiabilityReport(identifiable, *found, determined and contradicted)
 
 
