@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry.critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
     MAX_CHANGE,
@@ -62,7 +61,7 @@ from thesisrecon.metric._uncertainty import (
     widen_by_camera_model,
     widen_unverified_focals,
 )
-from thesisrecon.optimize.bundle.identifiability import excess_noise
+from thesisrecon.optimize.bundle.identifiability import excess_noise, measure_motion, nearest_critical_motion
 from thesisrecon.optimize.bundle.scatter import BlockScatter
 from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.records import (
