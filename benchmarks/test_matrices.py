@@ -20,7 +20,7 @@ from benchmarks.references import (
 )
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import distort, project_camera, undistort
-from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
+from thesisrecon.epipolar.ransac import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.geometry.triangulation import pose_from_three_points

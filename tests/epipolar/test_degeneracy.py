@@ -22,7 +22,7 @@ from thesisrecon.camera import compose_camera
 from thesisrecon.epipolar import degeneracy as assessment
 from thesisrecon.epipolar import homography
 from thesisrecon.epipolar._matches import PairFrame, log10_false_alarms, multiplicity_weights
-from thesisrecon.epipolar.degeneracy import _contradicted_ratios, assess_degeneracy
+from thesisrecon.epipolar.degeneracy import _contradicted_fraction, assess_degeneracy
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.conditioning import unit_norm
@@ -283,8 +283,8 @@ def test_votes_of_matches_off_the_plane():
     lone, patch = 44, (77, 78, 79, 87, 88, 89, 97, 98, 99)
     points[lone, 2] += 3.0
     points[list(patch), 2] += 3.0
-    on_plane = np.ones(100, bool)
-    on_plane[[lone, *patch]] = False
-    shares = _contradicted_ratios(np.eye(3), points, on_plane, np.array([lone, 88]), 0.1)
-    assert shares[0] == 1.0
-    assert shares[1] == 0.0
+    off = np.isin(np.arange(100), [lone, *patch])
+    # Of the patch, its middle alone counts.
+    weights = np.zeros(100)
+    weights[[lone, 88]] = 3.0, 1.0
+    assert _contradicted_fraction(points, weights, np.eye(3), off, 0.1) == 0.75

@@ -16,9 +16,15 @@ from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.epipolar.degeneracy import Method
-from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.ransac import INLIER_TESTS, LeastMedianOfSquares, ThesisRansac, discard_outliers
+from thesisrecon.epipolar.ransac import (
+    INLIER_TESTS,
+    LeastMedianOfSquares,
+    ThesisRansac,
+    discard_outliers,
+    estimate_eight_point,
+    estimate_seven_point,
+)
 from thesisrecon.epipolar.refinement import _RowMap, refine_fundamental
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure

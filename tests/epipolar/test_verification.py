@@ -8,9 +8,8 @@ import pytest
 from tests.conftest import real_data, refuses
 from tests.epipolar.pairs import SIZE, make_pair, spoil, with_points
 from thesisrecon.api.pairs import estimate_fundamental
-from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point
 from thesisrecon.epipolar.verification import (
     Configuration,
     PairVerification,

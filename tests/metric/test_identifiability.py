@@ -14,8 +14,12 @@ from tests.metric.test_verdicts import looking, project
 from tests.synthetic import looking_along, make_scene, projective_reconstruction, with_poses
 from thesisrecon import reconstruct, reconstruct_from_tracks
 from thesisrecon.config.intrinsics import prior_for
-from thesisrecon.geometry.critical_motions import UpgradedCameras, measure_motion, nearest_critical_motion
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.optimize.bundle.identifiability import (
+    UpgradedCameras,
+    measure_motion,
+    nearest_critical_motion,
+)
 from thesisrecon.pipeline.large_sets import restrict_views
 from thesisrecon.records import IdentifiabilityReport
 from thesisrecon.selfcalibration._candidates import check_identifiability

@@ -201,7 +201,7 @@ def test_the_population_is_the_quadratic_form_of_deviations_from_its_mean():
     x[-1] = log_f.mean()
     assert values.terms.cost(x) == pytest.approx(np.sum((log_f - log_f.mean()) ** 2) / 0.05**2 / 2.0)
     # Free values at the rows of 0, 2, 3 once the mean is marginalised: (I - 11'/4) / tau^2 of four members.
-    Q = values.terms.information(values.size)
+    Q = values.terms.information().toarray()
     marginal = Q[:5, :5] - np.outer(Q[:5, 5], Q[5, :5]) / Q[5, 5]
     np.testing.assert_allclose(marginal[:3, :3], (np.eye(3) - 0.25) / 0.05**2, atol=1e-9)
     np.testing.assert_allclose(marginal[3:, 3:], np.diag([100.0, 0.0]), atol=1e-9)

@@ -16,7 +16,7 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import decompose_camera
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.conditioning import centred_frame, whitening_transform
+from thesisrecon.geometry.conditioning import whitened_frame
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.three_view import cameras_from_tensor
 from thesisrecon.geometry.two_view import fundamental_from_cameras
@@ -323,7 +323,7 @@ scenes = pytest.mark.parametrize("kind", [pytest.param(v, id=k) for k, v in (FLA
 @scenes
 def test_a_frame_loses_no_more_digits_than_its_stretch(kind):
     scene = _Scene(**kind)
-    frame = centred_frame(scene.X, whitening_transform)
+    frame = whitened_frame(scene.X)
     s = np.linalg.svd(frame.S, compute_uv=False)
     assert s[0] <= STRETCH * (1.0 + 1e-9) * s[3]
     P = frame.cameras_back(frame.cameras(scene.P))

@@ -10,20 +10,18 @@ from tests.constants import with_constants
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.critical_motions import (
-    UpgradedCameras,
-    _infinite_homography_shift,
-    _planarity_ratio,
-    measure_motion,
-    nearest_critical_motion,
-    projective_infinity_shifts,
-)
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.optimize.bundle.identifiability import (
     MAX_FOCAL_STD,
     MIN_INFINITY_SHIFT,
     MIN_ROTATION_SIGNIFICANCE,
+    UpgradedCameras,
+    _infinite_homography_shift,
+    _planarity_ratio,
     excess_equations,
+    measure_motion,
+    nearest_critical_motion,
+    projective_infinity_shifts,
 )
 from thesisrecon.records import Tracks, Upgrade
 from thesisrecon.selfcalibration._candidates import (

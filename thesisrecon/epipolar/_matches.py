@@ -187,9 +187,8 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
     """Return the width that contains the noise: ``threshold``, or more if the noise exceeds it.
 
-    The median of normal noise is 0.22 of a width of 3 standard deviations. The width is multiplied by 1.5
-    until this holds for the residuals within it; beyond 11 thresholds these are wrong matches, and
-    ``threshold`` is returned.
+    The median of normal noise is 0.22 of a width of 3 standard deviations: the width grows until this holds;
+    beyond 11 thresholds the residuals are those of wrong matches.
     """
     width, ordered = threshold, np.sort(residuals)
     for _ in range(7):
@@ -202,24 +201,11 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
     return threshold
 
 
-def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
-    """Standard deviation of residuals >= 0 within 2.5 standard deviations; ``start`` if these are too few."""
-    sigma = start
-    for _ in range(5):
-        kept = residuals[residuals <= 2.5 * sigma]
-        if len(kept) <= 2 * parameters:
-            return start
-        # The variance of a normal variable trimmed there is 0.911.
-        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / 0.91125))
-    return sigma
-
-
 @dataclass(frozen=True)
 class NoiseMixture:
-    """Mixture model of residuals: normal noise, its tail four times as wide, and wrong matches.
+    """Normal noise (``sigma``), its tail four times as wide, and wrong matches (``spread``), with fractions.
 
-    ``sigma`` and ``spread`` are the standard deviations of noise and wrong residuals, ``core``, ``tail`` and
-    ``wrong`` the fractions, ``log_likelihood`` is the mean over the residuals.
+    ``log_likelihood`` is the mean over the residuals.
     """
 
     sigma: float
@@ -262,10 +248,9 @@ class NoiseMixture:
 
 
 def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
-    """Weight (N,) of each match, one over the number of matches at its position.
+    """Weight (N,) of each match, one over the number of those within 2 px of it in an image.
 
-    At most one of the matches at one position (within 2 px in either image) is right, and all of them agree
-    with every F whose epipole lies there: together they count once.
+    At most one of them is right, and all agree with every F whose epipole lies there: they count once.
     """
     numbers = np.zeros(len(xy1), dtype=np.int64)
     for xy in (xy1, xy2):
@@ -278,11 +263,10 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
 
 
 def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
-    """log10 of the expected number of models with as many inliers among wrong matches.
+    """log10 of the expected number of models with as many inliers among wrong matches, sums of weights.
 
     A-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free): the model passes through
-    ``free`` matches and each of the rest agrees with probability ``chance`` (Moisan and Stival, IJCV 57,
-    2004). ``agreeing`` and ``tried`` are sums of weights.
+    ``free`` matches, the rest agree with probability ``chance`` (Moisan and Stival, IJCV 57, 2004).
     """
     rest, hits = tried - free, agreeing - free
     if hits <= 0.0 or rest <= 0.0:

@@ -2,7 +2,7 @@
 
 In the projective basis of four of the seven matches F has a zero diagonal and entries that sum to zero, and
 three equations leave a pencil by minors without pivoting: the loop vectorises and is four times faster than
-:func:`thesisrecon.epipolar.linear.seven_point`. It may miss a double root, which random sampling tolerates.
+:func:`thesisrecon.epipolar.ransac.seven_point`. It may miss a double root, which random sampling tolerates.
 Points are rows (x1, y1, x2, y2) in a frame that scales both images equally, F is a row-major vector of 9.
 """
 
@@ -249,12 +249,11 @@ def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tup
 def truncated_score(
     f: F64, columns: F64, gate: float, give_up: float, evidence: tuple[float, float]
 ) -> tuple[float, int, int]:
-    """Truncated quadratic score of F on ``columns`` (4, N) in random order, stopping early for a bad F.
+    """Mean of min(r^2 / gate^2, 1) on ``columns`` (4, N) in random order, the inliers and points evaluated.
 
-    Returns the mean of min(r^2 / gate^2, 1), the inliers and the points evaluated. The evaluation stops with
-    score 1 if the sum exceeds ``give_up`` times the number of points, if the running mean is three standard
-    errors above it, or by Wald's sequential test (Matas and Chum, ICCV 2005) of ``evidence``, the log
-    likelihood ratios "wrong" to "right" of a point inside and outside the gate.
+    Stops with score 1 if the sum exceeds ``give_up`` times the number of points, if the running mean is three
+    standard errors above it, or by Wald's sequential test (Matas and Chum, ICCV 2005) of ``evidence``, the
+    log likelihood ratios "wrong" to "right" of a point inside and outside the gate.
     """
     n = columns.shape[1]
     total, inliers = 0.0, 0.0
@@ -272,10 +271,9 @@ def truncated_score(
 
 @kernel
 def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
-    """Log likelihood ratios wrong : right of a point inside and outside the gate.
+    """Log likelihood ratios wrong : right of a point inside and outside the gate, from the fractions inside.
 
-    ``right`` and ``wrong`` are the fractions of points inside the gate of a right and of a wrong F. Zeros
-    (never stop early) if the two are too close.
+    Zeros (never stop early) if the two are too close.
     """
     right = min(right, 0.99)
     if not right > 1.5 * wrong:
@@ -327,12 +325,11 @@ def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
 def search_fundamental(
     points: F64, columns: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
 ) -> int:
-    """Score a seven-point sample per row of ``uniforms`` (B, 7); returns the number of samples drawn.
+    """Score a seven-point sample of ``points`` per row of ``uniforms`` (B, 7) on ``columns`` (4, N).
 
-    The search ends with the batch that finds a better ``F`` or when enough samples are drawn. Samples are of
-    ``points``, scores are on ``columns`` (4, N). ``stop``: samples drawn before, minimum number, probability
-    of a sample without outliers. ``state`` (4,): best score, its inlier ratio, points seen and points inside
-    the gate of rejected models.
+    Returns the number of samples, with the batch that finds a better ``F`` or when enough are drawn.
+    ``stop``: samples drawn before, minimum number, probability of a sample without outliers. ``state`` (4,):
+    best score, its inlier ratio, points seen and points inside the gate of rejected models.
     """
     done, least, confidence = stop
     X, Y = full((28, LANES), 1.0), empty((ROWS, LANES))

@@ -52,28 +52,10 @@ def _select_distinct(order: I64, agree: F64, weights: F64, chosen: list[int], mo
             break
 
 
-def _contradicted_ratios(H: F64, points: F64, on_plane: B8, chosen: I64, near: float) -> F64:
-    """Fraction of the nearest neighbours of each chosen point that lie on the plane and contradict it.
-
-    A neighbour contradicts if the parallax differs by more than the distance in image 1: two points of an
-    opaque surface would change order. Points nearer than ``near`` are the same feature and do not count.
-    """
-    parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)
-    apart = scipy.spatial.distance.cdist(points[chosen, :2], points[:, :2])
-    apart[apart < near] = np.inf
-    count = min(5, len(points))
-    nearest = np.argpartition(apart, count - 1, axis=1)[:, :count]
-    distance = np.take_along_axis(apart, nearest, axis=1)
-    differ = np.linalg.norm(parallax[nearest] - parallax[chosen, None], axis=2) > distance
-    counted = np.maximum(np.isfinite(distance).sum(axis=1), 1)
-    return np.asarray((on_plane[nearest] & differ).sum(axis=1) / counted)
-
-
 @dataclass(frozen=True)
 class _CompetingModel:
-    """Another F ``f`` (9,) and how it differs from the estimate.
+    """Another F ``f`` (9,), and the weights of matches that only the estimate or only this F explains.
 
-    ``lost`` and ``gained`` are the weights of matches that only the estimate or only this F explains.
     ``error`` is the RMS distance of its inliers to the estimate, ``apart`` the smaller of that and the
     reverse, in frame units.
     """
@@ -150,9 +132,8 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     F is undetermined if the inliers off the dominant plane are no more than expected by chance, if another F
     of that plane or of another search explains about as many matches (McNemar's test) at a relevant distance,
     if more than a fifth of the inliers off the plane are contradicted by neighbours on it (as matches between
-    repeated windows are), or if the covariance allows errors of the epipolar lines above a pixel. The F of a
-    pure translation is determined. Wrong matches as coherent as a surface (a whole facade shifted by one
-    window) cannot be detected.
+    repeated windows are), or if the covariance allows errors of the epipolar lines above a pixel. Wrong
+    matches as coherent as a surface cannot be detected.
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     if fit.inliers.shape != (len(xy1),):
@@ -189,15 +170,11 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     if not allowed_px <= relevant_px:
         reasons.append(f"the covariance of F allows epipolar line errors of {allowed_px:.2g} px")
     return DegeneracyReport(
-        determined=not reasons,
-        reasons=tuple(reasons),
-        off_plane=agreeing,
-        contradicted=contradicted,
-        log10_false_alarms=false_alarms,
+        determined=not reasons, reasons=tuple(reasons), off_plane=agreeing, contradicted=contradicted,
+        log10_false_alarms=false_alarms, expected_error_px=error_px,
         competing_margin=other.margin if other is not None else float("inf"),
         competing_model=frame.matrix_in_pixels(other.f) if other is not None else None,
-        expected_error_px=error_px,
-    )
+    )  # fmt: skip
 
 
 def _reasons(
@@ -222,11 +199,23 @@ def _reasons(
 
 
 def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:
-    """Fraction of a sample of the inliers ``off`` the plane that 30 % of their neighbours contradict."""
+    """Fraction of a sample of the inliers ``off`` the plane that 30 % of their neighbours on it contradict.
+
+    A parallax that differs by more than the distance in image 1 would change the order of two points of an
+    opaque surface. Points nearer than ``near`` are the same feature.
+    """
     chosen = np.flatnonzero(off)
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
-    ratios, some = _contradicted_ratios(H, points, ~off, chosen, near), weights[chosen]
-    return float(some[ratios > 0.3].sum() / max(some.sum(), 1e-300))
+    parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)
+    apart = scipy.spatial.distance.cdist(points[chosen, :2], points[:, :2])
+    apart[apart < near] = np.inf
+    count = min(5, len(points))
+    nearest = np.argpartition(apart, count - 1, axis=1)[:, :count]
+    distance = np.take_along_axis(apart, nearest, axis=1)
+    differ = np.linalg.norm(parallax[nearest] - parallax[chosen, None], axis=2) > distance
+    neighbours = np.maximum(np.isfinite(distance).sum(axis=1), 1)
+    contradicted, some = (~off[nearest] & differ).sum(axis=1) / neighbours > 0.3, weights[chosen]
+    return float(some[contradicted].sum() / max(some.sum(), 1e-300))
 
 
 def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:

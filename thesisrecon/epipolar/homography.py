@@ -24,6 +24,7 @@ from thesisrecon.geometry.two_view import (
 )
 from thesisrecon.optimize.least_squares import minimize_residuals
 from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
+from thesisrecon.optimize.ransac import search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
@@ -192,7 +193,6 @@ def _plane_inliers(F: F64, columns: F64, gate: float) -> F64:
 
 
 _SAMPLE, _PARAMETERS = 4, 8
-_BATCH, _MAX_BATCHES, _SCORED = 128, 16, 1000
 # Rounds to find the inliers.
 _ROUNDS = 8
 # Residuals in units of the frame below which they are rounding errors.
@@ -275,20 +275,16 @@ def _through_four(samples: F64) -> F64:
 def _search(points: F64, gate: float, rng: Generator) -> F64:
     """The homography of the samples with the least truncated squared distances in image 2."""
     n = len(points)
-    scored = points[rng.choice(n, _SCORED, replace=False)] if n > _SCORED else points
-    best, least, drawn = np.eye(3), np.inf, 0
-    for _ in range(_MAX_BATCHES):
-        samples = rng.random((_BATCH, n)).argpartition(_SAMPLE - 1, axis=1)[:, :_SAMPLE]
-        H = _through_four(points[samples])
+    scored = points[rng.choice(n, 1000, replace=False)] if n > 1000 else points
+
+    def costs(H: F64) -> F64:
         squared = np.stack([homography_residuals(h, scored[:, :2], scored[:, 2:]) for h in H]) ** 2
-        cost = np.minimum(squared / (2.0 * gate**2), 1.0).sum(axis=1)
-        drawn += _BATCH
-        if cost.min() < least:
-            least, best = float(cost.min()), H[cost.argmin()]
-        share = 1.0 - least / len(scored)
-        if drawn * np.log1p(-min(share**_SAMPLE, 1.0 - 1e-9)) < np.log(1e-4):
-            break
-    return best
+        return np.asarray(np.minimum(squared / (2.0 * gate**2), 1.0).mean(axis=1))
+
+    return search_models(
+        lambda samples: _through_four(points[samples]), costs, rng, n, _SAMPLE,
+        batch=128, batches=16, risk=1e-4,
+    )  # fmt: skip
 
 
 def _refine(H: F64, points: F64) -> tuple[F64, F64]:

@@ -125,10 +125,9 @@ class LocallyOptimisedRansac:
         return found, samples
 
     def _agree(self, found: list[tuple[float, F64]], points: F64, gate: float) -> bool:
-        """Whether enough searches end at the best score, within the effect of the matches near the gate.
+        """Whether enough searches end at the best score.
 
-        Two searches that end at the same minimum differ by about the root of the number of matches of which
-        noise decides whether they are inside.
+        Two that end at the same minimum differ by about the root of the number of matches near the gate.
         """
         if len(found) < self.starts:
             return False
@@ -152,21 +151,9 @@ class LocallyOptimisedRansac:
     def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
         f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
         # Six searches share the minimum; one of them draws a sample without outliers.
-        least, most = self.min_samples // 6, self.max_samples // self.max_starts
         confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / 6.0)
-        drawn, uniforms = 0, np.empty((0, 7))
-        while drawn < most:
-            if not len(uniforms):
-                uniforms = rng.random((min(512, most - drawn), 7))
-            score, before = state[0], drawn
-            stop = (drawn, least, confidence)
-            drawn = search_fundamental(points, columns, uniforms, gate, stop, state, f)
-            uniforms = uniforms[drawn - before :]
-            if state[0] < score:
-                _refine_best(points, columns, gate, state, f)
-            elif len(uniforms):
-                break
-        return f, drawn
+        limits = self.min_samples // 6, self.max_samples // self.max_starts, confidence
+        return f, _score_samples(points, points, columns, gate, limits, state, f, rng)
 
     def _finish(self, frame: PairFrame, found: _Candidate, points: F64) -> FundamentalFit:
         r, noise = found.residuals, found.noise
@@ -202,8 +189,8 @@ class _Candidate:
     def explains_more_than(self, other: _Candidate) -> bool:
         """Whether this result of a wider gate is more likely and leaves few matches unexplained.
 
-        A wide gate accepts wrong F that are near many wrong matches. This F must explain most of the matches
-        that ``other`` rejects, or nearly all matches.
+        A wide gate accepts wrong F near many wrong matches: this one must explain most of those that
+        ``other`` rejects.
         """
         if self.noise is None or other.noise is None:
             return other.noise is None
@@ -224,21 +211,37 @@ def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> 
         f[:] = trial
 
 
+def _score_samples(
+    sampled: F64, points: F64, columns: F64, gate: float, limits: tuple[int, int, float],
+    state: F64, f: F64, rng: Generator,
+) -> int:  # fmt: skip
+    """Improve ``f`` in place by samples of some points, each better one refined; return their number.
+
+    ``limits``: minimum and maximum number, and the probability of a sample without outliers.
+    """
+    (least, most, confidence), drawn, uniforms = limits, 0, np.empty((0, 7))
+    while drawn < most:
+        if not len(uniforms):
+            uniforms = rng.random((min(512, most - drawn), 7))
+        score, before = state[0], drawn
+        stop = (drawn, least, confidence)
+        drawn = search_fundamental(sampled, columns, uniforms, gate, stop, state, f)
+        uniforms = uniforms[drawn - before :]
+        if state[0] < score:
+            _refine_best(points, columns, gate, state, f)
+        elif len(uniforms):
+            break
+    return drawn
+
+
 def _search_among_inliers(f: F64, points: F64, columns: F64, gate: float, rng: Generator) -> None:
     """Improve ``f`` in place by samples of the matches near it until a round finds no better one."""
     score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
     state = np.array([score, inliers / len(points), *PRIOR])
-    samples = 256
     for _ in range(10):
-        near = points[np.asarray(sampson_distances(f, points)) < 3.0 * gate]
-        if len(near) < MINIMUM:
-            return
-        before, done, uniforms = state[0], 0, rng.random((samples, 7))
-        while done < samples:
-            score, stop = state[0], (done, samples, 1.0)
-            done = search_fundamental(near, columns, uniforms[done:], gate, stop, state, f)
-            if state[0] < score:
-                _refine_best(points, columns, gate, state, f)
+        near, before = points[np.asarray(sampson_distances(f, points)) < 3.0 * gate], state[0]
+        if len(near) >= MINIMUM:
+            _score_samples(near, points, columns, gate, (256, 256, 1.0), state, f, rng)
         if not state[0] < before:
             return
 

@@ -20,7 +20,7 @@ from thesisrecon.errors import unknown_word
 from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.small_matrices import orthogonalize_columns, solve_damped
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.least_squares import DenseProblem, DenseSystem, run_levenberg_marquardt
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -157,23 +157,6 @@ def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: fl
 
 
 @kernel
-def residuals_and_derivatives(f: F64, points: F64, criterion: int) -> tuple[F64, F64]:
-    """Signed residuals (N,) of a criterion and their derivatives (N, 9) by F."""
-    r, J, D = empty(len(points)), empty((len(points), 9)), empty((11, BLOCK))
-    for start in range(0, len(points), BLOCK):
-        block = points[start : start + BLOCK]
-        if criterion == REPROJECTION:
-            _reprojection_derivatives(f, block, np.inf, 1e150, D)
-        else:
-            _weighted_derivatives(f, block, criterion, np.inf, 1e150, D)
-        for k in range(len(block)):
-            r[start + k] = D[9, k]
-            for m in range(9):
-                J[start + k, m] = D[m, k]
-    return r, J
-
-
-@kernel
 def fundamental_from_orthonormal(U: F64, V: F64, phi: float, f: F64) -> None:
     """Write F = U diag(cos phi, sin phi, 0) V' to ``f``."""
     c, s = np.cos(phi), np.sin(phi)
@@ -265,8 +248,7 @@ def refine(
 ) -> tuple[float, int]:
     """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and the number of linear solves.
 
-    The cost is never above that of the nearest rank-2 matrix of the start. Residuals beyond ``gate`` have no
-    weight; ``delta`` is the width of Huber's loss.
+    Residuals beyond ``gate`` have no weight; ``delta`` is the width of Huber's loss.
     """
     U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
@@ -338,11 +320,10 @@ def refine_fundamental(
 ) -> F64:
     """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt, from a start F.
 
-    F = U diag(cos phi, sin phi, 0) V' (Bartoli and Sturm, PAMI 26, 2004) has rank 2 without the thesis'
-    exception of an epipole at infinity. The reprojection error gives the maximum likelihood for Gaussian
-    noise (HZ, algorithm 11.3); the Sampson distance is optimal to first order in the noise. With the
-    ``parameters`` "row" and "row-and-column" one row (and one column) of F is a combination of the others, as
-    in the thesis; its 18 (36) maps reach the same minimum more slowly.
+    The reprojection error gives the maximum likelihood for Gaussian noise (HZ, algorithm 11.3); the Sampson
+    distance is optimal to first order in the noise. With the ``parameters`` "row" and "row-and-column" one
+    row (and one column) of F is a combination of the others, as in the thesis; its 18 (36) maps reach the
+    same minimum more slowly.
     """
     if criterion not in _CRITERIA:
         raise ValueError(unknown_word("criterion", criterion, _CRITERIA))
@@ -404,14 +385,24 @@ class _RowMap:
 
 def _refine_by_rows(f: F64, points: F64, criterion: int, *, and_columns: bool) -> F64:
     """Minimise a criterion in the thesis' parameters; the map is chosen again when the estimate leaves it."""
-    current = f.reshape(3, 3)
+    current, G, h = f.reshape(3, 3), np.empty((9, 9)), np.empty(9)
     for _ in range(MAPS_TRIED):
         chart = _RowMap.best_for(current, and_columns=and_columns)
 
-        def residuals(p: F64, chart: _RowMap = chart) -> F64:
-            return np.asarray(residuals_and_derivatives(chart.matrix(p).ravel(), points, criterion)[0])
+        def cost(p: F64, chart: _RowMap = chart) -> float:
+            F = chart.matrix(p).ravel()
+            return float(normal_equations(F, points, criterion, np.inf, UNBOUNDED, G, h))
 
-        current = chart.matrix(minimize_residuals(residuals, chart.parameters(current)).x)
+        def linearize(p: F64, chart: _RowMap = chart) -> DenseSystem:
+            steps = 1e-6 * np.eye(7)
+            B = np.array([chart.matrix(p + d) - chart.matrix(p - d) for d in steps]).reshape(7, 9) / 2e-6
+            value = cost(p, chart)
+            return DenseSystem(value, B @ G @ B.T, B @ h)
+
+        problem = DenseProblem(linearize, lambda p, step: p + step, cost)
+        start = chart.parameters(current)
+        found = run_levenberg_marquardt(problem, start, max_iterations=MAX_ITERATIONS, initial_damping=1e-3)
+        current = chart.matrix(found.state)
         if _RowMap.best_for(current, and_columns=and_columns) == chart:
             break
     return current.ravel()

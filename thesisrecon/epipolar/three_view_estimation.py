@@ -135,8 +135,8 @@ def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
 class _ReprojectionProblem:
     """Reprojection error of points and lines by 18 coordinates c of P2 and P3 near those of a conditioned T.
 
-    A state is c and four coordinates f of each point (the last one unused) and line, all moves orthogonal to
-    the start. Points and lines are fitted to the cameras of each step (variable projection).
+    A state is c and four coordinates f of each point (the last one unused) and line, moves orthogonal to the
+    start, fitted to the cameras of each step (variable projection).
     """
 
     def __init__(self, T: F64, points: F64, segments: F64, transforms: F64, loss_px: float) -> None:
@@ -239,11 +239,7 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
 
 
 def _require_determined(fit: TrifocalFit, equations: _TensorEquations, xy: F64) -> None:
-    """Raise StageFailure if the noise alone decides a fit to points and segment ends xy (3, K, 2).
-
-    Three indicators: noise like that of the fit explains many solutions of the linear equations; the
-    covariance of the fit; collinear matches in an image.
-    """
+    """Raise StageFailure if the noise alone decides a fit to points and segment ends xy (3, K, 2)."""
     family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
@@ -291,8 +287,7 @@ class _TensorEquations:
     def noise_levels_px(self) -> F64:
         """Noise (27,) that would explain each of 27 solutions of the equations, the best first.
 
-        Roots of the eigenvalues of A'A relative to those of unit noise (Kanatani's renormalisation). If the
-        matches leave a family of tensors, as many values as it has dimensions are at or below the noise.
+        Roots of the eigenvalues of A'A relative to those of unit noise (Kanatani's renormalisation).
         """
         values, vectors = np.linalg.eigh(self.noise.T @ self.noise)
         whitening = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))

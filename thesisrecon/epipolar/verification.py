@@ -13,7 +13,6 @@ from enum import Enum
 import numpy as np
 import scipy
 
-from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import (
     PairFrame,
@@ -23,7 +22,6 @@ from thesisrecon.epipolar._matches import (
     log10_false_alarms,
     multiplicity_weights,
     noise_scale,
-    trimmed_noise_scale,
 )
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
@@ -35,11 +33,11 @@ from thesisrecon.epipolar.homography import (
     plane_covariance,
     refine_plane,
 )
-from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, refine
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
-from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.geometry.small_matrices import solve_positive
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.two_view import (
     epipoles,
@@ -48,6 +46,7 @@ from thesisrecon.geometry.two_view import (
     homography_sampson_residuals,
 )
 from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.optimize.noise import trimmed_noise_scale
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 MINIMUM = 12
@@ -62,7 +61,7 @@ BAND = 2.5
 EPIPOLE, BEYOND_TRANSLATION = 2, 5
 # Probability of rejecting a rotation by its eigenvalues (two-sided) and by the camera test.
 ROTATION_RISK = 1e-3
-CORRECTIONS, EXACT = 10, 1e-12
+CORRECTIONS = 10
 
 
 def _rotation_homography(parameters: F64) -> F64:
@@ -114,13 +113,10 @@ class Configuration(Enum):
 
 
 def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> Configuration:
-    """Determine which model explains at least 12 inliers of F.
+    """Determine which model explains at least 12 inliers of F (GENERAL: relief and baseline exceed noise).
 
-    GENERAL if relief and baseline exceed the noise.
-
-    The matches with their outliers show how many agree by chance. Both images are assumed to share their
-    intrinsics (otherwise a rotation is classified as a plane and a translation as general) and to have square
-    pixels.
+    The outliers show how many matches agree by chance. Both images are assumed to share their intrinsics
+    (otherwise a rotation is classified as a plane and a translation as general) and to have square pixels.
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
     inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
@@ -189,8 +185,7 @@ def _classify(case: _InlierData) -> Configuration:
 def _plane_noise(squared: F64) -> float:
     """Standard deviation of one coordinate from squared distances (N,) to a homography with outliers.
 
-    In sigma^2 they are chi-square(2) with the median 1.386; below 11 their halves across and along the
-    epipolar lines have the mean 0.977.
+    In sigma^2 they are chi-square(2): the median is 1.386, the mean of those below 11 is 2 * 0.977.
     """
     variance = float(np.median(squared)) / 1.386294
     for _ in range(3):
@@ -204,9 +199,8 @@ def _plane_noise(squared: F64) -> float:
 def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
     """Standard errors by which the squared parallax of the matches near the plane exceeds the noise.
 
-    A homography has 8 parameters for 2 K residuals and F takes 7 of the K across the epipolar lines: K - 1
-    remain along the lines, with the same variance if they are noise. The F of these matches alone is
-    compared.
+    A homography leaves 2 K - 8 of the residuals, F of these matches K - 7 across the epipolar lines: K - 1
+    along the lines have the same variance if they are noise.
     """
     k = int(near.sum())
     if k < MINIMUM - 4:
@@ -282,49 +276,23 @@ def _fit_translation(points: F64, sigma: float) -> F64:
 def _refine_translation(f: F64, points: F64, gate: float) -> None:
     """Minimise the Sampson distances of [e]x (9,) within the gate, in place, by Gauss-Newton."""
     e = np.array([f[7], f[2], f[3]])
-    if not np.linalg.norm(e) > EXACT:
-        return
-    e /= np.linalg.norm(e)
     kept = points[np.asarray(sampson_distances(f, points)) < gate]
-    if len(kept) >= 5:
-        _correct_epipole(e, np.ascontiguousarray(kept))
-        f[:] = (cross_matrix(e) / np.sqrt(2.0)).ravel()
-
-
-@kernel
-def _correct_epipole(e: F64, points: F64) -> None:
-    """Minimise the Sampson distances of [e]x of matches (K, 4) over the unit vector ``e``, in place."""
-    normal, gradient, J, n, step = empty((3, 3)), empty(3), empty(3), empty(3), empty(3)
+    if len(kept) < 5 or not np.linalg.norm(e) > 1e-12:
+        return
+    G, h = np.empty((9, 9)), np.empty(9)
+    by_e = cross_matrix(np.eye(3)).reshape(3, 9) / np.sqrt(2.0)
     for _ in range(CORRECTIONS):
-        normal[:], gradient[:] = 0.0, 0.0
-        for k in range(len(points)):
-            x1, y1, x2, y2 = points[k]
-            # x2 . (e x x1) = e . (x1 x x2); its gradients are e x x1 by x2 and x2 x e by x1, the first two
-            # rows, whose squares are g.
-            n[0], n[1], n[2] = y1 - y2, x2 - x1, x1 * y2 - y1 * x2
-            a0, a1 = e[1] - e[2] * y1, e[2] * x1 - e[0]
-            b0, b1 = y2 * e[2] - e[1], e[0] - x2 * e[2]
-            size = 1.0 / np.sqrt(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1 + EXACT**2)
-            residual = (n[0] * e[0] + n[1] * e[1] + n[2] * e[2]) * size
-            by_g = residual * size * size
-            J[0] = n[0] * size - by_g * (b1 - a1)
-            J[1] = n[1] * size - by_g * (a0 - b0)
-            J[2] = n[2] * size - by_g * (a1 * x1 - a0 * y1 + b0 * y2 - b1 * x2)
-            for i in range(3):
-                gradient[i] += J[i] * residual
-                for j in range(3):
-                    normal[i, j] += J[i] * J[j]
+        e /= np.linalg.norm(e)
+        normal_equations(e @ by_e, kept, SAMPSON, np.inf, UNBOUNDED, G, h)
         # The length of e has no effect on the distances: e e' fixes it.
-        held = normal[0, 0] + normal[1, 1] + normal[2, 2]
-        for i in range(3):
-            for j in range(3):
-                normal[i, j] += held * e[i] * e[j]
-        if not solve_damped(normal, gradient, 0.0, step):
+        normal = by_e @ G @ by_e.T
+        step = solve_positive(normal + np.trace(normal) * np.outer(e, e), -by_e @ h)
+        if step is None:
             break
         e += step
-        e /= np.sqrt(e @ e)
         if step @ step < 1e-20:
             break
+    f[:] = e / np.linalg.norm(e) @ by_e
 
 
 @dataclass(frozen=True)
@@ -367,34 +335,19 @@ class PairVerification:
         reason = self._objection(len(xy1), len(inliers))
         configuration, degeneracy = _assess_pair(matches, fit, rng)
         return TwoView(
-            i=matches.i,
-            j=matches.j,
-            F=fit.F,
-            sigma_px=fit.sigma_px,
-            index1=matches.index1[inliers],
-            index2=matches.index2[inliers],
-            xy1=xy1,
-            xy2=xy2,
-            affine=matches.affine[inliers],
-            candidates=len(inliers),
-            homography_inlier_ratio=ratio,
-            accepted=not reason,
-            reason=reason,
-            configuration=configuration,
-            degeneracy=degeneracy,
-        )
+            i=matches.i, j=matches.j, F=fit.F, sigma_px=fit.sigma_px, index1=matches.index1[inliers],
+            index2=matches.index2[inliers], xy1=xy1, xy2=xy2, affine=matches.affine[inliers],
+            candidates=len(inliers), homography_inlier_ratio=ratio, accepted=not reason, reason=reason,
+            configuration=configuration, degeneracy=degeneracy,
+        )  # fmt: skip
 
     def _objection(self, verified: int, candidates: int) -> str:
         """Reason to reject the pair, empty if there is none."""
         if verified < self.min_inliers:
             return Notice("few-inliers", verified, counted(candidates, "match"), self.min_inliers)
         if verified < self.min_inlier_ratio * candidates:
-            return Notice(
-                "low-inlier-ratio",
-                100.0 * verified / candidates,
-                counted(candidates, "match"),
-                100.0 * self.min_inlier_ratio,
-            )
+            found, least = 100.0 * verified / candidates, 100.0 * self.min_inlier_ratio
+            return Notice("low-inlier-ratio", found, counted(candidates, "match"), least)
         return ""
 
 
@@ -420,8 +373,8 @@ def homography_inlier_ratio(
 ) -> float:
     """The largest fraction of the matches (N, 2) of F that one homography maps to within ``tolerance_px``.
 
-    The best of 200 planes through three matches is fitted again to its inliers until they stay the same. A
-    ratio near 1 indicates a planar scene or a pure rotation; fewer than 5 matches always have a homography.
+    The best of 200 planes through three matches is fitted again to its inliers until they stay the same.
+    Fewer than 5 matches always have a homography.
     """
     n = len(xy1)
     if n < 5:

@@ -9,6 +9,5 @@ Pure functions of arrays, transform or camera first: ``project(P, X)``.
 3.6.1, 3.6.2, 3.6.4   ``two_view``: fundamental matrix, epipoles, homographies, residuals, canonical cameras
 3.6.3                 ``three_view``: the trifocal tensor
 6.3, 6.4              ``triangulation``, ``polynomial_triangulation`` (two views), resection
-7                     ``critical_motions``
 ===================== ============================================================================
 """

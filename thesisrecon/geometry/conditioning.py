@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -81,8 +80,7 @@ def scene_frame(X: F64) -> tuple[F64, float]:
 class SpaceFrame(NamedTuple):
     """Coordinates S N X of space: N (4, 4) centres and scales, S (4, 4) stretches.
 
-    Each is applied by itself: of coordinates far from the origin their product would lose the digits that
-    centring keeps.
+    Their product would lose the digits that centring keeps.
     """
 
     N: F64
@@ -115,9 +113,8 @@ def centring_transform(X: F64) -> F64:
 def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     """M for which the unit vectors x = M X / |M X| have sum x x' proportional to I (Tyler, Ann. Stat. 1987).
 
-    Every point counts as a direction, so neither homogeneous scales nor a few far points matter. No direction
-    is stretched more than ``_MAX_STRETCH`` times another, so that coplanar points keep their digits. det M >
-    0, which keeps orientations; I for fewer than 4 points.
+    Neither homogeneous scales nor a few far points matter. No direction is stretched more than
+    ``_MAX_STRETCH`` times another. det M > 0, which keeps orientations; I for fewer than 4 points.
     """
     M = np.eye(4)
     X = X[np.linalg.norm(X, axis=1) > 0.0]
@@ -133,14 +130,14 @@ def whitening_transform(X: F64, *, rounds: int = 4) -> F64:
     return M
 
 
-def centred_frame(X: F64, stretch: Callable[[F64], F64]) -> SpaceFrame:
-    """Frame that centres points (N, 4), then stretches them by a function of the centred points."""
+def whitened_frame(X: F64) -> SpaceFrame:
+    """Frame that centres points (N, 4), then whitens them."""
     N = centring_transform(X)
-    return SpaceFrame(N, stretch(X @ N.T))
+    return SpaceFrame(N, whitening_transform(X @ N.T))
 
 
 def unit_norm(F: F64) -> F64:
-    """Scale matrices (..., 3, 3) to unit Frobenius norm; zeros stay zeros."""
+    """Scale matrices (..., m, n) to unit Frobenius norm; zeros stay zeros."""
     norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))
     return F / np.where(norm > 0.0, norm, 1.0)
 

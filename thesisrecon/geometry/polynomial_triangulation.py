@@ -20,6 +20,8 @@ from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, require_finite, require_shapes
 from thesisrecon.geometry.conditioning import checked_unit
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.triangulation import sort_by_point, triangulate_linear
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 
 _Two = tuple[float, float]
 _Four = tuple[float, float, float, float]
@@ -209,23 +211,16 @@ def _best_of_pencil(a1: float, b1: float, a2: float, b2: float, B1: F64, B2: F64
 
 
 @kernel
-def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, pencil: F64) -> None:
-    """Move every match (N, 2), (N, 2) to its nearest exact one, in place; fill ``pencil`` (N, 2) with q.
-
-    Matches with a NaN are skipped and have q = 0.
-    """
+def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64) -> None:
+    """Move every match (N, 2), (N, 2) to its nearest exact one, in place."""
     c = empty(_DEGREE + 1)
     for k in range(len(xy1)):
         x1, y1, x2, y2 = xy1[k, 0], xy1[k, 1], xy2[k, 0], xy2[k, 1]
-        pencil[k, 0] = pencil[k, 1] = 0.0
-        if not math.isfinite(x1 + y1 + x2 + y2):
-            continue
         a1, b1 = L1[0, 0] * x1 + L1[1, 0] * y1 + L1[2, 0], L1[0, 1] * x1 + L1[1, 1] * y1 + L1[2, 1]
         a2, b2 = L2[0, 0] * x2 + L2[1, 0] * y2 + L2[2, 0], L2[0, 1] * x2 + L2[1, 1] * y2 + L2[2, 1]
         q0, q1, n1, n2 = _best_of_pencil(a1, b1, a2, b2, B1, B2, c)
         size = 1.0 / math.sqrt(q0 * q0 + q1 * q1)
         q0, q1, n1, n2 = q0 * size, q1 * size, n1 * size, n2 * size
-        pencil[k, 0], pencil[k, 1] = q0, q1
         u, v = L1[0, 0] * q0 + L1[0, 1] * q1, L1[1, 0] * q0 + L1[1, 1] * q1
         n1 = n1 / (u * u + v * v) if n1 != 0.0 else 0.0
         xy1[k, 0], xy1[k, 1] = x1 - n1 * u, y1 - n1 * v
@@ -234,63 +229,12 @@ def _correct_each_match(L1: F64, L2: F64, B1: F64, B2: F64, xy1: F64, xy2: F64, 
         xy2[k, 0], xy2[k, 1] = x2 - n2 * u, y2 - n2 * v
 
 
-@kernel
-def _intersect_planes(a: F64, b: F64, c: F64, X: F64) -> float:
-    """Fill X (4,) with the common point of three planes, by minors; return its relative norm."""
-    s01, s02, s03 = b[0] * c[1] - b[1] * c[0], b[0] * c[2] - b[2] * c[0], b[0] * c[3] - b[3] * c[0]
-    s12, s13, s23 = b[1] * c[2] - b[2] * c[1], b[1] * c[3] - b[3] * c[1], b[2] * c[3] - b[3] * c[2]
-    X[0] = a[1] * s23 - a[2] * s13 + a[3] * s12
-    X[1] = -a[0] * s23 + a[2] * s03 - a[3] * s02
-    X[2] = a[0] * s13 - a[1] * s03 + a[3] * s01
-    X[3] = -a[0] * s12 + a[1] * s02 - a[2] * s01
-    planes = (a @ a) * (b @ b) * (c @ c)
-    return math.sqrt((X @ X) / planes) if planes > 0.0 else 0.0
-
-
-@kernel
-def _intersect_rays(P: F64, L: F64, N: F64, back: F64, xy: F64, pencil: F64, X: F64) -> None:
-    """Fill X (M, 4), unit norm, with the intersections of the rays of exact matches.
-
-    P (2, 3, 4) cameras, L (2, 3, 2) the epipolar lines of the two images, xy (2, M, 2), ``pencil`` (M, 2) q.
-    Each ray is the epipolar plane N q intersected with the plane of the perpendicular line, so nothing is
-    solved. N (4, 3) ends with the sum of the centres, which represents the baseline if both points are
-    epipoles. ``back`` (4, 4) takes the point to the caller's frame. q = 0 gives a zero point.
-    """
-    P1, P2, L1, L2, xy1, xy2 = P[0], P[1], L[0], L[1], xy[0], xy[1]
-    plane, across1, across2, Y = empty(4), empty(4), empty(4), empty(4)
-    for k in range(len(X)):
-        q0, q1 = pencil[k, 0], pencil[k, 1]
-        X[k] = 0.0
-        if q0 == 0.0 and q1 == 0.0:
-            continue
-        u, v = L1[0, 0] * q0 + L1[0, 1] * q1, L1[1, 0] * q0 + L1[1, 1] * q1
-        w = v * xy1[k, 0] - u * xy1[k, 1]
-        r, s = L2[0, 0] * q0 + L2[0, 1] * q1, L2[1, 0] * q0 + L2[1, 1] * q1
-        t = s * xy2[k, 0] - r * xy2[k, 1]
-        for m in range(4):
-            plane[m] = N[m, 0] * q0 + N[m, 1] * q1
-            across1[m] = -v * P1[0, m] + u * P1[1, m] + w * P1[2, m]
-            across2[m] = -s * P2[0, m] + r * P2[1, m] + t * P2[2, m]
-        if not _intersect_planes(plane, across1, across2, Y) > 1e-14:
-            for m in range(4):
-                Y[m] = N[m, 2]
-        norm = 0.0
-        for m in range(4):
-            X[k, m] = back[m, 0] * Y[0] + back[m, 1] * Y[1] + back[m, 2] * Y[2] + back[m, 3] * Y[3]
-            norm += X[k, m] * X[k, m]
-        norm = 1.0 / math.sqrt(norm)
-        for m in range(4):
-            X[k, m] *= norm
-
-
 def _conditioning(xy: F64) -> tuple[float, F64, F64]:
     """Scale (one for both views), centre (2, 2) and the transforms (2, 3, 3) to ``scale (x - centre)``."""
     scale, centre, T = 1.0, np.zeros((2, 2)), np.zeros((2, 3, 3))
-    seen = np.isfinite(xy).all(axis=(0, 2))
-    if seen.any():
-        points = xy if seen.all() else xy[:, seen]
-        centre = points.mean(axis=1)
-        spread = float(np.abs(points - centre[:, None]).max())
+    if xy.size:
+        centre = xy.mean(axis=1)
+        spread = float(np.abs(xy - centre[:, None]).max())
         scale = 1.0 / spread if spread > 0.0 else 1.0
     T[:, 0, 0] = T[:, 1, 1] = scale
     T[:, :2, 2] = -scale * centre
@@ -298,15 +242,14 @@ def _conditioning(xy: F64) -> tuple[float, F64, F64]:
     return scale, centre, T
 
 
-def _balanced(L: F64) -> tuple[F64, F64, F64]:
-    """Lines L (2, 3, 2) of a pencil in a balanced basis, its change (2, 2) and the forms (2, 3)."""
+def _balanced(L: F64) -> tuple[F64, F64]:
+    """Lines L (2, 3, 2) of a pencil in a balanced basis, and the forms (2, 3)."""
     B = np.einsum("vka,vkb->vab", L[:, :2], L[:, :2])
     traces = np.maximum(np.trace(B, axis1=1, axis2=2), 1e-300)
     values, basis = np.linalg.eigh((B / traces[:, None, None]).sum(axis=0))
-    basis = basis / np.sqrt(np.maximum(values, _RANK * values[1]))
-    L = np.ascontiguousarray(L @ basis)
+    L = np.ascontiguousarray(L @ (basis / np.sqrt(np.maximum(values, _RANK * values[1]))))
     u, v = L[:, :2, 0], L[:, :2, 1]
-    return L, basis, np.stack([np.sum(u * u, axis=1), np.sum(u * v, axis=1), np.sum(v * v, axis=1)], axis=1)
+    return L, np.stack([np.sum(u * u, axis=1), np.sum(u * v, axis=1), np.sum(v * v, axis=1)], axis=1)
 
 
 def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
@@ -326,9 +269,9 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
         raise ValueError("correct_matches needs an F of rank 2; got one of rank 1")
     lines1 = Vt[:2].T
     lines2 = (U[:, :2] * s[:2]) @ Vt[:2] @ cross_matrix(Vt[2]) @ lines1
-    L, _, B = _balanced(np.stack([lines1, lines2]))
+    L, B = _balanced(np.stack([lines1, lines2]))
     moved = np.ascontiguousarray((xy - centre[:, None]) * scale)
-    _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], np.empty((len(xy1), 2)))
+    _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1])
     moved = moved / scale + centre[:, None]
     return moved[0], moved[1]
 
@@ -336,35 +279,27 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 def triangulate_polynomial(P: F64, xy: F64) -> F64:
     """Triangulate xy (2, N, 2) optimally from two views (6.3.3): unit points (N, 4); zeros where xy is NaN.
 
-    The sum of squared reprojection errors is the global minimum in any frame (:func:`correct_matches`). A
-    match whose nearest exact pair has one point on an epipole gives the centre of the other camera; with both
-    there, some point of the baseline.
+    The sum of squared reprojection errors is the global minimum in any frame. A match whose nearest exact
+    pair has one point on an epipole gives the centre of the other camera; both, some point of the baseline.
     """
     if P.shape != (2, 3, 4):
         raise ValueError(f'the polynomial method needs exactly two cameras, not {len(P)}; use "optimal"')
     require_shapes("triangulate_polynomial", xy=(xy, (2, "N", 2)))
     require_finite("triangulate_polynomial", P)
-    scale, centre, T = _conditioning(xy)
+    seen = np.isfinite(xy).all(axis=(0, 2))
+    T = _conditioning(xy[:, seen])[2]
     conditioned = T @ P
     size = np.linalg.norm(conditioned, axis=(1, 2), keepdims=True)
     stacked = (conditioned / np.where(size > 0.0, size, 1.0)).reshape(6, 4)
     columns = np.linalg.norm(stacked, axis=0)
-    columns = np.where(columns > 0.0, columns, 1.0)
-    U, s, Vt = np.linalg.svd(stacked / columns, full_matrices=False)
+    U, s, _ = np.linalg.svd(stacked / np.where(columns > 0.0, columns, 1.0), full_matrices=False)
     if not s[3] > _RANK * s[0]:
         raise ValueError("the polynomial method needs two cameras with different centres")
-    # In a frame of space with Q1'Q1 + Q2'Q2 = I the centres are orthonormal: eigenvectors of Q2'Q2 of the
-    # eigenvalues 0 (second camera) and 1 (first). The other two span the pencil of epipolar planes.
-    Q = np.ascontiguousarray(U.reshape(2, 3, 4))
-    values, vectors = np.linalg.eigh(Q[1].T @ Q[1])
+    # In a frame of space with Q1'Q1 + Q2'Q2 = I, the eigenvalues of Q2'Q2 of the centres are 0 and 1.
+    Q = U.reshape(2, 3, 4)
+    values = np.linalg.eigvalsh(Q[1].T @ Q[1])
     if not (values[1] > _RANK and 1.0 - values[2] > _RANK):
         raise ValueError("the polynomial method needs cameras of rank 3")
-    N = vectors[:, 1:3]
-    L, basis, B = _balanced(np.stack([Q[0] @ N / (1.0 - values[1:3]), Q[1] @ N / values[1:3]]))
-    planes = np.column_stack([N @ basis, vectors[:, 0] + vectors[:, 3]])
-    back = np.ascontiguousarray((Vt.T / s) / columns[:, None])
-    moved = np.ascontiguousarray((xy - centre[:, None]) * scale)
-    q, X = np.empty((xy.shape[1], 2)), np.empty((xy.shape[1], 4))
-    _correct_each_match(L[0], L[1], B[0], B[1], moved[0], moved[1], q)
-    _intersect_rays(Q, L, planes, back, moved, q, X)
-    return X
+    moved = np.full_like(xy, np.nan)
+    moved[:, seen] = correct_matches(T[1].T @ fundamental_from_cameras(*Q) @ T[0], *xy[:, seen])
+    return triangulate_linear(P, sort_by_point(moved), 0)

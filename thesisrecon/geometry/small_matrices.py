@@ -1,4 +1,4 @@
-"""Small matrices and loss functions: kernels that compile in a fraction of the time of LAPACK's wrappers."""
+"""Small matrices: kernels that compile in a fraction of the time of LAPACK's wrappers."""
 
 from __future__ import annotations
 
@@ -9,35 +9,6 @@ import scipy
 
 from thesisrecon._numba import kernel, zeros
 from thesisrecon.arrays import F64
-
-TINY = 1e-12
-
-
-@kernel(inline="always")
-def loss_value(s: float, delta: float) -> float:
-    """Evaluate Huber's rho(s); least squares if delta is infinite."""
-    d2 = delta * delta
-    return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
-
-
-@kernel(inline="always")
-def loss_weight(s: float, delta: float) -> float:
-    """Evaluate rho'(s)."""
-    return 1.0 if s <= delta * delta else delta / math.sqrt(s)
-
-
-@kernel(inline="always")
-def loss_curvature(s: float, delta: float) -> float:
-    """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves."""
-    return 1.0 if s / (delta * delta) <= 1.0 else 0.0
-
-
-@kernel(inline="always")
-def away_from_zero(w: float) -> float:
-    """Move a projective depth off 0, so that a point in the focal plane gets a huge residual."""
-    if w >= 0.0:
-        return max(w, TINY)
-    return min(w, -TINY)
 
 
 @kernel
@@ -63,14 +34,6 @@ def invert_cholesky_3x3(
     out[2, 1] = -l21 * out[1, 1] * out[2, 2]
     out[2, 0] = -(l20 * out[0, 0] + l21 * out[1, 0]) * out[2, 2]
     return True
-
-
-@kernel
-def invert_positive_3x3(M: F64, root: F64, out: F64) -> bool:
-    """Invert a symmetric positive matrix by Cholesky factorisation."""
-    positive: bool = invert_cholesky_3x3(M[0, 0], M[1, 0], M[2, 0], M[1, 1], M[2, 1], M[2, 2], root)
-    multiply_transposed_3x3(root, out)
-    return positive
 
 
 @kernel(inline="always")
@@ -166,16 +129,3 @@ def orthogonalize_columns(A: F64, V: F64) -> None:
                     V[i, p], V[i, q] = cosine * V[i, p] - sine * V[i, q], sine * V[i, p] + cosine * V[i, q]
         if not turned:
             break
-
-
-@kernel
-def shortest_column(A: F64) -> int:
-    """Index of the column of least length, the first of several."""
-    best, least = 0, math.inf
-    for p in range(A.shape[1]):
-        length = 0.0
-        for i in range(A.shape[0]):
-            length += A[i, p] ** 2
-        if length < least:
-            best, least = p, length
-    return best

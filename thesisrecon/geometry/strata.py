@@ -4,8 +4,8 @@ A transform G (4, 4) maps points X -> G X, as in the thesis' table 3.3; the matr
 text act on rows, X' -> X' G, and are the transposes of those here.
 
 Invariants: projective - cross-ratio, incidence, tangency, sign of the Gaussian curvature; affine -
-parallelism, ratios of volumes and of lengths along a line, centroids; metric - angles, ratios of lengths;
-Euclidean - lengths. Two metric models differ by a similarity (3.4.4).
+parallelism, ratios of volumes and of lengths along a line; metric - angles, ratios of lengths (two metric
+models differ by a similarity, 3.4.4); Euclidean - lengths.
 
 C is a conic (3, 3) of the points x'C x = 0 (3.1) or a quadric (4, 4) with X'Q X = 0 (3.8); its dual has
 l'C* l = 0 (3.3) or Pi'Q* Pi = 0 (3.9). The tangent line at x is C x, the tangent plane at X is Q X (3.7). All
@@ -55,8 +55,8 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
 def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
     """The smallest group that a transform belongs to (figure 3.1).
 
-    With G = [A t; b' 1] the transform is affine if b = 0, metric if also A'A = s^2 I and det A > 0, and
-    Euclidean if also s = 1. The unit of length of the test is that of G, or |t| / |A| if this is larger.
+    G = [A t; b' 1] is affine if b = 0, metric if also A'A = s^2 I and det A > 0, and Euclidean if also s = 1.
+    The unit of length of the test is that of G, or |t| / |A| if this is larger.
     """
     if G.shape == (4, 4) and np.isfinite(G).all() and G[:3, :3].any():
         length = max(1.0, float(np.linalg.norm(G[:3, 3]) / np.linalg.norm(G[:3, :3])))
@@ -155,9 +155,7 @@ def upgrade_cameras(P: F64, K: F64, metric_from_projective: F64) -> tuple[F64, F
 
 
 def upgrade_points(X: F64, valid: B8, metric_from_projective: F64) -> tuple[F64, B8, float]:
-    """Points (N, 3), zeros where not finite; which are finite; and the scale of their frame, which is free:
-    the median of their distances from their median.
-    """
+    """Points (N, 3), zeros where not finite; which are finite; their median distance from their median."""
     Xm = X @ metric_from_projective.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         X = Xm[:, :3] / Xm[:, 3:]
@@ -228,10 +226,7 @@ def dual(C: F64) -> F64:
 
 
 def _length_scale(C: F64) -> float:
-    """Unit of length, at least 1, in which the blocks of a conic or quadric [A b; b' c] are of similar size.
-
-    It conditions conics and quadrics far from the origin.
-    """
+    """Unit of length, at least 1, in which the blocks of a conic or quadric [A b; b' c] are similar."""
     a, b, c = (float(np.linalg.norm(part)) for part in (C[:-1, :-1], C[:-1, -1], C[-1, -1]))
     return max(1.0, b / a, math.sqrt(c / a)) if a > 1e-15 * max(b, c) else 1.0
 
@@ -239,8 +234,8 @@ def _length_scale(C: F64) -> float:
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
     """Real intersections (0 to 2, d) of a conic or quadric with the line of two points (3.5).
 
-    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y. The discriminant S(x, y)^2 - S(x)
-    S(y) is 0 for tangents (3.6, where the thesis' text lost the square). None for a line of the quadric.
+    Solves a^2 S(x) + 2 a b S(x, y) + b^2 S(y) = 0 for the points a x + b y, if it is not 0. The
+    discriminant S(x, y)^2 - S(x) S(y) is 0 for tangents (3.6, where the thesis' text lost the square).
     """
     require_finite("intersect_line", C)
     units = np.append(np.full(len(C) - 1, _length_scale(C)), 1.0)
@@ -262,9 +257,8 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
 def curvature_sign(Q: F64) -> int:
     """The sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
 
-    K = -det Q / |grad|^4 up to a positive factor, and det(G^-T Q G^-1) has the sign of det Q: 1 for
-    ellipsoids, elliptic paraboloids and hyperboloids of two sheets, -1 for saddles, 0 for cones, cylinders
-    and planes.
+    K = -det Q / |grad|^4 up to a positive factor: 1 for ellipsoids, elliptic paraboloids and hyperboloids of
+    two sheets, -1 for saddles, 0 for cones, cylinders and planes.
     """
     require_finite("curvature_sign", Q)
     units = np.append(np.full(3, _length_scale(Q)), 1.0)

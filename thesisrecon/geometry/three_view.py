@@ -61,9 +61,8 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
 def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     """Transfer matches of views 1 and 2 to view 3 (figure 3.14).
 
-    The matches are corrected (6.3.3); then the line l2 through x2 perpendicular to its epipolar line
-    transfers x1 by the homography l2_j T_i^jk (HZ 15.3), also for points of the plane of the centres. Inf or
-    NaN for points of the line through the centres of views 1 and 2.
+    The line l2 through the corrected x2 (6.3.3) perpendicular to its epipolar line transfers x1 by the
+    homography l2_j T_i^jk (HZ 15.3). Inf or NaN for points of the line through the centres of views 1 and 2.
     """
     F21, _ = fundamentals_from_tensor(T)
     xy1, xy2 = correct_matches(F21, xy1, xy2)
@@ -84,9 +83,8 @@ def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:
     """The unit epipoles of the first camera in views 2 and 3 (HZ algorithm 15.1).
 
-    e2 is orthogonal to the left null vectors u_i of the T_i (u_i'T_i = 0), e3 to the right ones; least
-    squares for a noisy T. The coordinates of view 1 are rotated first, because T_i has rank 1 (a plane of
-    null vectors) if the i-th unit vector of view 1 is an epipole, as in rectified images.
+    e2 is orthogonal to the left null vectors of the T_i, e3 to the right ones. The coordinates of view 1 are
+    rotated first: T_i has rank 1 if the i-th unit vector of view 1 is an epipole, as in rectified images.
     """
     require_finite("tensor_epipoles", T)
     sizes = np.linalg.norm(T, axis=(1, 2), keepdims=True)

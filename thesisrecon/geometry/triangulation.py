@@ -16,7 +16,7 @@ from thesisrecon.arrays import F64, I64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.conditioning import normalizing_transform
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.small_matrices import orthogonalize_columns, shortest_column
+from thesisrecon.geometry.small_matrices import orthogonalize_columns
 
 PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
@@ -46,47 +46,16 @@ def _insert_row(R: F64, row: F64) -> None:
 
 @kernel
 def _least_singular_vector(R: F64, x: F64) -> None:
-    """Fill x (4,) with the unit vector of least |R x|, R (4, 4) upper triangular.
-
-    Inverse iteration; Jacobi rotations if the two least singular values are close.
-    """
-    largest = max(abs(R[0, 0]), abs(R[1, 1]), abs(R[2, 2]), abs(R[3, 3]))
-    floor = max(1e-16 * largest, 1e-300)
-    d0, d1 = 1.0 / max(R[0, 0], floor), 1.0 / max(R[1, 1], floor)
-    d2, d3 = 1.0 / max(R[2, 2], floor), 1.0 / max(R[3, 3], floor)
-    y0, y1, y2, y3 = 0.0, 0.0, 0.0, 1.0
-    x0 = x1 = x2 = x3 = 0.0
-    for k in range(9):
-        if k > 0:
-            y0 = x0 * d0
-            y1 = (x1 - R[0, 1] * y0) * d1
-            y2 = (x2 - R[0, 2] * y0 - R[1, 2] * y1) * d2
-            y3 = (x3 - R[0, 3] * y0 - R[1, 3] * y1 - R[2, 3] * y2) * d3
-        z3 = y3 * d3
-        z2 = (y2 - R[2, 3] * z3) * d2
-        z1 = (y1 - R[1, 2] * z2 - R[1, 3] * z3) * d1
-        z0 = (y0 - R[0, 1] * z1 - R[0, 2] * z2 - R[0, 3] * z3) * d0
-        size = 1.0 / math.sqrt(z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3)
-        z0, z1, z2, z3 = z0 * size, z1 * size, z2 * size, z3 * size
-        change = abs(z0 - x0) + abs(z1 - x1) + abs(z2 - x2) + abs(z3 - x3)
-        x0, x1, x2, x3 = z0, z1, z2, z3
-        if change < 1e-13:
-            x[0], x[1], x[2], x[3] = x0, x1, x2, x3
-            return
-    _jacobi_least(R, x)
-
-
-@kernel
-def _jacobi_least(R: F64, x: F64) -> None:
-    """Fill x (4,) with the unit vector of least |R x| by one-sided Jacobi rotations (Hestenes)."""
-    A, V = empty((4, 4)), empty((4, 4))
+    """Fill x (4,) with the unit vector of least |R x|, x[3] >= 0, by one-sided Jacobi rotations."""
+    A, V, least = empty((4, 4)), empty((4, 4)), math.inf
     for i in range(4):
-        for p in range(4):
-            A[i, p] = R[i, p] if p >= i else 0.0
+        copy_to(A[i], R[i])
     orthogonalize_columns(A, V)
-    best = shortest_column(A)
-    for i in range(4):
-        x[i] = V[i, best]
+    for p in range(4):
+        length = A[0, p] ** 2 + A[1, p] ** 2 + A[2, p] ** 2 + A[3, p] ** 2
+        if length < least:
+            least, sign = length, math.copysign(1.0, V[3, p])
+            x[0], x[1], x[2], x[3] = sign * V[0, p], sign * V[1, p], sign * V[2, p], sign * V[3, p]
 
 
 @kernel
@@ -140,9 +109,8 @@ def _triangulate_each_linear(
 ) -> None:
     """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,).
 
-    Points observed from one ``centre`` (V, 4) stay 0. ``passes`` > 0: repeat with each row over the
-    depth p3'X of the last pass until no depth changes by more than ``tolerance``, relative. Without
-    convergence the better reprojection of the last and the linear answer is kept.
+    Points observed from one ``centre`` (V, 4) stay 0. ``passes`` > 0: repeat with each row over the depth
+    p3'X of the last pass until no depth changes by more than ``tolerance``, else the better answer is kept.
     """
     start, view, xy = listed
     R, row, x, y = zeros((4, 4)), empty(4), empty(4), empty(4)
@@ -262,8 +230,7 @@ def triangulate_midpoint(P: F64, listed: SortedPixels) -> F64:
 def resect_linear(X: F64, xy: F64) -> F64:
     """Unit cameras of least algebraic residual (DLT) of points X (..., M, 4) and xy (..., M, 2), M >= 6.
 
-    Best with whitened unit vectors X. Coplanar points do not determine the camera; one of the solutions
-    results.
+    Best with whitened unit vectors X; coplanar points do not determine the camera.
     """
     if X.shape[-2] < 6:
         raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
@@ -281,8 +248,8 @@ def resect_linear(X: F64, xy: F64) -> F64:
     return np.asarray(P / np.linalg.norm(P, axis=(-2, -1), keepdims=True))
 
 
-def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
-    """All poses R, t that see three points X (B, 3, 3) along unit rays (B, 3, 3), and their samples (P3P).
+def pose_from_three_points(X: F64, rays: F64) -> F64:
+    """All poses [R t] (B', 3, 4) that see three points X (B, 3, 3) along unit rays (B, 3, 3) (P3P).
 
     With side lengths a = |X2 - X3|, b = |X1 - X3|, c = |X1 - X2| and the angles between the rays, the ratio v
     = s3 / s1 of the distances is a root of Grunert's quartic: up to four poses a sample (Haralick et al.,
@@ -309,12 +276,11 @@ def pose_from_three_points(X: F64, rays: F64) -> tuple[F64, F64, I64]:
         s1 = np.sqrt(b2 / (1 + v**2 - 2 * v * cb))
     Y = np.stack([s1, u * s1, v * s1], axis=1)[:, :, None] * rays
     good = np.isfinite(Y).all(axis=(1, 2)) & (u > 0)
-    X, Y, sample = X[good], Y[good], sample[good]
+    X, Y = X[good], Y[good]
     R = _triad(Y) @ _triad(X).swapaxes(1, 2)
     t = Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1))
     # The triads of points on one line, as of equal rays, are no bases.
-    proper = np.linalg.det(R) > 0.5
-    return R[proper], t[proper], sample[proper]
+    return np.concatenate([R, t[:, :, None]], axis=2)[np.linalg.det(R) > 0.5]
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:

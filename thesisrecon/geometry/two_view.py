@@ -116,10 +116,9 @@ def plane_homography(P1: F64, P2: F64, plane: F64) -> F64:
     """The homography x2 ~ H x1 of unit norm between two images induced by a plane (3.29 - 3.32).
 
     H = P2 ((Pi'C) I - C Pi') P1^+ with the centre C of P1: the ray of a pixel meets the plane and the point
-    is projected. For P1 = [I 0], P2 = [M m] and the plane (pi, 1) it is H_Pi = M - m pi' (3.29), which maps
-    the point (x, -pi'x) to its image; [M m] = [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40). In
-    general it equals H_Pi2 H_Pi1^-1 (3.30), also for planes through the origin; singular for a plane through
-    the second centre.
+    is projected. For P1 = [I 0], P2 = [M m] and the plane (pi, 1) it is H_Pi = M - m pi' (3.29), and [M m] =
+    [H_Pi + e2 pi', e2] with the epipole e2 = m (3.36-3.40). In general it equals H_Pi2 H_Pi1^-1 (3.30), also
+    for planes through the origin; singular for a plane through the second centre.
     """
     P1, P2, plane = (checked_unit(array, "plane_homography") for array in (P1, P2, plane))
     centre = checked_unit(camera_centre(P1), "plane_homography, for the centre of its first camera,")
@@ -144,10 +143,9 @@ def infinite_homography(P1: F64, P2: F64) -> F64:
 def quasi_euclidean_planes(F: F64) -> F64:
     """The two v that make the left part of P2 (:func:`canonical_cameras`) nearest to a rotation.
 
-    v = +-(s1 + s2) / 2 e1 with the singular values s1 >= s2 of F gives the left part the singular values s1,
-    (s1 + s2) / 2, s2. With a calibration near the identity v is near the plane at infinity. The two solutions
-    differ by a rotation of 180 degrees about the baseline; only matches decide between them. That of the
-    smaller rotation is first (Beardsley, Zisserman and Murray, IJCV 23, 1997).
+    v = +-(s1 + s2) / 2 e1 with the singular values s1 >= s2 of F: near the plane at infinity if the
+    calibration is near the identity (Beardsley, Zisserman and Murray, IJCV 23, 1997). Only matches decide
+    between the two, which differ by 180 degrees about the baseline; that of the smaller rotation is first.
     """
     F = unit_norm(F)
     e1, e2 = epipoles(F)
@@ -225,8 +223,7 @@ def require_parallax_of_matches(
 ) -> None:
     """Raise ``StageFailure`` if one homography explains the N >= 4 inliers of F (section 5.5).
 
-    F is then arbitrary and the images contain no depth: the camera only rotated, or the scene is a plane.
-    ``at_infinity`` is the homography of the plane at infinity of known cameras: a plane then has parallax.
+    With ``at_infinity``, the homography of the plane at infinity of known cameras, a plane has parallax.
     Without it, matches that are no inliers of F are refused too, as of images in the other order.
     """
     distances = np.abs(sampson_residuals(F, xy1, xy2))
@@ -254,10 +251,7 @@ def require_parallax_of_matches(
 
 
 def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Residuals (N,) of a least-squares homography, fitted twice more without the worst tenth of the matches.
-
-    At least four matches remain.
-    """
+    """Residuals (N,) of a least-squares homography, fitted twice more without the worst tenth of them."""
     inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
     for _ in range(3):
         H = homography_linear(xy1[inliers], xy2[inliers])

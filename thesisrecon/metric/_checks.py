@@ -16,7 +16,6 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice
-from thesisrecon.geometry.critical_motions import UpgradedCameras
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import (
     FOCAL,
@@ -29,6 +28,7 @@ from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
 from thesisrecon.metric._uncertainty import USUAL_INFLATION, Intervals
 from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
+    UpgradedCameras,
     excess_equations,
     identifiability_report,
 )

@@ -17,6 +17,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import undistort
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import Reconstruction, Similarity
 
 MIN_COMMON, MIN_SHARE = 6, 0.6
@@ -130,7 +131,7 @@ def join_models(
 def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> list[Similarity]:
     """Similarities of three points: of all triples up to ``most``, or of as many random ones."""
     whole = np.flatnonzero(points.whole)
-    chosen = whole[rng.random((most, len(whole))).argpartition(2, axis=1)[:, :3]]
+    chosen = whole[draw_samples(rng, most, len(whole), 3)]
     if scipy.special.comb(len(whole), 3) <= most:
         chosen = np.array(list(combinations(whole, 3)))
     a, b = points.a[chosen], points.b[chosen]

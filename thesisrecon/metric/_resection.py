@@ -29,6 +29,7 @@ from thesisrecon.metric._model import (
     seen_views,
 )
 from thesisrecon.optimize.bundle.partial import refine_pose
+from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.optimize.robust_resection import resect_calibrated
 
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
@@ -58,9 +59,9 @@ def _pose_and_focal(
         threshold = threshold_px / table[row, 0]
         # The nearest of the tried focals may be some per cent off: widen the gate.
         threshold = max(threshold, 0.01) if len(zooms) > 1 else threshold
-        pose = resect_calibrated(model.X[t.point_index[k]], normalized, threshold=threshold, rng=rng)
-        if pose is not None and (best is None or pose[2].sum() > best[3].sum()):
-            best = pose[0], pose[1], table[row], pose[2]
+        pose, inlier = resect_calibrated(model.X[t.point_index[k]], normalized, threshold=threshold, rng=rng)
+        if pose is not None and (best is None or inlier.sum() > best[3].sum()):
+            best = pose[:, :3], pose[:, 3], table[row], inlier
     return best
 
 
@@ -237,10 +238,11 @@ class _Evidence:
 
     def start(self, gate: float, rng: np.random.Generator) -> tuple[F64, F64] | None:
         """The pose of three points with the least cost."""
-        chosen = rng.random((300, len(self.X))).argpartition(2, axis=1)[:, :3]
+        chosen = draw_samples(rng, 300, len(self.X), 3)
         unit = self.of_points / np.linalg.norm(self.of_points, axis=1, keepdims=True)
-        R, t, _ = pose_from_three_points(self.X[chosen], unit[chosen])
-        return min(zip(R, t, strict=True), key=lambda pose: self.cost(pose, gate), default=None)
+        poses = pose_from_three_points(self.X[chosen], unit[chosen])
+        found = [(pose[:, :3], pose[:, 3]) for pose in poses]
+        return min(found, key=lambda pose: self.cost(pose, gate), default=None)
 
     def refined(self, pose: tuple[F64, F64], noise: float, gate: float) -> tuple[F64, F64]:
         """The pose near ``pose`` with the least robust cost."""

@@ -153,7 +153,7 @@ def _variance_by_own_values(
     own, focals = (np.unique(number[:, c][number[:, c] >= 0]) for c in (columns, (FOCAL,)))
     if not len(focals):
         return 0.0
-    unit = np.diag(terms.information(fit.values.size))[own] ** -0.5
+    unit = terms.information().diagonal()[own] ** -0.5
     C = fit.solve(np.eye(fit.information.shape[0])[:, fit.first + own]) / unit
     gradient = fit.J.T @ fit.residual
     gradient[fit.first :] += terms.gradient(fit.start)

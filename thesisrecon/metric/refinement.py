@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry.critical_motions import measure_motion, nearest_critical_motion
 from thesisrecon.metric._adjustment import (
     FOCAL_AND_CENTRE,
     MAX_CHANGE,
@@ -63,7 +62,7 @@ from thesisrecon.metric._uncertainty import (
     widen_by_camera_model,
     widen_unverified_focals,
 )
-from thesisrecon.optimize.bundle.identifiability import excess_noise
+from thesisrecon.optimize.bundle.identifiability import excess_noise, measure_motion, nearest_critical_motion
 from thesisrecon.optimize.bundle.scatter import (
     BlockScatter,
     LinearisedFit,

@@ -29,8 +29,8 @@ _MANY = 1200
 class _LinearSystem(Protocol[StepOut]):
     """Normal equations at one state.
 
-    ``solve`` returns the damped step, its predicted decrease in cost (gain), and the part of the gain due to
-    the cameras (in small problems all of it); None if the system is singular.
+    ``solve`` returns the damped step, its predicted decrease in cost (gain), and the part due to the cameras
+    (in small problems all of it); None if the system is singular.
     """
 
     @property
@@ -65,21 +65,15 @@ class Descent(Generic[State]):
 
 
 def run_levenberg_marquardt(
-    problem: _Problem[State, Step],
-    state: State,
-    *,
-    max_iterations: int,
-    tolerance: float = 1e-10,
-    min_camera_gain: float = 0.0,
-    initial_damping: float = _WEAKEST,
-) -> Descent[State]:
+    problem: _Problem[State, Step], state: State, *, max_iterations: int, tolerance: float = 1e-10,
+    min_camera_gain: float = 0.0, initial_damping: float = _WEAKEST,
+) -> Descent[State]:  # fmt: skip
     """Minimise a problem by Levenberg-Marquardt (6.7).
 
-    The cost never rises and singular systems raise nothing. The damping multiplies the diagonal (Marquardt
-    1963), so that units do not matter and gauge freedoms need no other treatment; it follows Nielsen
-    (IMM-REP-1999-05). It ends when the predicted gain of an undamped step is at most ``tolerance`` relative
-    to the cost, or that of the cameras at most ``min_camera_gain``. A small gain of a damped step is no sign
-    of a minimum: in a valley the damping makes steps short.
+    The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge freedoms need
+    no other treatment; it follows Nielsen (IMM-REP-1999-05). It ends when the predicted gain of an undamped
+    step is at most ``tolerance`` relative to the cost, or that of the cameras at most ``min_camera_gain``: in
+    a valley the damping makes steps short.
     """
     system = problem.linearize(state)
     cost, damping, growth = system.cost, initial_damping, 2.0
@@ -133,6 +127,15 @@ class DenseSystem:
         return step, gain, gain
 
 
+@dataclass(frozen=True)
+class DenseProblem(Generic[State]):
+    """A problem of functions of its state, with dense normal equations."""
+
+    linearize: Callable[[State], DenseSystem]
+    retract: Callable[[State, F64], State]
+    cost: Callable[[State], float]
+
+
 def invert_information(information: F64) -> F64:
     """Invert an information matrix, eigenvalues floored relative to the largest; inf if not finite.
 
@@ -170,26 +173,6 @@ def _squared(s: F64) -> tuple[F64, F64]:
     return s, np.ones_like(s)
 
 
-@dataclass(frozen=True)
-class _VectorProblem:
-    residual_fn: Callable[[F64], F64]
-    jacobian: Callable[[F64], F64] | None
-    loss: Callable[[F64], tuple[F64, F64]]
-
-    def linearize(self, state: F64) -> DenseSystem:
-        r = self.residual_fn(state)
-        J = self.jacobian(state) if self.jacobian else _difference_jacobian(self.residual_fn, state, r)
-        rho, weight = self.loss(r**2)
-        return DenseSystem(0.5 * float(rho.sum()), (J.T * weight) @ J, J.T @ (weight * r))
-
-    def retract(self, state: F64, step: F64) -> F64:
-        return state + step
-
-    def cost(self, state: F64) -> float:
-        r = self.residual_fn(state)
-        return 0.5 * float(self.loss(r**2)[0].sum()) if np.isfinite(r).all() else np.inf
-
-
 def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
     """Return forward differences (M, D), steps sqrt(eps) (1 + |x|); columns outside the domain are 0."""
     J = np.zeros((len(residual), len(x)))
@@ -203,25 +186,31 @@ def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F6
 
 
 def minimize_residuals(
-    residual_fn: Callable[[F64], F64],
-    x0: F64,
-    *,
-    jacobian: Callable[[F64], F64] | None = None,
-    loss: Callable[[F64], tuple[F64, F64]] = _squared,
-    max_iterations: int = 50,
-    tolerance: float = 1e-10,
-) -> ResidualMinimum:
+    residual_fn: Callable[[F64], F64], x0: F64, *, jacobian: Callable[[F64], F64] | None = None,
+    loss: Callable[[F64], tuple[F64, F64]] = _squared, max_iterations: int = 50, tolerance: float = 1e-10,
+) -> ResidualMinimum:  # fmt: skip
     """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt, with forward differences by default.
 
     States with residuals that are not finite are rejected; such a start is a ``ValueError``.
     """
     if not (np.isfinite(x0).all() and np.isfinite(residual_fn(x0)).all()):
         raise ValueError("minimize_residuals needs a start with finite residuals")
-    problem = _VectorProblem(residual_fn, jacobian, loss)
+
+    def linearize(x: F64) -> DenseSystem:
+        r = residual_fn(x)
+        J = jacobian(x) if jacobian else _difference_jacobian(residual_fn, x, r)
+        rho, weight = loss(r**2)
+        return DenseSystem(0.5 * float(rho.sum()), (J.T * weight) @ J, J.T @ (weight * r))
+
+    def cost_at(x: F64) -> float:
+        r = residual_fn(x)
+        return 0.5 * float(loss(r**2)[0].sum()) if np.isfinite(r).all() else np.inf
+
+    problem = DenseProblem(linearize, lambda x, step: x + step, cost_at)
     found = run_levenberg_marquardt(
         problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
     )
     x, cost = found.state, found.cost
     residual = residual_fn(x)
     variance = 2.0 * cost / max(len(residual) - len(x0), 1)
-    return ResidualMinimum(x, cost, variance * invert_information(problem.linearize(x).hessian), residual)
+    return ResidualMinimum(x, cost, variance * invert_information(linearize(x).hessian), residual)

@@ -51,12 +51,23 @@ def next_inlier_limit(distance: F64, inliers: B8, limit: float, *, unknowns: int
     )
 
 
+def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
+    """Standard deviation of residuals >= 0 within 2.5 standard deviations; ``start`` if these are too few."""
+    sigma = start
+    for _ in range(5):
+        kept = residuals[residuals <= 2.5 * sigma]
+        if len(kept) <= 2 * parameters:
+            return start
+        # The variance of a normal variable trimmed there is 0.911.
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / 0.91125))
+    return sigma
+
+
 def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:
     """The width of Huber's loss with the least expected variance, infinite for least squares.
 
-    The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber, 1964) is estimated from the residuals (N,) >= 0
-    (Jaeckel, 1971). Few residuals may appear heavy-tailed by chance: Huber's loss must reduce the variance by
-    more than twice the effect of chance.
+    The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber, 1964) is estimated from residuals (N,) >= 0
+    (Jaeckel, 1971) and must be smaller by more than twice the effect of chance.
     """
     n = len(residuals)
     if n <= 2 * parameters:

@@ -12,7 +12,7 @@ import scipy.sparse
 from thesisrecon._numba import full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.conditioning import centred_frame, pixel_from_unit, whitening_transform
+from thesisrecon.geometry.conditioning import pixel_from_unit, whitened_frame
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
 from thesisrecon.optimize.bundle.observations import Observations
@@ -387,7 +387,7 @@ def adjust_locally(
 
 def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
     """Transform to a well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept."""
-    frame = centred_frame(X[model.valid], whitening_transform)
+    frame = whitened_frame(X[model.valid])
     P, X = frame.cameras(P), frame.points(X)
     length = np.linalg.norm(X, axis=1, keepdims=True)
     norm = np.linalg.norm(P, axis=(1, 2), keepdims=True)

@@ -15,13 +15,14 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.geometry.critical_motions import nearest_critical_motion, projective_infinity_shifts
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.optimize.bundle.identifiability import (
     CalibrationProblem,
     excess_equations,
     identifiability_report,
     identifiability_sentences,
+    nearest_critical_motion,
+    projective_infinity_shifts,
 )
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations

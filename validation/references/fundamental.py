@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.arrays import F64
-from thesisrecon.epipolar.linear import estimate_eight_point, estimate_seven_point
-from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point, estimate_seven_point
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from validation.references.libraries import cv2, poselib, pycolmap

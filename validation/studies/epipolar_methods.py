@@ -20,9 +20,8 @@ from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.arrays import F64
 from thesisrecon.config import FundamentalEstimator
 from thesisrecon.epipolar._matches import PairFrame
-from thesisrecon.epipolar.linear import estimate_eight_point
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac
+from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, estimate_eight_point
 from thesisrecon.epipolar.refinement import Criterion, Parameters, fundamental_covariance, refine_fundamental
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure

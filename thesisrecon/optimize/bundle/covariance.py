@@ -14,7 +14,7 @@ from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF
 from thesisrecon.optimize.bundle.observations import Jacobians
 from thesisrecon.optimize.bundle.schur import ReducedSystem, order_views
 from thesisrecon.optimize.least_squares import invert_information
-from thesisrecon.optimize.noise import MAD_FACTOR
+from thesisrecon.optimize.noise import MAD_FACTOR, trimmed_noise_scale
 
 SIMILARITY_DOF = 7
 MAX_DENSE = 1200
@@ -34,21 +34,14 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     if not informative.any():
         return 0.0
     size = np.abs(residual[informative]) / np.sqrt(kept[informative])
-    sigma = MAD_FACTOR * float(np.median(size))
-    for _ in range(5):
-        within = size[size <= 2.5 * sigma]
-        if len(within):
-            # The variance of a standard normal variable within 2.5 sigma.
-            sigma = float(np.sqrt(np.mean(within**2) / 0.91126))
-    return sigma
+    return trimmed_noise_scale(size, MAD_FACTOR * float(np.median(size)), parameters=0)
 
 
 def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
-    """Return the covariance (n, C + e, C + e) of pairs of views with a common point, and of the border.
+    """Return the covariance (n, C + e, C + e) of views ``row`` and the border with ``column`` and the border.
 
-    Its rows are the columns of view ``row``, then the border, its columns those of view ``column`` and the
-    border. It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved
-    the cameras least. ``R`` and ``t`` are those of the b views with observations.
+    It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved the
+    cameras least. ``R`` and ``t`` are those of the b views with observations.
     """
     (b, C, e), D = reduced.sums.border.shape, len(reduced.sums.rhs)
     if not b:
@@ -133,9 +126,8 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
 def sparse_inverse(S: scipy.sparse.csc_matrix, width: int, R: F64, t: F64) -> Callable[[F64], F64]:
     """Return B -> C B for the inverse C of sparse information S (D, D) in the inner gauge, which is dense.
 
-    The pose of view v has the first six of ``width`` columns from ``width`` v on. Seven coordinates without a
-    gauge freedom are fixed, a pose and the distance to the farthest camera, and Baarda's S-transformation
-    leads from there to the inner gauge.
+    A pose, the first six of ``width`` columns, and the distance to the farthest camera are fixed; Baarda's
+    S-transformation leads from there to the inner gauge.
     """
     N, centres = gauge_basis(S.shape[0], width, R, t), -np.einsum("vba,vb->va", R, t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
@@ -145,11 +137,9 @@ def sparse_inverse(S: scipy.sparse.csc_matrix, width: int, R: F64, t: F64) -> Ca
     fixed[:POSE_DOF, :POSE_DOF] = np.eye(POSE_DOF)
     fixed[moved, moved] = np.outer(line, line) / max(float(line @ line), 1e-300)
     factor = scipy.sparse.linalg.splu(
-        scipy.sparse.csc_matrix(S + float(np.median(S.diagonal())) * fixed),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
-    )
+        scipy.sparse.csc_matrix(S + float(np.median(S.diagonal())) * fixed), permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0, options={"SymmetricMode": True},
+    )  # fmt: skip
 
     def without(B: F64) -> F64:
         return np.asarray(B - N @ (N.T @ B))

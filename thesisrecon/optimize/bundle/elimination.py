@@ -76,14 +76,9 @@ class _ByView(NamedTuple):
 
 @kernel
 def eliminate_points(
-    first: int,
-    last: int,
-    damping: float,
-    J: Jacobians,
-    index: BlockIndex,
-    sums: ReducedSums,
+    first: int, last: int, damping: float, J: Jacobians, index: BlockIndex, sums: ReducedSums,
     points: PointSums,
-) -> None:
+) -> None:  # fmt: skip
     """Add the eliminated points to the sums; a point whose block is not positive does not move."""
     k = index.start[first]
     n = index.start[last] - k
@@ -100,14 +95,9 @@ def eliminate_points(
 
 @kernel
 def _sum_points(
-    first: int,
-    last: int,
-    damping: float,
-    J: Jacobians,
-    index: BlockIndex,
-    points: PointSums,
+    first: int, last: int, damping: float, J: Jacobians, index: BlockIndex, points: PointSums,
     left: _Elimination,
-) -> None:
+) -> None:  # fmt: skip
     """Compute J'J and J'r of each point, its inverse, B~ and the residuals after its own step."""
     M, more = empty((3, 3)), 1.0 + damping
     for j in range(first, last):

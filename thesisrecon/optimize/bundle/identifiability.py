@@ -1,7 +1,10 @@
 """Identifiability of the calibration: the nearest critical motion, and whether the prior resolves it.
 
-The covariance of the focal lengths with free poses and points decides: a turntable leaves the scale along its
-axis and the aspect ratio undetermined; square pixels resolve both.
+Critical motions (HZ 19.8, 19.9; P. Sturm, CVPR 1997, and BMVC 1999 for varying focal lengths; F. Kahl, B.
+Triggs, K. Astrom, JMIV 13, 2000) are invariant under the transforms that they leave undetermined, so that the
+measures here hold for any of these solutions. The covariance of the focal lengths with free poses and points
+decides: a turntable leaves the scale along its axis and the aspect ratio undetermined; square pixels resolve
+both.
 """
 
 from __future__ import annotations
@@ -10,25 +13,63 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
-from thesisrecon.geometry.critical_motions import (
-    OPTICAL_AXIS,
-    PARALLEL_AXES,
-    PLANAR,
-    PLANE,
-    ROTATION,
-    TRANSLATION,
-    TURNTABLE,
-    UpgradedCameras,
-    measure_motion,
-    nearest_critical_motion,
-)
 from thesisrecon.optimize.bundle.metric import BundleOptions, MetricBundleResult, refine_metric_bundle
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior
+
+PLANE = "planar scene"
+ROTATION = "pure rotation"
+TRANSLATION = "pure translation"
+OPTICAL_AXIS = "rotation about the optical axis"
+TURNTABLE = "turntable"
+PLANAR = "planar motion"
+PARALLEL_AXES = "parallel rotation axes"
+
+# Tolerances for the unintended motion of a hand-held camera: rotations of a degree about each axis (twice
+# that between two images), translations of a hundredth of the distance.
+TOLERANCES: Mapping[str, float] = {
+    "scene_planarity_ratio": 0.02,
+    "centre_spread_over_distance": 0.03,
+    "infinity_shift": 0.08,
+    "infinity_shift_beyond_roll": 0.08,
+    "rotation_rms_deg": 3.5,
+    "optical_axis_rms_deg": 3.5,
+    "rotation_axis_spread_deg": 3.0,
+    "turntable_residual_over_distance": 0.05,
+    "axial_translation_over_distance": 0.025,
+}
+
+MAX_CAMERAS = 1000
+# Long sides; also used for points that rotate behind the camera.
+_MAX_SHIFT = 10.0
+
+# Sorted by how much the motion leaves undetermined. A motion is critical if all its measures are within
+# tolerance.
+_MEASURES_OF: Mapping[str, tuple[str, ...]] = {
+    PLANE: ("scene_planarity_ratio",),
+    ROTATION: ("centre_spread_over_distance",),
+    TRANSLATION: ("infinity_shift",),
+    OPTICAL_AXIS: ("infinity_shift_beyond_roll",),
+    TURNTABLE: (
+        "rotation_axis_spread_deg",
+        "turntable_residual_over_distance",
+        "axial_translation_over_distance",
+    ),
+    PLANAR: ("rotation_axis_spread_deg", "axial_translation_over_distance"),
+    PARALLEL_AXES: ("rotation_axis_spread_deg",),
+}
+
+# With a long lens an unintended rotation moves the image more, so it is enough if the shift or the angle is
+# within its tolerance. The angle depends on the focal length, which may be undetermined; the shift does not.
+_ALTERNATIVE: Mapping[str, str] = {
+    "infinity_shift": "rotation_rms_deg",
+    "infinity_shift_beyond_roll": "optical_axis_rms_deg",
+}
 
 # A focal length with a larger relative standard deviation is undetermined.
 MAX_FOCAL_STD = 0.15
@@ -39,48 +80,6 @@ MIN_ROTATION_SIGNIFICANCE = 4.0
 # all parts of the scene, so that no covariance contains them. A rotation that moves the image by s determines
 # f by its second-order part s (x / f)^2, about s / 10: for f to 15 %, 2 (s / 10) 0.15 must exceed 1e-4.
 MIN_INFINITY_SHIFT = 0.003
-_FOUND: Mapping[str, str] = {
-    PLANE: (
-        "the scene is planar: the points lie in one plane to {scene_planarity_ratio:.1%} of its width, which "
-        "hardly determines the cameras"
-    ),
-    ROTATION: (
-        "close to a pure rotation: the camera moved by only {centre_spread_over_distance:.1%} of the "
-        "distance to the scene, which determines the focal length but hardly any depth"
-    ),
-    TRANSLATION: (
-        "close to a pure translation: the rotations (at most {largest_rotation_deg:.1f} degrees) move points "
-        "at infinity by {infinity_shift:.1%} of the image, which hardly determines the focal length"
-    ),
-    OPTICAL_AXIS: (
-        "the camera rotated about its optical axis only and looked in one direction, which does not "
-        "determine the focal length"
-    ),
-    TURNTABLE: (
-        "turntable motion: all views rotate about one axis (to within {rotation_axis_spread_deg:.1f} "
-        "degrees), which does not determine the scale along the axis unless the aspect ratio of the pixels "
-        "is known"
-    ),
-    PLANAR: (
-        "planar motion: the camera moved in a plane and rotated about one direction (to within "
-        "{rotation_axis_spread_deg:.1f} degrees), which does not determine the scale across the plane unless "
-        "the aspect ratio of the pixels is known"
-    ),
-    PARALLEL_AXES: (
-        "all rotation axes are parallel (to within {rotation_axis_spread_deg:.1f} degrees), which does not "
-        "determine the scale along the axes unless the aspect ratio of the pixels is known"
-    ),
-}
-_FOUND_PROJECTIVE: Mapping[str, str] = {
-    TRANSLATION: (
-        "the projective cameras fit a pure translation, which does not determine the focal length (points at "
-        "infinity move by {infinity_shift:.1%} of the image)"
-    ),
-    OPTICAL_AXIS: (
-        "the projective cameras fit a rotation about the optical axis, which does not determine the focal "
-        "length (points at infinity move by {infinity_shift_beyond_roll:.1%} of the image)"
-    ),
-}
 _ROTATE = "rotate the camera by at least 10 degrees between images, about the vertical and a horizontal axis"
 _HEIGHTS = "take some images from higher or lower positions, or with the camera rolled by 90 degrees"
 _ADVICE: Mapping[str, str] = {
@@ -92,6 +91,152 @@ _ADVICE: Mapping[str, str] = {
     PLANAR: _HEIGHTS,
     PARALLEL_AXES: "tilt the camera up and down too, or roll it by 90 degrees",
 }
+
+
+@dataclass(frozen=True)
+class UpgradedCameras:
+    """Metric cameras: unit-free focal lengths (V,), R (V, 3, 3), C (V, 3), and points X (N, 3)."""
+
+    focal: F64
+    R: F64
+    C: F64
+    X: F64
+
+    @property
+    def distance(self) -> float:
+        """Median distance from the cameras to the median point."""
+        centre = np.median(self.X, axis=0)
+        return max(float(np.median(np.linalg.norm(centre - self.C, axis=1))), 1e-300)
+
+    def infinite_homographies(self) -> F64:
+        """Return the unit-free infinite homographies (V, 3, 3) from the view nearest to the mean rotation."""
+        mean = scipy.spatial.transform.Rotation.from_matrix(self.R).mean().as_matrix()
+        middle = int(scipy.spatial.transform.Rotation.from_matrix(self.R @ mean.T).magnitude().argmin())
+        K = np.stack([self.focal, self.focal, np.ones_like(self.focal)], axis=1)
+        return np.asarray(K[:, :, None] * (self.R @ self.R[middle].T) / K[middle])
+
+
+def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
+    """Return the measures of ``TOLERANCES`` by name, and the largest rotation (chapter 7).
+
+    Of more than ``MAX_CAMERAS`` cameras, evenly many are used: all pairs are compared.
+    """
+    if len(metric.R) > MAX_CAMERAS:
+        few = np.unique(np.rint(np.linspace(0, len(metric.R) - 1, MAX_CAMERAS)).astype(np.int64))
+        metric = UpgradedCameras(metric.focal[few], metric.R[few], metric.C[few], metric.X)
+    i, j = np.triu_indices(len(metric.R), 1)
+    relative = metric.R[j].swapaxes(1, 2) @ metric.R[i]
+    rotations = scipy.spatial.transform.Rotation.from_matrix(relative).as_rotvec()
+    spread, axes = np.linalg.eigh(rotations.T @ rotations / len(rotations))
+    # The direction nearest to all rotation axes.
+    axis, (z_i, z_j) = axes[:, 2], metric.R[[i, j], 2]
+    views = np.arctan2(np.linalg.norm(np.cross(z_i, z_j), axis=1), np.sum(z_i * z_j, axis=1))
+    H, offset = metric.infinite_homographies(), metric.C - metric.C.mean(axis=0)
+    return {
+        "scene_planarity_ratio": _planarity_ratio(metric.X),
+        "centre_spread_over_distance": _rms(offset) / metric.distance,
+        "infinity_shift": _infinite_homography_shift(H, roll=False),
+        "infinity_shift_beyond_roll": _infinite_homography_shift(H, roll=True),
+        "largest_rotation_deg": float(np.degrees(np.linalg.norm(rotations, axis=1).max())),
+        "rotation_rms_deg": float(np.degrees(_rms(rotations))),
+        "optical_axis_rms_deg": float(np.degrees(_rms(views[:, None]))),
+        "rotation_axis_spread_deg": float(np.degrees(np.sqrt(max(spread[1], 0.0)))),
+        "turntable_residual_over_distance": _turntable_residual(metric, axis) / metric.distance,
+        "axial_translation_over_distance": _rms((offset @ axis)[:, None]) / metric.distance,
+    }
+
+
+def nearest_critical_motion(measures: Mapping[str, float]) -> tuple[str, float]:
+    """The nearest critical motion, and its largest measure over its tolerance (chapter 7)."""
+    ratio = {key: measures[key] / TOLERANCES[key] for key in measures.keys() & TOLERANCES.keys()}
+    for key, alternative in _ALTERNATIVE.items():
+        if key in ratio:
+            ratio[key] = min(ratio[key], ratio.get(alternative, np.inf))
+    near = {
+        name: max(ratio[key] for key in needed)
+        for name, needed in _MEASURES_OF.items()
+        if ratio.keys() >= set(needed)
+    }
+    within = [name for name, distance in near.items() if distance < 1.0]
+    if ROTATION in within and near.get(TRANSLATION, 1.0) < near[ROTATION]:
+        within.remove(ROTATION)
+    chosen = within[0] if within else min(near, key=lambda name: near[name])
+    return chosen, near[chosen]
+
+
+def _infinite_homography_shift(H: F64, *, roll: bool) -> float:
+    """Rms shift (long sides) of points at infinity by H (V, 3, 3) beyond zoom and, with ``roll``, roll."""
+    template = np.zeros_like(H)
+    zoom = (H[:, 0, 0] + H[:, 1, 1]) / 2.0
+    # A roll of 180 degrees is no zoom, although it maps points as one with a negative scale.
+    template[:, 0, 0] = template[:, 1, 1] = zoom if roll else np.where(zoom * H[:, 2, 2] > 0.0, zoom, 0.0)
+    template[:, 2, 2] = H[:, 2, 2]
+    if roll:
+        template[:, 1, 0] = (H[:, 1, 0] - H[:, 0, 1]) / 2.0
+        template[:, 0, 1] = -template[:, 1, 0]
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 5))
+    grid = np.stack([u.ravel(), v.ravel(), np.ones(25)])
+    shift = np.sum((_dehomogenized(H @ grid) - _dehomogenized(template @ grid)) ** 2, axis=1)
+    return float(np.sqrt(np.mean(np.minimum(shift, _MAX_SHIFT**2))))
+
+
+def _dehomogenized(x: F64) -> F64:
+    """Return (V, 2, M) from (V, 3, M), finite."""
+    w = x[:, 2:]
+    return np.asarray(x[:, :2] / np.where(np.abs(w) < 1e-9, 1e-9, w))
+
+
+def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
+    """Return lower bounds of the shifts of points at infinity from projective cameras [A | a] alone.
+
+    The plane at infinity is chosen such that the cameras come nearest to having no rotation: A_i - a_i p' =
+    diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]], linear in p, g, k, h. Small shifts are
+    necessary but not sufficient for a camera without rotation.
+    """
+    identity = np.zeros((3, 3, 3))
+    identity[0, 0, 0] = identity[0, 1, 1] = identity[1, 2, 2] = identity[2, 1, 0] = 1.0
+    identity[2, 0, 1] = -1.0
+    shifts = {}
+    for name, kinds in (("infinity_shift", 2), ("infinity_shift_beyond_roll", 3)):
+        rows = np.zeros((len(A), 9, 3 + kinds * len(A)))
+        for k in range(3):
+            rows[:, k::3, k] = a
+        for i in range(len(A)):
+            rows[i, :, 3 + kinds * i : 3 + kinds * (i + 1)] = identity[:kinds].reshape(kinds, 9).T
+        p = np.linalg.lstsq(rows.reshape(9 * len(A), -1), A.reshape(-1), rcond=None)[0][:3]
+        shifts[name] = _infinite_homography_shift(A - a[:, :, None] * p, roll=kinds == 3)
+    return shifts
+
+
+def _rms(vectors: F64) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
+    """Rms distance of the centres from a common circular motion about one line along ``axis``."""
+    seen = metric.R @ (np.eye(3) - np.outer(axis, axis))
+    places = np.einsum("vab,vb->va", seen, metric.C)
+    coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
+    c = np.linalg.lstsq(coefficients.reshape(-1, 3), right.ravel(), rcond=1e-9)[0]
+    return _rms(right - coefficients @ c)
+
+
+def _planarity_ratio(X: F64) -> float:
+    """Rms thickness of 95 % of the points (N, 3) about their best plane over their rms extent in it.
+
+    Before, the farthest 5 % of the points are left out.
+    """
+
+    def nearest(distance: F64) -> I64:
+        return np.argsort(distance, kind="stable")[: max(int(0.95 * len(distance)), 4)]
+
+    X = X[nearest(np.linalg.norm(X - np.median(X, axis=0), axis=1))]
+    near = X
+    for _ in range(3):
+        normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2]
+        near = X[nearest(np.abs((X - near.mean(axis=0)) @ normal))]
+    s = np.linalg.svd(near - near.mean(axis=0), compute_uv=False)
+    return float(s[2] / max(float(s[1]), 1e-300))
 
 
 def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
@@ -229,8 +374,8 @@ def identifiability_sentences(
     if evidence["excess_equations"] < 0:
         sentences.append(Notice("too-few-equations", -evidence["excess_equations"]))
     if is_critical:
-        found = (_FOUND if calibrated else _FOUND_PROJECTIVE)[motion]
-        sentences.append(found.format(**evidence))
+        kind = motion if calibrated else f"projective {motion}"
+        sentences.append(Notice(kind.replace(" ", "-"), evidence))
     if _has_excess_noise(evidence):
         sentences.append(excess_noise(evidence))
     if identifiable:

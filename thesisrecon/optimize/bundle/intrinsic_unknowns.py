@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF, MetricCameras
@@ -21,38 +22,23 @@ MAX_LOG_STEP = 3.0
 
 @dataclass(frozen=True)
 class _PriorTerms:
-    """Terms w (x_first - x_second - offset)^2 / 2; ``second`` is -1 if a term binds one value."""
+    """Terms w (A x - offset)^2 / 2, each of which binds one value or the difference of two."""
 
-    first: I64
-    second: I64
+    A: scipy.sparse.csr_array
     offset: F64
     weight: F64
 
-    def residual(self, x: F64) -> F64:
-        """Return x_first - x_second - offset; (L,)."""
-        return np.asarray(x[self.first] - np.where(self.second >= 0, x[self.second], 0.0) - self.offset)
-
     def cost(self, x: F64) -> float:
         """Return the sum of all terms."""
-        return 0.5 * float(self.weight @ self.residual(x) ** 2)
+        return 0.5 * float(self.weight @ (self.A @ x - self.offset) ** 2)
 
     def gradient(self, x: F64) -> F64:
         """Return the derivative of the cost; (n,)."""
-        pull = self.weight * self.residual(x)
-        both = self.second >= 0
-        g = np.bincount(self.first, pull, minlength=len(x))
-        return np.asarray(g - np.bincount(self.second[both], pull[both], minlength=len(x)))
+        return np.asarray(self.A.T @ (self.weight * (self.A @ x - self.offset)))
 
-    def information(self, n: int) -> F64:
+    def information(self) -> scipy.sparse.csr_array:
         """Return the second derivative of the cost; (n, n)."""
-        Q = np.zeros((n, n))
-        a, b, w = self.first, self.second, self.weight
-        both = b >= 0
-        np.add.at(Q, (a, a), w)
-        np.add.at(Q, (b[both], b[both]), w[both])
-        np.add.at(Q, (a[both], b[both]), -w[both])
-        np.add.at(Q, (b[both], a[both]), -w[both])
-        return Q
+        return scipy.sparse.csr_array(self.A.T @ scipy.sparse.diags_array(self.weight) @ self.A)
 
 
 @dataclass(frozen=True)
@@ -146,7 +132,11 @@ class _Parts:
         """Return all terms in one table."""
         none = (np.zeros(0, dtype=np.int64),) * 2 + (np.zeros(0),) * 2
         first, second, offset, weight = (np.concatenate(a) for a in zip(none, *self.terms, strict=True))
-        return _PriorTerms(first, second, offset, weight)
+        both = np.flatnonzero(second >= 0)
+        rows = np.concatenate([np.arange(len(first)), both])
+        signs, columns = np.repeat([1.0, -1.0], [len(first), len(both)]), np.append(first, second[both])
+        A = scipy.sparse.csr_array((signs, (rows, columns)), (len(first), len(self.start)))
+        return _PriorTerms(A, offset, weight)
 
 
 def _number_column(

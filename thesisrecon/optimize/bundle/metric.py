@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.conditioning import scene_frame
 from thesisrecon.optimize.bundle.covariance import (
     SIMILARITY_DOF,
@@ -42,7 +42,6 @@ from thesisrecon.optimize.bundle.schur import (
     BundleLayout,
     BundleStep,
     BundleSystem,
-    CameraPrior,
     build_layout,
 )
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
@@ -59,12 +58,11 @@ _Covariances = tuple[F64, F64 | None, F64 | None]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """Options of :func:`refine_metric_bundle`.
+    """Options of :func:`refine_metric_bundle`: the noise ``sigma_px``, the width ``loss_px`` of Huber's loss.
 
-    ``sigma_px`` is the noise that weights the residuals, ``loss_px`` the width of Huber's loss. The
-    adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
-    distance of all cameras from the minimum, in standard deviations. ``damping`` is the initial damping; the
-    covariances are computed with a noise of at least ``noise_floor_px``.
+    The adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
+    distance of all cameras from the minimum, in standard deviations. Covariances are those of a noise of at
+    least ``noise_floor_px``.
     """
 
     sigma_px: float = 1.0
@@ -87,10 +85,9 @@ class MetricBundleResult:
 
     ``residual_px`` (K, 2) is projection minus observation in the caller's order, ``cost`` 1/2 sum rho in
     units of the given sigma, priors included. ``intrinsics_covariance`` (G, C, C) is zero for entries that do
-    not move, ``pose_covariance`` (V, 6, 6) that of (rotation vector in rad, translation) of x -> exp(w) x + d
-    in each camera frame, ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views.
-    ``sigmas_to_minimum`` is (g' H^-1 g)^(1/2) of the cameras: the largest undamped step of any function of
-    them in its standard deviations, for noise of the given sigma.
+    not move, ``pose_covariance`` (V, 6, 6) that of (w, d) of x -> exp(w) x + d in each camera frame,
+    ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views. ``sigmas_to_minimum`` is the
+    largest undamped step of any function of the cameras in its standard deviations, (g' H^-1 g)^(1/2).
     """
 
     cameras: MetricCameras
@@ -120,6 +117,7 @@ class _MetricProblem:
     values: IntrinsicUnknowns
     weighting: Weighting
     jacobians: Jacobians
+    information: tuple[I64, I64, F64]
 
     def linearize(self, state: _State) -> BundleSystem:
         J, c = self.jacobians, self.columns
@@ -131,15 +129,9 @@ class _MetricProblem:
         cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
         if c.pinned.any():
             J.A[:] = np.where(c.pinned[self.layout.observations.seen.view_index][:, None], 0.0, J.A)
-        return BundleSystem(cost, self.layout, J, self._prior(state))
-
-    def _prior(self, state: _State) -> CameraPrior | None:
-        terms, c = self.values.terms, self.columns
-        if not len(terms.first):
-            return None
         gradient = np.zeros(self.layout.size)
-        gradient[c.place] = terms.gradient(state.values)
-        return c.columns_of(terms.first), c.columns_of(terms.second), terms.weight, gradient
+        gradient[c.place] = self.values.terms.gradient(state.values)
+        return BundleSystem(cost, self.layout, J, (*self.information, gradient))
 
     def retract(self, state: _State, step: BundleStep) -> _State:
         m, layout = state.model, self.layout
@@ -172,15 +164,9 @@ class _MetricProblem:
 
 
 def refine_metric_bundle(
-    cameras: MetricCameras,
-    X: F64,
-    observations: Observations,
-    *,
-    free: B8,
-    prior: IntrinsicsPrior | None = None,
-    options: BundleOptions | None = None,
-    fixed: B8 | None = None,
-) -> MetricBundleResult:
+    cameras: MetricCameras, X: F64, observations: Observations, *, free: B8,
+    prior: IntrinsicsPrior | None = None, options: BundleOptions | None = None, fixed: B8 | None = None,
+) -> MetricBundleResult:  # fmt: skip
     """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics (6.7).
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
@@ -244,12 +230,9 @@ def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) ->
 
 
 def _metric_problem(
-    cameras: MetricCameras,
-    o: SortedObservations,
-    unknown: tuple[B8, B8],
-    prior: IntrinsicsPrior | None,
+    cameras: MetricCameras, o: SortedObservations, unknown: tuple[B8, B8], prior: IntrinsicsPrior | None,
     options: BundleOptions,
-) -> tuple[_MetricProblem, F64, F64]:
+) -> tuple[_MetricProblem, F64, F64]:  # fmt: skip
     """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics.
 
     ``unknown``: the views (V,) that move, and the intrinsics (C,) that do.
@@ -263,7 +246,10 @@ def _metric_problem(
         threads=options.threads,
     )  # fmt: skip
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
-    return _MetricProblem(layout, columns, moves, values, weighting, layout.jacobians()), start, table
+    Q = values.terms.information().tocoo()
+    information = columns.place[Q.row], columns.place[Q.col], Q.data
+    buffers = layout.jacobians()
+    return _MetricProblem(layout, columns, moves, values, weighting, buffers, information), start, table
 
 
 def _covariances(

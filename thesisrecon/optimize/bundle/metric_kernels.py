@@ -10,8 +10,15 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, I64
-from thesisrecon.geometry.small_matrices import away_from_zero, loss_curvature, loss_value, loss_weight
-from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
+from thesisrecon.optimize.bundle.observations import (
+    Jacobians,
+    Observations,
+    Weighting,
+    away_from_zero,
+    loss_curvature,
+    loss_value,
+    loss_weight,
+)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
-"""Image observations of scene points, and an order of view pairs for a cache of views."""
+"""Image observations of scene points, the weighting of their residuals, and an order of view pairs."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64, I64, require_finite, require_shapes
 
 
@@ -76,7 +78,35 @@ class Weighting(NamedTuple):
     min_curvature: float = 1.0
 
 
+@kernel(inline="always")
+def loss_value(s: float, delta: float) -> float:
+    """Evaluate Huber's rho(s); least squares if delta is infinite."""
+    d2 = delta * delta
+    return s if s <= d2 else 2.0 * delta * math.sqrt(s) - d2
+
+
+@kernel(inline="always")
+def loss_weight(s: float, delta: float) -> float:
+    """Evaluate rho'(s)."""
+    return 1.0 if s <= delta * delta else delta / math.sqrt(s)
+
+
+@kernel(inline="always")
+def loss_curvature(s: float, delta: float) -> float:
+    """Evaluate 1 + 2 s rho'' / rho', the fraction of the curvature along a residual that its loss leaves."""
+    return 1.0 if s / (delta * delta) <= 1.0 else 0.0
+
+
+@kernel(inline="always")
+def away_from_zero(w: float) -> float:
+    """Move a projective depth off 0, so that a point in the focal plane gets a huge residual."""
+    if w >= 0.0:
+        return max(w, TINY)
+    return min(w, -TINY)
+
+
 _MORTON_BITS = 31
+TINY = 1e-12
 
 
 class Observations(NamedTuple):

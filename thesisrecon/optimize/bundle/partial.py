@@ -14,13 +14,13 @@ from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.conditioning import (
     SpaceFrame,
-    centred_frame,
     centring_transform,
     pixel_conditioning,
-    whitening_transform,
+    unit_norm,
+    whitened_frame,
 )
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.geometry.small_matrices import away_from_zero, invert_positive_3x3, loss_value, loss_weight
+from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.triangulation import PASSES, sort_by_point, triangulate_linear, triangulate_midpoint
 from thesisrecon.optimize.bundle.metric_kernels import (
     MetricModel,
@@ -34,6 +34,9 @@ from thesisrecon.optimize.bundle.observations import (
     Observations,
     SortedObservations,
     Weighting,
+    away_from_zero,
+    loss_value,
+    loss_weight,
     sort_observations,
 )
 from thesisrecon.optimize.bundle.projective import (
@@ -43,7 +46,12 @@ from thesisrecon.optimize.bundle.projective import (
     tangent_reflectors,
     tangent_step,
 )
-from thesisrecon.optimize.least_squares import DenseSystem, invert_information, run_levenberg_marquardt
+from thesisrecon.optimize.least_squares import (
+    DenseProblem,
+    DenseSystem,
+    invert_information,
+    run_levenberg_marquardt,
+)
 
 TriangulationMethod = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
@@ -81,15 +89,9 @@ def _point_cost(P: F64, x: F64, view_index: I64, xy: F64, options: _PointOptions
 
 @kernel
 def _linearize_point(
-    P: F64,
-    x: F64,
-    tangent: tuple[F64, float, F64],
-    view_index: I64,
-    xy: F64,
-    options: _PointOptions,
-    H: F64,
-    g: F64,
-) -> None:
+    P: F64, x: F64, tangent: tuple[F64, float, F64], view_index: I64, xy: F64, options: _PointOptions,
+    H: F64, g: F64,
+) -> None:  # fmt: skip
     """Fill the lower triangle of J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space.
 
     ``tangent``: Householder vector, its factor, and scratch memory (2, 4).
@@ -123,8 +125,7 @@ def _linearize_point(
 @kernel
 def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, options: _PointOptions) -> None:
     """Refine every unit point of X (N, 4) in place by Levenberg-Marquardt in its tangent space."""
-    H, M, Mi, root = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
-    g, step = empty(3), empty((1, 3))
+    H, g, step = empty((3, 3)), empty(3), empty((1, 3))
     v, beta, moved, J = empty((1, 4)), empty(1), empty((1, 4)), empty((2, 4))
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
@@ -140,14 +141,8 @@ def _refine_each_point(P: F64, X: F64, start: I64, view_index: I64, xy: F64, opt
             if accepted:
                 tangent_reflectors(x, v, beta)
                 _linearize_point(P, x[0], (v[0], beta[0], J), view, seen, options, H, g)
-            for m in range(3):
-                for n in range(3):
-                    M[m, n] = H[m, n]
-                M[m, m] *= 1.0 + damping
-            accepted, promised = invert_positive_3x3(M, root, Mi), np.inf
+            accepted, promised = solve_damped(H, g, damping, step[0]), np.inf
             if accepted:
-                for m in range(3):
-                    step[0, m] = -(Mi[m, 0] * g[0] + Mi[m, 1] * g[1] + Mi[m, 2] * g[2])
                 promised = -(g[0] * step[0, 0] + g[1] * step[0, 1] + g[2] * step[0, 2])
                 tangent_step(x, v, beta, step, moved)
                 candidate, flipped = _point_cost(P, moved[0], view, seen, options)
@@ -187,28 +182,26 @@ def refine_points(
 ) -> F64:
     """Refine each point (N, 4) with the cameras fixed: least sum of rho(|x - P X|^2), Huber's loss.
 
-    Damped Gauss-Newton in the tangent space of the whitened unit 4-vector. The cost of no point rises and no
-    point crosses the focal plane of a view that observes it. Norms and signs stay, and points that are zero,
-    not finite or observed less than twice.
+    The cost of no point rises and no point crosses the focal plane of a view that observes it. Norms and
+    signs stay, and points that are zero, not finite or observed less than twice.
     """
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
     options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
-    return _refine_in_frame(P, X, o, used, centred_frame(X[used], whitening_transform), options)
+    return _refine_in_frame(P, X, o, used, whitened_frame(X[used]), options)
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
     """Move each point to a minimum of its squared reprojection errors; points may cross focal planes.
 
-    Works in a frame in which the cameras' rows are orthonormal and repeats until two steps bring no gain
-    above rounding.
+    Works in a frame in which the cameras' rows are orthonormal.
     """
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
     N = centring_transform(X[used])
-    cameras = _unit_cameras(pixel_conditioning(o.seen.xy) @ P @ np.linalg.inv(N))
+    cameras = unit_norm(pixel_conditioning(o.seen.xy) @ P @ np.linalg.inv(N))
     S = np.asarray(np.linalg.qr(cameras.reshape(-1, 4))[1])
     # Cameras with one centre leave a direction of space undetermined.
     if len(S) < 4 or not np.abs(np.diag(S)).min() > 1e-13 * np.abs(S).max():
@@ -241,19 +234,13 @@ def _usable_points(P: F64, X: F64, observations: Observations) -> tuple[SortedOb
     return o, np.isfinite(norms) & (norms > 0.0) & (np.diff(o.start) >= 2)
 
 
-def _unit_cameras(P: F64) -> F64:
-    """Return cameras (V, 3, 4) of unit norm; zeros stay."""
-    norms = np.linalg.norm(P, axis=(1, 2), keepdims=True)
-    return np.asarray(P / np.where(norms > 0.0, norms, 1.0))
-
-
 def _refine_in_frame(
     P: F64, X: F64, o: SortedObservations, used: B8, frame: SpaceFrame, options: _PointOptions
 ) -> F64:
     """Refine the ``used`` points in conditioned pixels and a frame of space; norms and signs are kept."""
     norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.seen.xy)
     # The scale of a camera has no effect on its projections, but must not push depths below rounding.
-    cameras = np.ascontiguousarray(_unit_cameras(frame.cameras(T @ P)))
+    cameras = np.ascontiguousarray(unit_norm(frame.cameras(T @ P)))
     moved = frame.points(np.where(used[:, None], X, 0.0))
     moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
     xy = o.seen.xy * T[0, 0] + T[:2, 2]
@@ -263,28 +250,6 @@ def _refine_in_frame(
     lengths = np.linalg.norm(back, axis=1, keepdims=True)
     back *= norms[:, None] / np.where(lengths > 0.0, lengths, 1.0)
     return np.where(used[:, None] & np.isfinite(back).all(axis=1, keepdims=True), back, X)
-
-
-@dataclass(frozen=True)
-class _CameraProblem:
-    """One unit camera (1, 12) and fixed whitened unit points, conditioned pixels."""
-
-    X: F64
-    obs: Observations
-    weighting: Weighting
-
-    def linearize(self, state: F64) -> DenseSystem:
-        J = Jacobians.empty(len(self.X), 11, 0)
-        cost = linearize_projective(UnitState.at(state, self.X), self.obs, self.weighting, J)
-        return _dense_system(cost, J)
-
-    def retract(self, state: F64, step: F64) -> F64:
-        s, moved = UnitState.at(state, self.X), np.empty_like(state)
-        tangent_step(state, s.vP, s.bP, step[None], moved)
-        return moved
-
-    def cost(self, state: F64) -> float:
-        return float(projective_cost(UnitState.at(state, self.X), self.obs, self.weighting))
 
 
 def _one_view_observations(xy: F64) -> Observations:
@@ -301,17 +266,28 @@ def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> tuple[F64, F64]:
     """Refine one projective camera by fixed points (6.4); return P and the covariance (12, 12) for 1 px.
 
-    P keeps the norm and sign of its start. The covariance of its row-major entries has no part along P (the
-    scale), and huge variances in undetermined directions, as for too few points or points on one plane.
+    P keeps the norm and sign of its start. The covariance of its row-major entries has no part along P, and
+    huge variances in undetermined directions.
     """
     size = float(np.linalg.norm(P))
-    T, frame = pixel_conditioning(xy), centred_frame(X, whitening_transform)
+    T, frame = pixel_conditioning(xy), whitened_frame(X)
     points = frame.points(X)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    start = frame.cameras(T @ P).reshape(1, 12)
-    scale = float(T[0, 0])
-    weighting = Weighting(1.0, loss_px * scale)
-    problem = _CameraProblem(points, _one_view_observations(xy * scale + T[:2, 2]), weighting)
+    start, scale = frame.cameras(T @ P).reshape(1, 12), float(T[0, 0])
+    obs, weighting = _one_view_observations(xy * scale + T[:2, 2]), Weighting(1.0, loss_px * scale)
+
+    def linearize(state: F64) -> DenseSystem:
+        J = Jacobians.empty(len(points), 11, 0)
+        return _dense_system(linearize_projective(UnitState.at(state, points), obs, weighting, J), J)
+
+    def retract(state: F64, step: F64) -> F64:
+        s, moved = UnitState.at(state, points), np.empty_like(state)
+        tangent_step(state, s.vP, s.bP, step[None], moved)
+        return moved
+
+    problem = DenseProblem(
+        linearize, retract, lambda s: float(projective_cost(UnitState.at(s, points), obs, weighting))
+    )
     end = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations).state
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), (frame.S @ frame.N).T)
@@ -323,35 +299,9 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     v, beta = np.empty_like(end), np.empty(1)
     tangent_reflectors(end, v, beta)
     basis = (np.eye(12) - beta[0] * np.outer(v[0], v[0]))[:, 1:]
-    of_unit_camera = basis @ invert_information(problem.linearize(end).hessian) @ basis.T
+    of_unit_camera = basis @ invert_information(linearize(end).hessian) @ basis.T
     covariance = back @ of_unit_camera @ back.T * scale**2
     return raw.reshape(3, 4), covariance
-
-
-@dataclass(frozen=True)
-class _PoseProblem:
-    """One calibrated camera and fixed points; a state's model has one view and one row."""
-
-    obs: Observations
-    free: I64
-    weighting: Weighting
-
-    def linearize(self, state: MetricModel) -> DenseSystem:
-        J = Jacobians.empty(len(state.X), 6 + len(self.free), 0)
-        cost = linearize_metric(state, self.obs, self.weighting, self.free, self.free[:0], J)
-        return _dense_system(cost, J)
-
-    def retract(self, state: MetricModel, step: F64) -> MetricModel:
-        R, t = np.empty_like(state.R), np.empty_like(state.t)
-        move_poses(state.R, state.t, step[None, :6], R, t)
-        moves = np.zeros(state.intrinsics.shape[1])
-        moves[self.free] = step[6:]
-        intrinsics = state.intrinsics + moves
-        intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
-        return state._replace(R=R, t=t, intrinsics=intrinsics)
-
-    def cost(self, state: MetricModel) -> float:
-        return float(metric_cost(state, self.obs, self.weighting))
 
 
 def refine_pose(
@@ -364,13 +314,27 @@ def refine_pose(
     origin = X.mean(axis=0)
     size = float(np.linalg.norm(X - origin, axis=1).mean())
     scale = 1.0 / size if size > 0.0 else 1.0
-    weighting = Weighting(1.0, loss_px)
-    problem = _PoseProblem(_one_view_observations(xy), columns, weighting)
+    obs, weighting = _one_view_observations(xy), Weighting(1.0, loss_px)
     moved, points = scale * (t + R @ origin), np.ascontiguousarray(scale * (X - origin))
     start = MetricModel(R[None], moved[None], intrinsics[None], np.zeros(1, dtype=np.int64), points)
+
+    def linearize(state: MetricModel) -> DenseSystem:
+        J = Jacobians.empty(len(points), 6 + len(columns), 0)
+        return _dense_system(linearize_metric(state, obs, weighting, columns, columns[:0], J), J)
+
+    def retract(state: MetricModel, step: F64) -> MetricModel:
+        R, t = np.empty_like(state.R), np.empty_like(state.t)
+        move_poses(state.R, state.t, step[None, :6], R, t)
+        moves = np.zeros(state.intrinsics.shape[1])
+        moves[columns] = step[6:]
+        intrinsics = state.intrinsics + moves
+        intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
+        return state._replace(R=R, t=t, intrinsics=intrinsics)
+
+    problem = DenseProblem(linearize, retract, lambda state: float(metric_cost(state, obs, weighting)))
     end = run_levenberg_marquardt(problem, start, max_iterations=iterations).state
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
-    covariance = invert_information(problem.linearize(end).hessian) * units * units[:, None]
+    covariance = invert_information(linearize(end).hessian) * units * units[:, None]
     t = end.t[0] / scale - end.R[0] @ origin
-    return PoseRefinement(end.R[0], t, end.intrinsics[0], covariance, project_metric(end, problem.obs))
+    return PoseRefinement(end.R[0], t, end.intrinsics[0], covariance, project_metric(end, obs))

@@ -12,10 +12,18 @@ import numpy as np
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.conditioning import centred_frame, pixel_conditioning, whitening_transform
-from thesisrecon.geometry.small_matrices import TINY, away_from_zero, loss_value, loss_weight
+from thesisrecon.geometry.conditioning import pixel_conditioning, whitened_frame
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points
-from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting, sort_observations
+from thesisrecon.optimize.bundle.observations import (
+    TINY,
+    Jacobians,
+    Observations,
+    Weighting,
+    away_from_zero,
+    loss_value,
+    loss_weight,
+    sort_observations,
+)
 from thesisrecon.optimize.bundle.schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import run_levenberg_marquardt
 
@@ -177,28 +185,21 @@ class _ProjectiveProblem:
 
 
 def refine_projective_bundle(
-    P: F64,
-    X: F64,
-    observations: Observations,
-    *,
-    loss_px: float = 1.0,
-    max_iterations: int = 10,
-    settled: float = 0.0,
-    fixed_views: B8 | None = None,
-) -> ProjectiveBundleResult:
+    P: F64, X: F64, observations: Observations, *, loss_px: float = 1.0, max_iterations: int = 10,
+    settled: float = 0.0, fixed_views: B8 | None = None,
+) -> ProjectiveBundleResult:  # fmt: skip
     """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss (6.7).
 
-    Sparse Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the
-    damping handles the 15 gauge freedoms (methods 6.7). The cost never rises; views and points without
-    observations do not change. The search also ends when the predicted gain of the cameras is below
-    ``settled`` times the square of ``loss_px``.
+    Levenberg-Marquardt in conditioned pixels and whitened space (sum XX' = I, |P| = |X| = 1); the damping
+    handles the 15 gauge freedoms. Views and points without observations do not change. The search also ends
+    when the predicted gain of the cameras is below ``settled`` times the square of ``loss_px``.
     """
     o = sort_observations(observations, len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
 
-    T, frame = pixel_conditioning(o.seen.xy), centred_frame(X[seen_points], whitening_transform)
+    T, frame = pixel_conditioning(o.seen.xy), whitened_frame(X[seen_points])
     scale = float(T[0, 0])
     conditioned = replace(o, seen=o.seen._replace(xy=o.seen.xy * scale + T[:2, 2]))
     block = np.where(free, np.cumsum(free) - 1, -1)

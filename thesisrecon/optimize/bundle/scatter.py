@@ -41,10 +41,9 @@ class BlockScatter:
     """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
 
     ``shared_variance`` (C,) would hold if all views shared one camera. ``ratio`` (G, C) is the scatter over
-    its expectation, NaN for fixed intrinsics; ``large_ratio`` is that of the ``large_blocks`` into which the
-    blocks merge. ``overdispersion`` is the scatter between blocks over that between single points: 1 if the
-    noise of different points is independent, for any distribution. ``pull`` (G, C) is the step by which the
-    prior moves the values.
+    its expectation, NaN for fixed intrinsics, ``large_ratio`` that of the ``large_blocks``;
+    ``overdispersion`` is the scatter between blocks over that between single points, 1 for independent noise.
+    ``pull`` (G, C) is the step by which the prior moves the values.
     """
 
     variance: F64
@@ -222,13 +221,9 @@ class LinearisedFit:
 
 
 def linearise_fit(
-    cameras: MetricCameras,
-    X: F64,
-    o: Observations,
-    free: B8,
-    prior: IntrinsicsPrior,
+    cameras: MetricCameras, X: F64, o: Observations, free: B8, prior: IntrinsicsPrior,
     noise: tuple[float, float],
-) -> LinearisedFit:
+) -> LinearisedFit:  # fmt: skip
     """Linearise an adjustment at its minimum; ``noise`` is the standard deviation and the loss width."""
     group, (sigma, loss), width = cameras.group, noise, cameras.intrinsics.shape[1]
     observed = np.bincount(o.view_index, minlength=len(group)) > 0
@@ -250,7 +245,7 @@ def linearise_fit(
     E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
     taken = scipy.sparse.csr_matrix(E.T @ J)
     residual -= E @ (E.T @ residual)
-    S = _information(J, taken, values.terms.information(values.size), o, len(views))
+    S = _information(J, taken, values.terms.information().toarray(), o, len(views))
     return LinearisedFit(
         X, o, loss / sigma, residual, J, taken, E, centre_columns, S, _covariance(S, frame, views),
         values, start, frame, scale, views, first,
@@ -317,12 +312,9 @@ def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views:
 
 
 def _shared_variances(
-    S: F64 | scipy.sparse.csc_matrix,
-    variance: F64,
-    values: IntrinsicUnknowns,
-    cameras: MetricCameras,
+    S: F64 | scipy.sparse.csc_matrix, variance: F64, values: IntrinsicUnknowns, cameras: MetricCameras,
     views: I64,
-) -> F64:
+) -> F64:  # fmt: skip
     """Return the variances (C,) of the intrinsics if all cameras were one, from S and those of each value."""
     first, width = S.shape[0] - values.size, values.number.shape[1]
     column = values.column[: values.n_table]

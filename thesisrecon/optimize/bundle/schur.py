@@ -128,11 +128,10 @@ def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
 
 @dataclass(frozen=True)
 class BundleLayout:
-    """Structure of one problem.
+    """Structure of one problem: ``width`` columns for each view's block, then ``border`` common columns.
 
-    The camera unknowns are ``width`` columns for each view's block, then ``border`` common columns; ``row``
-    and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points. The
-    chunks do not depend on ``threads``, so that sums are the same for any number.
+    ``row`` and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points
+    that do not depend on ``threads``, so that sums are the same for any number.
     """
 
     observations: SortedObservations
@@ -207,8 +206,8 @@ def build_layout(
     return BundleLayout(observations, index, width, border, row, column, chunks, solver, threads)
 
 
-# Gaussian terms between camera columns: first (L,), second (L,) of the border or -1 for a number instead,
-# weight (L,), and the gradient (D,) of all terms.
+# Rows, columns and values of the information on the camera columns, of which pairs are in the border, and
+# its gradient (D,).
 CameraPrior = tuple[I64, I64, F64, F64]
 
 # Steps of the camera columns (D,) and of the points (N, 3).
@@ -247,11 +246,10 @@ class BundleSystem:
         return ReducedSystem(layout.row, layout.column, total), points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
-        """Return the damped step, its predicted gain of cost, and that of the cameras.
+        """Return the damped step, its predicted gain of cost, and that of the cameras; None if singular.
 
-        None if the reduced matrix is not positive definite. The gain of the cameras, half their squared
-        distance in standard deviations, is the criterion of convergence: points whose observations contradict
-        each other move for many iterations without any effect on the cameras.
+        The gain of the cameras is the criterion of convergence: points whose observations contradict each
+        other move for many iterations without any effect on the cameras.
         """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver
@@ -276,16 +274,12 @@ class BundleSystem:
 def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:
     """Add the information and gradient of the prior."""
     size, border = len(total.rhs), len(total.corner)
-    (first, second, w, gradient), edge = prior, size - border
+    (i, j, w, gradient), edge = prior, size - border
     total.rhs[:] -= gradient
     total.gradient[:] += gradient
-    both = second >= 0
-    weight = np.bincount(first, w, minlength=size).astype(np.float64)
-    weight += np.bincount(second[both], w[both], minlength=size)
+    weight = np.bincount(i[i == j], w[i == j], minlength=size).astype(np.float64)
     total.diagonal[:] += weight
     add_diagonal(total, pair, weight)
-    first, second, w = first[both], second[both] - edge, w[both]
-    inside = first >= edge
-    np.add.at(total.corner, (first[inside] - edge, second[inside]), -w[inside])
-    np.add.at(total.corner, (second[inside], first[inside] - edge), -w[inside])
-    np.add.at(total.border.reshape(edge, border), (first[~inside], second[~inside]), -w[~inside])
+    inside, off = i >= edge, (i != j) & (j >= edge)
+    total.corner[i[off & inside] - edge, j[off & inside] - edge] += w[off & inside]
+    total.border.reshape(edge, border)[i[off & ~inside], j[off & ~inside] - edge] += w[off & ~inside]
