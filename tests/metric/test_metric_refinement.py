@@ -113,9 +113,9 @@ def test_calibrated_resection_survives_half_wrong_points():
     xy = dehomogenize(scene.X @ scene.R[0].T + scene.t[0])
     wrong = np.arange(len(xy)) % 2 == 0
     xy[wrong] += rng.uniform(0.1, 0.4, (int(wrong.sum()), 2))
-    R, t, inliers = resect_calibrated(scene.X, xy, threshold=1e-3, rng=rng)
-    np.testing.assert_allclose(R, scene.R[0], atol=1e-6)
-    np.testing.assert_allclose(t, scene.t[0], atol=1e-5)
+    pose, inliers = resect_calibrated(scene.X, xy, threshold=1e-3, rng=rng)
+    np.testing.assert_allclose(pose[:, :3], scene.R[0], atol=1e-6)
+    np.testing.assert_allclose(pose[:, 3], scene.t[0], atol=1e-5)
     np.testing.assert_array_equal(inliers, ~wrong)
 
 

@@ -35,6 +35,7 @@ from thesisrecon.metric._shared_camera import (
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
 from thesisrecon.metric.refinement import MAX_REMAINING
 from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.scatter import block_scatter
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 
 SIGMAS, ANGLE = 7.0, 1e-3
@@ -250,10 +251,10 @@ def test_deviations_of_few_images_are_learned_from_their_residuals(views):
             scene = make_scene(views=views, points=300, sigma_px=0.3, seed=seed)
             shift = own * scene.sizes[0].max() * np.random.default_rng(seed).normal(size=(views, 2))
             model, adjustment = settled(changed(scene, np.ones(views), shift))
-            adjustment = replace(adjustment, inflation=adjustment.scatter(model).inflation)
+            adjustment = replace(adjustment, inflation=block_scatter(adjustment.linearised(model)).inflation)
             model = adjustment.run(model, settled=SETTLED, keep_noise=True)[0]
             widths.append(focal_std_of_deviations(model, adjustment, critical=False, contradicted=False))
-            noise = np.sqrt(adjustment.scatter(model).variance[0, 0])
+            noise = np.sqrt(block_scatter(adjustment.linearised(model)).variance[0, 0])
             focal = model.cameras.intrinsics[0, 0] / scene.K[0, 0, 0]
             sigmas.append(np.log(focal) / np.hypot(noise, widths[-1]))
     assert np.abs(sigmas).max() < 2.0

@@ -19,15 +19,14 @@ from thesisrecon.pipeline import large_sets
 from thesisrecon.pipeline.large_sets import (
     align_parts,
     cameras_from_parts,
-    cameras_on_tracks,
     divide_views,
     has_narrow_cut,
     input_of_part,
     neighbour_graph,
     overlapping_parts,
-    pairs_of_missing,
     reconstruct_part,
 )
+from thesisrecon.pipeline.left_over import cameras_on_tracks, pairs_of_missing
 from thesisrecon.pipeline.run import _StageLog, start_run
 from thesisrecon.records import MetricResult
 

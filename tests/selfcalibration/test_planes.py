@@ -73,7 +73,7 @@ def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed
 
 def region_of(found):
     rng = np.random.default_rng(0)
-    return CheiralityRegion.of(found.frame, found.reconstruction, max_points=200, rng=rng)
+    return CheiralityRegion.of(found.frame, found.reconstruction, rng)
 
 
 @pytest.mark.parametrize("seed", range(4))
