@@ -8,10 +8,10 @@ from thesisrecon.arrays import F64
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.io._images import is_rgba, read_levels
 from thesisrecon.pipeline.image_pair import ImageInput
-from thesisrecon.records import (
-    DisparityMap,
-)
-from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range, rectify_pair
+from thesisrecon.records import DisparityMap
+from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
+from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range
+from thesisrecon.stereo.rectification import rectify as best_rectification
 
 
 def rectify(
@@ -56,7 +56,7 @@ def rectify(
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     images = read_levels(image1), read_levels(image2)
     size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
-    frame = rectify_pair(F, xy1, xy2, size1, size2, methods=PLANAR if planar else METHODS)
+    frame = best_rectification(pair_of_fundamental(F, xy1, xy2, size1, size2), PLANAR if planar else METHODS)
     return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
 
 
