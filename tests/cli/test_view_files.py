@@ -17,7 +17,7 @@ from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.model import TextureAtlas
+from thesisrecon.surface.model import texture_mesh
 
 SIZE = SHAPE[::-1]
 COUNT = 8
@@ -35,7 +35,7 @@ def sphere(tmp_path_factory):
     """A folder as a run leaves it, and the model in it."""
     out = tmp_path_factory.mktemp("views") / "a rün"
     maps = ring_of(COUNT)
-    mesh = TextureAtlas().texture(VolumetricFusion(voxel_px=3.0).fuse(maps), [photograph(m) for m in maps])
+    mesh = texture_mesh(VolumetricFusion(voxel_px=3.0).fuse(maps), [photograph(m) for m in maps])
     write_mesh(out / "model.glb", mesh)
     write_cameras(out)
     write_json(out / "run.json", {})

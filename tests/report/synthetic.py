@@ -20,7 +20,7 @@ from thesisrecon.records import HeldOut, Image, IntrinsicInterval, MetricResult,
 from thesisrecon.report._data import ReportData
 from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.fusion import VolumetricFusion
-from thesisrecon.surface.model import TextureAtlas
+from thesisrecon.surface.model import texture_mesh
 
 SIZE = (480, 320)
 K = np.array([[520.0, 0.0, 231.0], [0.0, 520.0, 166.0], [0.0, 0.0, 1.0]])
@@ -188,7 +188,7 @@ SPHERE_NAMES = tuple(f"sphere {k} <b>.jpg" for k in range(8))
 def sphere_model():
     """The sphere in at most 6000 triangles with the texture of its photographs."""
     mesh = reduce_faces(VolumetricFusion().fuse(ring_of()), 6_000)
-    return TextureAtlas().texture(mesh, [photograph(m) for m in ring_of()])
+    return texture_mesh(mesh, [photograph(m) for m in ring_of()])
 
 
 @cache

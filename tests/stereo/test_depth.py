@@ -17,7 +17,7 @@ from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image
 from thesisrecon.stereo import correspondence, depth
-from thesisrecon.stereo._depth_fusion import _concatenated, _measured
+from thesisrecon.stereo._depth_fusion import _concatenated, inverse_depths
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo._frames import common_orientation, polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
@@ -277,7 +277,7 @@ def wall_points(P, xy):
 @pytest.mark.parametrize("method", [common_orientation, polar])
 def test_exact_disparities_give_exact_depth(method):
     P = on_arc((-6.0, 6.0))
-    rho, std = _measured(P[0], P[1], true_correspondence(P, (0, 1), method))
+    rho, std = inverse_depths(P[0], P[1], true_correspondence(P, (0, 1), method))
     known = np.isfinite(rho)
     assert known.mean() > 0.6
     assert np.nanmedian(np.abs(6.0 * rho - 1.0)) < 1e-5

@@ -150,7 +150,7 @@ def test_wrong_calls_are_refused(variant):
         refuses(ValueError, words, variant.match, left, right, disparity_range=limits)
     for kind, wrong in (
         (SemiGlobalMatching, {"paths": 6}), (SemiGlobalMatching, {"census_share": 1.2}),
-        (MaximumLikelihoodScanline, {"radius": 9}), (MaximumLikelihoodScanline, {"cohesion": "both"}),
+        (MaximumLikelihoodScanline, {"radius": 9}),
     ):  # fmt: skip
         refuses(ValueError, next(iter(wrong)), kind, **wrong)
 
@@ -178,17 +178,7 @@ def test_noise_and_the_cost_of_a_hidden_pixel():
         assert estimate_noise(side) == pytest.approx(sigma, abs=1.2)
 
 
-def test_cohesion_has_fewer_discontinuities_and_strips_cover_every_row():
-    left, right, _, _ = pair_with_truth()
-    left, right = np.rint(left / 16.0) * 16.0, np.rint(right / 16.0) * 16.0
-    breaks = []
-    for cohesion in ("none", "along", "along and across"):
-        variant = MaximumLikelihoodScanline(radius=0, cohesion=cohesion)
-        found = variant.match(left, right, disparity_range=(0, 24)).disparity
-        d = np.nan_to_num(found, nan=-99.0)
-        breaks.append((int((np.diff(d, axis=1) != 0).sum()), int((np.diff(d, axis=0) != 0).sum())))
-    assert breaks[1][0] < breaks[0][0]
-    assert breaks[2][1] < breaks[1][1]
+def test_strips_cover_every_row_once_and_fit():
     for height, per_row, memory in ((100, 10, 1e6), (500, 1000, 2e5), (333, 7, 1.0)):
         strips = row_strips(height, per_row, memory)
         assert [s[0] for s in strips] == [0, *[s[1] for s in strips[:-1]]]

@@ -7,10 +7,16 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo import _depth_fusion as kernels
 from thesisrecon.stereo import _postprocessing
 from thesisrecon.stereo._cost import census, split_channels
-from thesisrecon.stereo._plane_kernels import fit_planes
+from thesisrecon.stereo._depth_fusion import (
+    InverseDepth,
+    fit_planes,
+    fuse_inverse_depths,
+    inverse_depths,
+    update_kalman,
+)
+from thesisrecon.stereo.correspondence import Correspondence
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, _solve_row
 from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
 
@@ -108,7 +114,7 @@ def test_rows_of_greatest_likelihood(first, n, seed):
         for _ in range(2)
     )
     left, right = np.empty(width, np.int32), np.empty(width, np.int32)
-    for prices in ((11, 5, 1, 1), (11, 11, 1, 0), (11, 5, 0, 0), (40, 5, 1, 1)):
+    for prices in ((11, 5), (11, 11), (40, 5)):
         _solve_row(costs, first, prices, above, left, right)
         found = price_of(costs, first, prices, above, left, right)
         assert found == most_likely_row(costs, first, prices, above)
@@ -147,7 +153,7 @@ def path_sum(costs, penalty, step, direction):
 def most_likely_row(costs, first, prices, above):
     """(cost, discontinuities) of the best correspondence of a row, by recursion over whole solutions."""
     n, width = costs.shape
-    hidden, border, along, across = prices
+    hidden, border = prices
     best, ends = {}, []
     for i, j in itertools.product(range(width + 1), range(width + 1)):
         q = i - j - first
@@ -166,7 +172,7 @@ def most_likely_row(costs, first, prices, above):
             for before in range(3):
                 if (a, b, before) in best:
                     cost, count = best[a, b, before]
-                    found[state].append((cost + price, count + along * (before != state) + across * breaks))
+                    found[state].append((cost + price, count + (before != state) + breaks))
         for state, values in found.items():
             if values:
                 best[i, j, state] = cost, count = min(values)
@@ -198,8 +204,7 @@ def test_inverse_depths_equal_least_squares_on_the_line():
     q = homogenize(pixels()) @ H.T + truth[..., None] * e
     xy = (q[..., :2] / q[..., 2:] + rng.normal(0.0, 0.1, (*SHAPE, 2))).astype(np.float32)
     sigma = holes(rng, np.full(SHAPE, 0.3))
-    rho, std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
-    kernels.inverse_depths(xy, sigma, H, e, rho, std)
+    rho, std = inverse_depths(np.eye(3, 4), np.column_stack([H, e]), Correspondence(xy, sigma))
     h = homogenize(pixels()) @ H.T
     a, b = e[:2] - xy * e[2], xy * h[..., 2:] - h[..., :2]
     wanted = (a * b).sum(-1) / (a * a).sum(-1)
@@ -218,9 +223,7 @@ def test_fusion_is_the_weighted_mean_of_the_largest_party():
     rho = truth + std * rng.normal(size=std.shape)
     rho[rng.random(std.shape) < 0.25] += 0.7
     rho = holes(rng, rho)
-    out, out_std = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
-    support, rivals = np.empty(SHAPE, np.uint8), np.empty(SHAPE, np.uint8)
-    kernels.fuse_inverse_depths(rho, std, 3.0, out, out_std, support, rivals)
+    found = fuse_inverse_depths(list(zip(rho, std, strict=True)), SHAPE)
     apart = np.abs(rho[:, None].astype(float) - rho[None])
     agree = apart <= 3.0 * np.hypot(std[:, None].astype(float), std[None])
     weight = 1.0 / std.astype(float) ** 2
@@ -233,27 +236,27 @@ def test_fusion_is_the_weighted_mean_of_the_largest_party():
         chi = np.where(party, weight * (rho - mean) ** 2, 0.0).sum(0) / (party.sum(0) - 1)
         wanted_std = np.sqrt(np.where(party.sum(0) > 1, np.maximum(chi, 1.0), 1.0) / total)
         wanted_std[total == 0.0] = np.nan
-    assert (support == party.sum(0)).all()
-    assert (rivals == np.isfinite(rho).sum(0) - party.sum(0)).all()
-    np.testing.assert_allclose(out, mean, rtol=1e-5)
-    np.testing.assert_allclose(out_std, wanted_std, rtol=1e-4)
+    assert (found.views == party.sum(0)).all()
+    assert (found.conflicts == np.isfinite(rho).sum(0) - party.sum(0)).all()
+    np.testing.assert_allclose(found.value, mean, rtol=1e-5)
+    np.testing.assert_allclose(found.std, wanted_std, rtol=1e-4)
 
 
 def test_the_filter_ends_at_the_first_outlier():
     rng = np.random.default_rng(2)
     rho, std = holes(rng, rng.uniform(1.0, 1.1, SHAPE)), np.full(SHAPE, 0.05, np.float32)
     new, new_std = holes(rng, rng.uniform(0.8, 1.3, SHAPE)), np.full(SHAPE, 0.03, np.float32)
-    alive, support = (rng.random(SHAPE) < 0.8).astype(np.uint8), np.ones(SHAPE, np.uint8)
+    alive, support = rng.random(SHAPE) < 0.8, (~np.isnan(rho)).astype(np.uint8)
     before, was = rho.copy(), alive.copy()
-    kernels.update_kalman(rho, std, new, new_std, 3.0, alive, support)
+    update_kalman(InverseDepth(rho, std, support, support), (new, new_std), alive)
     inside = np.abs(new - before) <= 3.0 * np.hypot(0.05, 0.03)
     first, measured = np.isnan(before), np.isfinite(new)
-    taken = (was == 1) & measured & (first | inside)
+    taken = was & measured & (first | inside)
     assert (alive == taken).all()
     gain = 0.05**2 / (0.05**2 + 0.03**2)
     wanted = np.where(first, new, before + gain * (new - before))
     np.testing.assert_allclose(rho, np.where(taken, wanted, before), rtol=1e-5)
-    assert (support == np.where(taken & ~first, 2, 1)).all()
+    assert (support == ~first + taken.astype(int)).all()
     np.testing.assert_allclose(std[taken & ~first], np.sqrt(1.0 - gain) * 0.05, rtol=1e-5)
 
 
@@ -263,9 +266,7 @@ def test_planes_are_fitted_to_similar_pixels():
     rho = (1.0 + 1e-3 * xy[..., 0] - 2e-3 * xy[..., 1]).astype(np.float32)
     rho[:, 20:] += 0.5
     rho = holes(rng, rho)
-    gx, gy = np.empty(SHAPE, np.float32), np.empty(SHAPE, np.float32)
-    fit_planes(rho, 3, 0.1, gx, gy)
-    known = np.isfinite(rho)
-    assert (np.isfinite(gx) == known).all()
-    np.testing.assert_allclose(gx[known], 1e-3, atol=2e-6)
-    np.testing.assert_allclose(gy[known], -2e-3, atol=2e-6)
+    planes, known = fit_planes(rho, 3), np.isfinite(rho)
+    np.testing.assert_array_equal(planes[..., 0], rho)
+    np.testing.assert_allclose(planes[known, 1], 1e-3, atol=2e-6)
+    np.testing.assert_allclose(planes[known, 2], -2e-3, atol=2e-6)

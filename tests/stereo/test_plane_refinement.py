@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from tests.synthetic import texture
-from thesisrecon.stereo import _plane_kernels as kernels
+from thesisrecon.stereo import _plane_refinement as kernels
 
 SHAPE = (13, 17)
 PLANE = np.array([1.0, 6e-3, -4e-3])
@@ -16,15 +16,14 @@ def arguments(gray, others, H, e):
     """What the compiled loops take of a reference and its neighbours, windows of 5 x 5 samples."""
     words, layout, start = [], [], 0
     for other in others:
-        words.append(np.empty(other.shape, np.uint32))
-        kernels.pack_squares(other, words[-1])
+        words.append(kernels.pack_squares(other))
         layout.append((start, *other.shape[::-1]))
         start += other.size
     packed = np.concatenate([word.ravel() for word in words])
     sample = np.stack(np.meshgrid(np.arange(-4, 5, 2), np.arange(-4, 5, 2))).reshape(2, -1)
     likeness = np.exp(-np.arange(256.0) / 15.0).astype(np.float32)
-    window = kernels.PatchWindow(sample.astype(np.float32), likeness)
-    return kernels.PatchViews(gray, packed, np.array(layout), H, e), window
+    offsets = sample.astype(np.float32)
+    return kernels.PatchSearch(gray, packed, np.array(layout), H, e, offsets, likeness)
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +59,7 @@ def planes_about(places, spread, seed=0):
 def test_squares_are_the_four_levels_of_an_interpolation(scene):
     gray = scene[0].copy()
     gray[5, 7] = 300.0
-    packed = np.empty(SHAPE, np.uint32)
-    kernels.pack_squares(gray, packed)
+    packed = kernels.pack_squares(gray)
     level = np.floor(np.clip(gray + np.float32(0.5), 1.0, 255.0))
     four = np.stack([level[:-1, :-1], level[:-1, 1:], level[1:, :-1], level[1:, 1:]], axis=-1)
     four = np.where(np.isfinite(four).all(axis=-1, keepdims=True), four, 0.0)
@@ -74,13 +72,11 @@ def test_squares_are_the_four_levels_of_an_interpolation(scene):
 
 def test_costs_vanish_at_the_true_plane_and_slopes_are_motions(scene):
     _, given, places = scene
-    cost, least, slope = np.empty((3, *SHAPE), np.float32)
-    support, costs = np.empty(SHAPE, np.uint8), []
-    H, e = given[0].H.swapaxes(1, 2)[:, None], given[0].e[:, None, None]
+    H, e, costs = given.H.swapaxes(1, 2)[:, None], given.e[:, None, None], []
     for spread in (0.0, 0.5, 20.0):
         planes = planes_about(places, spread)
-        kernels.begin_planes(*given, planes, cost)
-        kernels.rate_planes(*given, planes, 0.4, least, support, slope)
+        cost = kernels.begin_planes(given, planes)
+        least, support, std = kernels.rate_planes(given, planes, 0.4)
         costs.append(np.median(least[least < kernels.UNKNOWN]))
         known = np.isfinite(planes[..., 0]) & np.isfinite(scene[0])
         assert (cost[~known] == kernels.UNKNOWN).all()
@@ -92,7 +88,11 @@ def test_costs_vanish_at_the_true_plane_and_slopes_are_motions(scene):
         q = np.stack([*places, np.ones(SHAPE)], axis=-1) @ H + planes[..., :1] * e
         squares = np.sum(((e[..., :2] - q[..., :2] / q[..., 2:] * e[..., 2:]) / q[..., 2:]) ** 2, axis=-1)
         for views, moved in ((1, squares), (2, squares.sum(axis=0) - squares)):
-            assert np.isclose(slope**2, moved, rtol=1e-4).any(axis=0)[support == views].all()
+            assert (
+                np.isclose((kernels.SIGMA_PX / std) ** 2, moved, rtol=1e-4)
+                .any(axis=0)[support == views]
+                .all()
+            )
         if spread == 0.0:
             assert (support[known] >= 1).mean() > 0.5
             assert (support == 2).any()
@@ -104,15 +104,14 @@ def test_costs_vanish_at_the_true_plane_and_slopes_are_motions(scene):
 def test_converged_planes_rest_until_a_neighbour_changes(scene):
     _, given, places = scene
     planes = planes_about(places, 0.5)
-    cost = np.empty(SHAPE, np.float32)
-    kernels.begin_planes(*given, planes, cost)
+    cost = kernels.begin_planes(given, planes)
     kept, kept_cost = planes.copy(), cost.copy()
-    kernels.sweep_planes(*given, 0.4, 0.02, False, planes, cost, np.zeros(SHAPE, np.uint8))
+    kernels.sweep_planes(given, 0.4, 0.02, False, planes, cost, np.zeros(SHAPE, np.uint8))
     np.testing.assert_array_equal(planes, kept)
     np.testing.assert_array_equal(cost, kept_cost)
     active = np.zeros(SHAPE, np.uint8)
     active[SHAPE[0] // 2, SHAPE[1] // 2] = 1
-    kernels.sweep_planes(*given, 0.4, 0.02, False, planes, cost, active)
+    kernels.sweep_planes(given, 0.4, 0.02, False, planes, cost, active)
     y, x = np.nonzero(cost != kept_cost)
     assert 0 < len(y) < cost.size / 2
     assert y.min() >= SHAPE[0] // 2

@@ -31,8 +31,6 @@ from thesisrecon.stereo.rectification import (
     jacobians,
     measure_quality,
     rectify,
-    rectify_cameras,
-    rectify_pair,
 )
 
 SIZE = (640, 480)
@@ -216,9 +214,9 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
     for method in PLANAR_METHODS:
         refuses(StageFailure, "polar", method, pair)
     for best in (
-        rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes),
-        rectify_cameras(*scene.P, *scene.sizes, xy1=scene.xy1, xy2=scene.xy2),
-        rectify_cameras(*scene.P, *scene.sizes),
+        rectify(pair_of_fundamental(scene.F, scene.xy1, scene.xy2, *scene.sizes)),
+        rectify(pair_of_cameras(*scene.P, *scene.sizes, xy1=scene.xy1, xy2=scene.xy2)),
+        rectify(pair_of_cameras(*scene.P, *scene.sizes)),
     ):
         assert isinstance(best, PolarRectification)
         for side, size in enumerate(pair.pencil.sizes):
@@ -228,7 +226,7 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
 
 def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch(monkeypatch):
     scene = make_pair("beside", np.random.default_rng(9))
-    best = rectify_pair(scene.F, scene.xy1, scene.xy2, *scene.sizes)
+    best = rectify(pair_of_fundamental(scene.F, scene.xy1, scene.xy2, *scene.sizes))
     assert isinstance(best, planar.PlanarRectification)
     wide = both_pairs(make_pair("toed in", np.random.default_rng(9)))[0]
     monkeypatch.setattr(rectification, "BENDING", -1.0)
@@ -255,8 +253,10 @@ def test_images_in_the_other_order_do_not_fit_the_fundamental_matrix(motion):
     """Their rows would be off by tens of pixels; with noise the right ones are within one or two."""
     scene = make_pair(motion, np.random.default_rng(13), noise_px=0.5)
     sizes = scene.sizes[::-1]
-    refuses(StageFailure, "does not fit the matches", rectify_pair, scene.F, scene.xy2, scene.xy1, *sizes)
-    rectify_pair(scene.F.T, scene.xy2, scene.xy1, *sizes)
+    refuses(
+        StageFailure, "does not fit the matches", pair_of_fundamental, scene.F, scene.xy2, scene.xy1, *sizes
+    )
+    rectify(pair_of_fundamental(scene.F.T, scene.xy2, scene.xy1, *sizes))
 
 
 def test_pairs_that_cannot_be_rectified_are_refused_with_a_reason():
@@ -276,21 +276,21 @@ def test_pairs_that_cannot_be_rectified_are_refused_with_a_reason():
         ("too few", {"xy1": scene.xy1[:5], "xy2": scene.xy2[:5]}),
         ("rank 1", {"F": np.outer([1.0, 2.0, 3.0], [3.0, 1.0, 2.0])}),
     ):
-        refuses(StageFailure, words, rectify_pair, **(given | change))
+        refuses(StageFailure, words, pair_of_fundamental, **(given | change))
     for change in (
         {"F": np.zeros((3, 3))}, {"F": np.eye(2)}, {"F": np.full((3, 3), np.nan)},
         {"xy1": np.zeros((4, 2))}, {"xy1": np.full((300, 2), np.inf)}, {"size1": (1, 480)},
         {"size2": (640, 0)},
     ):  # fmt: skip
-        refuses(ValueError, r"rectif|matches|image", rectify_pair, **(given | change))
+        refuses(ValueError, r"rectif|matches|image", pair_of_fundamental, **(given | change))
     same, near, away = (scene.P.copy() for _ in range(3))
     same[1] = same[1, :, :3] @ np.eye(3, 4)
     near[1, :, 3] *= 1e-5
     away[1] = camera_from_centre(scene.P[0, :, :3], np.diag([-1.0, 1.0, -1.0]), np.array([1.5, 0.0, -5.0]))
     x2 = project(near[1], scene.X) + 0.05 * rng.normal(size=scene.xy1.shape)
-    refuses(StageFailure, "the same centre", rectify_cameras, *same, SIZE, SIZE)
-    refuses(StageFailure, "no parallax", rectify_cameras, *near, SIZE, SIZE, xy1=scene.xy1, xy2=x2)
-    refuses(StageFailure, "in front of both", rectify_cameras, *away, SIZE, SIZE)
+    refuses(StageFailure, "the same centre", pair_of_cameras, *same, SIZE, SIZE)
+    refuses(StageFailure, "no parallax", pair_of_cameras, *near, SIZE, SIZE, xy1=scene.xy1, xy2=x2)
+    refuses(StageFailure, "in front of both", pair_of_cameras, *away, SIZE, SIZE)
 
 
 def planar_frame(H, size):

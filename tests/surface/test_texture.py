@@ -26,7 +26,7 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import model as texture_atlas
 from thesisrecon.surface._mesh import face_neighbours, halve_surface
-from thesisrecon.surface.model import SurfaceModel, TextureAtlas, _pack_rectangles, cut_tile
+from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, _pack_rectangles, cut_tile, texture_mesh
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
 
@@ -56,7 +56,7 @@ def prepared_views(mesh, views):
 
 
 def test_a_new_view_shows_the_painted_sphere(sphere):
-    mesh = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()])
+    mesh = texture_mesh(sphere, [photograph(m) for m in ring_of()])
     assert mesh.untextured.mean() < 0.05
     assert np.sqrt(np.mean(difference(mesh) ** 2)) < 6.0
 
@@ -112,7 +112,7 @@ def test_rectangles_do_not_overlap():
 
 
 def test_the_atlas_is_no_larger_than_allowed(sphere):
-    mesh = TextureAtlas(max_texels=20_000).texture(sphere, [photograph(m) for m in ring_of()])
+    mesh = texture_mesh(sphere, [photograph(m) for m in ring_of()], max_texels=20_000)
     assert mesh.texture.shape[0] * mesh.texture.shape[1] < 40_000  # with the patches of unseen faces
     assert np.sqrt(np.mean(difference(mesh) ** 2)) < 20.0
 
@@ -125,23 +125,17 @@ def test_what_cannot_be_textured_is_rejected(sphere):
         [[-100.0, -100.0, 4.0], [100.0, -100.0, 4.0], [100.0, 100.0, 4.0], [-100.0, 100.0, 4.0]]
     )
     wall = TexturedMesh(square @ camera.R + camera.centre, np.array([[0, 2, 1], [0, 3, 2]]))
-    for words, atlas, mesh, some in (
-        (
-            r"too large; \d+ charts need \d+ texels, the limit is 40",
-            TextureAtlas(max_texels=40),
-            sphere,
-            views,
-        ),
-        ("no texture; no image shows the outside of a face", TextureAtlas(), sphere, [away]),
-        ("shows the outside of a face completely", TextureAtlas(), wall, views[:1]),
+    for words, most, mesh, some in (
+        (r"too large; \d+ charts need \d+ texels, the limit is 40", 40, sphere, views),
+        ("no texture; no image shows the outside of a face", MAX_TEXELS, sphere, [away]),
+        ("shows the outside of a face completely", MAX_TEXELS, wall, views[:1]),
     ):
-        refuses(StageFailure, words, atlas.texture, mesh, some)
-    refuses(ValueError, "max_texels must be >= 1", TextureAtlas, max_texels=0)
+        refuses(StageFailure, words, texture_mesh, mesh, some, max_texels=most)
 
 
 def test_unseen_faces_take_the_colour_of_their_surroundings(sphere):
     red = [replace(v, rgb=np.full_like(v.rgb, [200, 30, 20])) for v in map(photograph, ring_of()[:3])]
-    mesh = TextureAtlas().texture(sphere, red)
+    mesh = texture_mesh(sphere, red)
     assert 0.2 < mesh.untextured.mean() < 0.8
     seen = render(mesh, Camera.from_matrix(looking_at_origin(np.pi, 0.0, 3.5), (160, 120)))
     inner = seen.color[seen.valid & (seen.color.sum(axis=2) > 230)].astype(int)
@@ -227,14 +221,14 @@ def test_of_many_views_those_of_the_largest_weights_are_blended():
 
 @pytest.mark.parametrize("max_texels", [4096 * 4096, 20_000])
 def test_the_texture_is_the_same_bytes_within_any_memory_and_for_any_threads(sphere, monkeypatch, max_texels):
-    views, atlas, rastered = [photograph(m) for m in ring_of(40)], TextureAtlas(max_texels=max_texels), []
+    views, rastered = [photograph(m) for m in ring_of(40)], []
 
     def counted(*given):
         rastered.append(0)
         return rasterize(*given)
 
     monkeypatch.setattr(blending, "rasterize", counted)
-    whole = atlas.texture(sphere, views)
+    whole = texture_mesh(sphere, views, max_texels=max_texels)
     once = len(rastered)
     assert once == (40 if max_texels > 1e6 else 80)
     for name in ("BUFFER_BYTES", "SURFACE_BYTES"):
@@ -244,7 +238,7 @@ def test_the_texture_is_the_same_bytes_within_any_memory_and_for_any_threads(sph
     monkeypatch.setattr(blending, "CHUNK_POINTS", 500)
     for threads in (1, 2):
         rastered.clear()
-        within = atlas.texture(sphere, views, threads=threads)
+        within = texture_mesh(sphere, views, max_texels=max_texels, threads=threads)
         assert within.texture.tobytes() == whole.texture.tobytes()
         assert within.uv.tobytes() == whole.uv.tobytes()
         assert len(rastered) > 2 * once
@@ -263,7 +257,7 @@ def test_views_in_memory_during_texturing_do_not_grow_with_their_number(sphere, 
     monkeypatch.setattr(blending, "_prepared", followed)
     monkeypatch.setattr(blending, "BUFFER_BYTES", 0)
     monkeypatch.setattr(blending, "SURFACE_BYTES", 3 * 11 * 160 * 120)
-    TextureAtlas().texture(sphere, [photograph(m) for m in ring_of(count)], threads=2)
+    texture_mesh(sphere, [photograph(m) for m in ring_of(count)], threads=2)
     # Those that are kept, those of one batch, and those that two threads are making.
     assert most[0] <= 3 + blending.BATCH_VIEWS + 2
 
@@ -283,7 +277,7 @@ def test_a_part_of_the_surface_uses_no_view_away_from_it_and_each_one_that_shows
 
 
 def test_a_tile_has_the_texels_and_corners_of_the_whole(sphere):
-    whole = TextureAtlas().texture(sphere, [photograph(m) for m in ring_of()[:5]])
+    whole = texture_mesh(sphere, [photograph(m) for m in ring_of()[:5]])
     part = halve_surface(whole, np.ones(len(whole.faces), int), len(whole.faces) // 3)
     assert whole.untextured.any()
     texels = 0

@@ -250,14 +250,12 @@ def test_two_pictures_become_one_by_the_rules():
     shape, s = (12, 15), 0.3
     colors = tuple(rng.uniform(0, 255, (*shape, 3)).astype(np.float32) for _ in range(2))
     fronts = tuple(rng.choice([1.0, 1.4, 6.0, np.nan], shape).astype(np.float32) for _ in range(2))
-    weights = tuple(rng.choice([0.01, 0.4, 1.0], (9, 9)).astype(np.float32) for _ in range(2))
-    sources = tuple(rng.uniform(-0.5, 8.5, (*shape, 2)).astype(np.float32) for _ in range(2))
+    weights = tuple(rng.choice([0.01, 0.4, 1.0], shape).astype(np.float32) for _ in range(2))
     out = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-    kernels.blend(colors, fronts, sources, weights, (0.5, 0.015, s), out)
+    kernels.blend(colors, fronts, weights, (0.5, 0.015, s), out)
     for at in np.ndindex(shape):
         n, c = [float(f[at]) for f in fronts], [color[at].astype(float) for color in colors]
-        places = [tuple(np.clip(np.rint(source[at]), 0, 8).astype(int)[::-1]) for source in sources]
-        w = [float(weight[place]) for weight, place in zip(weights, places, strict=True)]
+        w = [float(weight[at]) for weight in weights]
         sure = [weight > 0.015 for weight in w]
         if np.isnan(n).all():
             assert np.isnan([*out[0][at], out[1][at]]).all()

@@ -27,8 +27,10 @@ from thesisrecon.records import (
     Tracks,
     require_mesh,
 )
+from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
-from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range, rectify_pair
+from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range
+from thesisrecon.stereo.rectification import rectify as best_rectification
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
@@ -74,7 +76,7 @@ def rectify(
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     images = read_levels(image1), read_levels(image2)
     size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
-    frame = rectify_pair(F, xy1, xy2, size1, size2, methods=PLANAR if planar else METHODS)
+    frame = best_rectification(pair_of_fundamental(F, xy1, xy2, size1, size2), PLANAR if planar else METHODS)
     return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
 
 

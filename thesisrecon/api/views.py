@@ -27,8 +27,13 @@ from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 from thesisrecon.views.render import Shading, render_mesh
-from thesisrecon.views.tensor import VirtualCamera, default_intrinsics, pair_from_fundamental
-from thesisrecon.views.tensor_synthesis import TensorSynthesis, prepare_synthesis
+from thesisrecon.views.tensor import (
+    TensorSynthesis,
+    VirtualCamera,
+    default_intrinsics,
+    pair_from_fundamental,
+    prepare_synthesis,
+)
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""

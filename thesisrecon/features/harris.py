@@ -124,18 +124,12 @@ def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[
 
 @kernel
 def _is_maximum(response: F32, x: int, y: int) -> bool:
-    # > on one side and >= on the other: a plateau of two pixels gives one corner.
-    v = response[y, x]
-    return bool(
-        v > response[y - 1, x - 1]
-        and v > response[y - 1, x]
-        and v > response[y - 1, x + 1]
-        and v > response[y, x - 1]
-        and v >= response[y, x + 1]
-        and v >= response[y + 1, x - 1]
-        and v >= response[y + 1, x]
-        and v >= response[y + 1, x + 1]
-    )
+    # > before and >= after the pixel: a plateau of two pixels gives one corner.
+    for k in range(9):
+        other = response[y + k // 3 - 1, x + k % 3 - 1]
+        if (k < 4 and response[y, x] <= other) or response[y, x] < other:
+            return False
+    return True
 
 
 @kernel
@@ -186,13 +180,11 @@ def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
     kept = empty(len(order), np.int64)
     n = 0
     for i in order:
-        free = True
         for k in range(n):
             dx, dy = xy[i, 0] - xy[kept[k], 0], xy[i, 1] - xy[kept[k], 1]
             if dx * dx + dy * dy < distance * distance:
-                free = False
                 break
-        if free:
+        else:
             kept[n] = i
             n += 1
     return kept[:n]
@@ -205,23 +197,12 @@ class CornerMeasure:
     M (2 x 2; the thesis' "4 x 4" is a slip) holds the products of the image gradient, smoothed by a Gaussian.
     The thesis' formula for R lost two signs: M and (M11 + M22) fit both det M / trace M (Noble 1988) and det
     M - k (trace M)^2 (Harris and Stephens 1988); both are available.
-
-    Parameters
-    ----------
-    formula : {"noble", "harris"}
-        det / trace, or det - k trace^2.
-    integration_sigma_px : float
-        Gaussian of M, three sigma to each side. The thesis has sigma 1.
-    colour : bool
-        Mean of M over red, green and blue, else M of the grey values.
-    subpixel : bool
-        Fit a quadratic surface to the 3 x 3 pixels of each maximum, else keep the pixel.
     """
 
-    formula: Literal["noble", "harris"] = "noble"
-    integration_sigma_px: float = 1.5
-    colour: bool = False
-    subpixel: bool = True
+    formula: Literal["noble", "harris"] = "noble"  #: det / trace, or det - k trace^2
+    integration_sigma_px: float = 1.5  #: Gaussian of M, three sigma to each side; the thesis has sigma 1
+    colour: bool = False  #: mean of M over red, green and blue, else M of the grey values
+    subpixel: bool = True  #: fit a quadratic surface to the 3 x 3 pixels of each maximum, else keep the pixel
 
     # k of Harris and Stephens.
     harris_k = 0.04
@@ -265,24 +246,13 @@ class CornerMeasure:
 
 @dataclass(frozen=True)
 class HarrisCorners:
-    """The thesis' detector: one scale, a threshold on R, the strongest corners with spatial selection.
+    """The thesis' detector: one scale, a threshold on R, the strongest corners with spatial selection."""
 
-    Parameters
-    ----------
-    max_corners : int
-        Maximum number of corners.
-    threshold_rel : float
-        Minimum response relative to the largest one; 0 for all above the noise.
-    selection : {"spacing", "spread"}
-        Drop corners too near to a stronger one, or use :func:`select_spread`.
-    measure : CornerMeasure
-        Response and its parameters.
-    """
-
-    max_corners: int = 2000
-    threshold_rel: float = 0.002
+    max_corners: int = 2000  #: maximum number of corners
+    threshold_rel: float = 0.002  #: minimum response relative to the largest one; 0 for all above the noise
     selection: Literal["spacing", "spread"] = "spacing"
-    measure: CornerMeasure = field(default_factory=CornerMeasure)
+    """Drop corners too near to a stronger one, or use :func:`select_spread`."""
+    measure: CornerMeasure = field(default_factory=CornerMeasure)  #: response and its parameters
 
     # Minimum distance of two corners for "spacing", relative to the long side.
     spacing_rel = 0.004

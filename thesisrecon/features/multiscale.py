@@ -106,25 +106,14 @@ class MultiScaleCorners:
     Seeds are the multi-scale oriented patches of Brown, Szeliski and Winder (CVPR 2005), each upright and
     rotated to its dominant gradient. Small images are doubled first: the scales of the corners are 1 and 2,
     or 0.5 and 1.
-
-    Parameters
-    ----------
-    full_corners, half_corners : int
-        Number of corners at full and at half size; 0 for none.
-    spread : bool
-        Select corners and seeds that cover the image (:func:`~thesisrecon.features.harris.select_spread`),
-        else the strongest.
-    levels : int
-        Number of levels; with fewer than 3 there is no half size.
-    measure : CornerMeasure
-        Response and its parameters at every size.
     """
 
-    full_corners: int = 3000
-    half_corners: int = 1500
-    spread: bool = True
-    levels: int = 5
+    full_corners: int = 3000  #: number of corners at full size; 0 for none
+    half_corners: int = 1500  #: number of corners at half size; 0 for none
+    spread: bool = True  #: select corners and seeds that cover the image, else the strongest
+    levels: int = 5  #: number of levels; with fewer than 3 there is no half size
     measure: CornerMeasure = field(default_factory=CornerMeasure)
+    """Response and its parameters at every size."""
 
     # Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
     seeds_per_level = 1400
@@ -179,25 +168,16 @@ class MultiScaleCorners:
         return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]
 
     def _seeds(self, levels: list[_PyramidLevel], found: list[tuple[F64, F32]]) -> Seeds:
-        xy, scale, angle, upright, turned = [], [], [], [], []
+        upright, turned = [], []
         for index, (level, (corners, response)) in enumerate(zip(levels, found, strict=True)):
-            count = int(self.seeds_per_level / np.sqrt(2.0) ** index)
-            kept = self._select(corners, response, count)
-            blurred = smooth(level.gray, 2.0)
-            direction = _dominant_direction(blurred, corners[kept])
-            xy.append(level.to_image(corners[kept]))
-            scale.append(np.full(len(kept), np.sqrt(np.prod(level.scale)), np.float32))
-            angle.append(direction)
-            upright.append(sample_patches(blurred, corners[kept], np.zeros_like(direction), PATCH_SIDE, 4.0))
-            turned.append(sample_patches(blurred, corners[kept], direction, PATCH_SIDE, 4.0))
-        patches, structured = _normalize_patches(np.concatenate(upright + turned))
-        zeros = np.zeros(sum(len(a) for a in angle), np.float32)
-        return Seeds(
-            xy=np.concatenate(xy + xy)[structured],
-            scale=np.concatenate(scale + scale)[structured],
-            angle=np.concatenate([zeros, *angle])[structured],
-            patches=patches[structured],
-        )
+            kept = self._select(corners, response, int(self.seeds_per_level / np.sqrt(2.0) ** index))
+            xy = level.to_image(corners[kept])
+            scale = np.full(len(kept), np.sqrt(np.prod(level.scale)), np.float32)
+            for part, seen in zip((upright, turned), _patches(level.gray, corners[kept]), strict=True):
+                part.append((xy, scale, *seen))
+        xy, scale, angle, raw = (np.concatenate(column) for column in zip(*upright, *turned, strict=True))
+        patches, ok = _normalize_patches(raw)
+        return Seeds(xy[ok], scale[ok], angle[ok], patches[ok])
 
     def oblique_seeds(self, image: Image) -> Seeds:
         """Seeds of simulated oblique views, in the orientation of the image and rotated to their gradient."""
@@ -228,15 +208,12 @@ class MultiScaleCorners:
             # Half the density of the image: many views show the same surface.
             count = int(0.5 * self.seeds_per_level / view.tilt / np.sqrt(2.0) ** index)
             kept = self._select(corners, response, count)
-            blurred, corners, xy = smooth(gray, 2.0), corners[kept], xy[kept]
-            upright = np.full(len(kept), -view.direction, np.float32)
-            for turned, angle in ((False, upright), (True, _dominant_direction(blurred, corners))):
+            size_px = np.full(len(kept), spacing * np.sqrt(np.linalg.det(to_image)), np.float32)
+            for turned, (angle, raw) in enumerate(_patches(gray, corners[kept], -view.direction)):
+                label = angle if turned else np.zeros_like(angle)
                 c, s = np.cos(angle), np.sin(angle)
                 turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2).astype(np.float64)
-                patches = sample_patches(blurred, corners, angle, PATCH_SIDE, 4.0)
-                size_px = np.full(len(kept), spacing * np.sqrt(np.linalg.det(to_image)), np.float32)
-                label = angle if turned else np.zeros_like(angle)
-                parts.append((xy, size_px, label, patches, spacing * (to_image @ turn)))
+                parts.append((xy[kept], size_px, label, raw, spacing * (to_image @ turn)))
         return parts
 
 
@@ -258,6 +235,14 @@ def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32]
             sizes.append(halve(finer))
             scales.append(2.0 * scales[index - 2])
     return sizes, scales
+
+
+def _patches(gray: F32, corners: F64, upright: float = 0.0) -> list[tuple[F32, F32]]:
+    """Angles (N,) and patches of corners: ``upright``, and rotated to their dominant direction."""
+    blurred = smooth(gray, 2.0)
+    turned = _dominant_direction(blurred, corners)
+    angles = np.full(len(corners), upright, np.float32), turned
+    return [(angle, sample_patches(blurred, corners, angle, PATCH_SIDE, 4.0)) for angle in angles]
 
 
 def _dominant_direction(blurred: F32, xy: F64) -> F32:

@@ -18,6 +18,12 @@ def dehomogenize(xh: F64) -> F64:
         return xh[..., :-1] / xh[..., -1:]
 
 
+def map_in_front(H: F64, x: F64) -> F64:
+    """Map points (..., d) by a homography, NaN where the last coordinate is not positive."""
+    xh = homogenize(x) @ H.T
+    return np.where(xh[..., -1:] > 0.0, dehomogenize(xh), np.nan)
+
+
 def unit_normals(l: F64) -> F64:
     """Scale lines l or planes such that l . (x, 1) is a signed distance; those at infinity stay."""
     norm = np.linalg.norm(l[..., :-1], axis=-1, keepdims=True)

@@ -13,8 +13,7 @@ from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.records import TexturedMesh
 
-_SLACK = 1e-7
-"""Margin of a triangle's edges, px, so that rounding leaves no gap between neighbours."""
+_SLACK = 1e-7  #: margin of a triangle's edges, px, so that rounding leaves no gap between neighbours
 
 
 @kernel

@@ -19,12 +19,9 @@ from thesisrecon.camera import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Image, PinholeView, Reconstruction
 
-MAX_TAPS = 24
-"""Limit of the filter width: reductions by more than 6 alias."""
-NOT_SHRUNK = 1.1
-"""Reduction up to which the filter is not widened."""
-STRIP_ROWS = 64
-"""Rows whose positions are held in memory at a time."""
+MAX_TAPS = 24  #: limit of the filter width: reductions by more than 6 alias
+NOT_SHRUNK = 1.1  #: reduction up to which the filter is not widened
+STRIP_ROWS = 64  #: rows whose positions are held in memory at a time
 
 
 @kernel(fastmath=FAST)
@@ -52,8 +49,8 @@ def _convolve_separable(image: F32, taps: F32) -> F32:
 
 
 @kernel(fastmath=FAST)
-def _halve_image(image: F32) -> F32:
-    """Downsample to (H // 2, W // 2) with the taps (1, 3, 3, 1) / 8, centred between the merged pixels."""
+def halve(image: F32) -> F32:
+    """Reduce to (H // 2, W // 2) >= 1 with the taps (1, 3, 3, 1) / 8, centred between the merged pixels."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     out = empty((height, width), np.float32)
     row = empty(image.shape[1], np.float32)
@@ -107,13 +104,6 @@ def gaussian_taps(sigma_px: float) -> F32:
 def smooth(image: F32, sigma_px: float) -> F32:
     """Smooth an image (H, W) with a Gaussian, the border pixels repeated."""
     return _convolve_separable(image, gaussian_taps(sigma_px))
-
-
-def halve(image: F32) -> F32:
-    """Reduce an image to half its size (rounded down), low-passed by (1, 3, 3, 1) / 8."""
-    if min(image.shape) < 2:
-        raise ValueError(f"halve needs at least 2 x 2 pixels; got shape {image.shape}")
-    return _halve_image(image)
 
 
 @kernel

@@ -37,7 +37,7 @@ from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirector
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._mesh import halve_surface
 from thesisrecon.surface._simplification import reduce_faces
-from thesisrecon.surface.model import SurfaceModel, TextureAtlas, cut_tile
+from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, cut_tile, texture_mesh
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
@@ -180,13 +180,13 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
     made(whole.name, lambda: write_atomically(whole, content), warnings, None)
 
     def reduced() -> TexturedMesh:
-        texels = TextureAtlas.max_texels if mesh.texture is None else mesh.texture[..., 0].size
+        texels = MAX_TEXELS if mesh.texture is None else mesh.texture[..., 0].size
         share, smaller, packed = 1.0, mesh, content
         while len(packed) > 1e6 * max_mb:
             share *= 0.9 * 1e6 * max_mb / len(packed)
             smaller = reduce_faces(mesh, int(share * len(mesh.faces)), threads=threads)
-            atlas = TextureAtlas(max_texels=int(share * texels))
-            packed = glb_bytes(atlas.texture(smaller, result.views, threads=threads))
+            limit = int(share * texels)
+            packed = glb_bytes(texture_mesh(smaller, result.views, max_texels=limit, threads=threads))
         write_atomically(path, packed)
         return smaller
 
@@ -296,7 +296,7 @@ def _model_for_page(result: RunResult, threads: int) -> TexturedMesh | None:
     if result.mesh is None:
         return None
     coarse = reduce_faces(result.mesh, PAGE_FACES, threads=threads)
-    return TextureAtlas(max_texels=PAGE_TEXELS).texture(coarse, result.views, threads=threads)
+    return texture_mesh(coarse, result.views, max_texels=PAGE_TEXELS, threads=threads)
 
 
 def _thinned_maps(result: RunResult) -> dict[int, F32]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,15 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, I16, I32, U8, U16
 
-LEVELS = 4
-"""Integer steps of one grey level: resampled images have fractional levels."""
-ARM = 2
-"""Maximal length of a support arm in pixels."""
+LEVELS = 4  #: integer steps of one grey level: resampled images have fractional levels
+ARM = 2  #: maximal length of a support arm in pixels
 CENSUS_BITS = 24
-WEIGHT_SHIFT = 8
-"""Weights are in units of 1 / 256."""
-MAX_DISPARITIES = 4096
-"""Upper limit of the number of disparities searched."""
+WEIGHT_SHIFT = 8  #: weights are in units of 1 / 256
+MAX_DISPARITIES = 4096  #: upper limit of the number of disparities searched
 
 CostFeatures = tuple[I32, I16, U8]
 """Census transform (H, W), channels (K, H, W) and valid pixels (H, W) of rows of an image."""
@@ -99,10 +96,9 @@ def estimate_noise(image: StereoImage) -> float:
     inimage = whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:]
     if not inimage.any():
         return 0.0
-    # Median of integers by counting. The squared filter coefficients sum to 36.
-    below = np.cumsum(np.bincount(np.abs(response[:, inimage]).ravel()))
-    median = int(np.searchsorted(below, 0.5 * below[-1]))
-    return 1.4826 * median / 6.0 / LEVELS
+    # The squared filter coefficients sum to 36.
+    median = np.quantile(np.abs(response[:, inimage]), 0.5, method="inverted_cdf")
+    return float(1.4826 * median / 6.0 / LEVELS)
 
 
 @kernel
@@ -265,34 +261,22 @@ def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> N
 
 
 @kernel
-def _sum_five_bytes(values: tuple[U8, U8, U8, U8, U8], masks: tuple[U8, U8, U8, U8], out: U16) -> None:
-    far_l, left, here, right, far_r = values
-    mask_l, mask_far_l, mask_r, mask_far_r = masks
-    for x in range(len(out)):
-        total = np.uint16(here[x]) + np.uint16(left[x] & mask_l[x]) + np.uint16(far_l[x] & mask_far_l[x])
-        total += np.uint16(right[x] & mask_r[x]) + np.uint16(far_r[x] & mask_far_r[x])
-        out[x] = np.uint16(total)
-
-
-@kernel
-def _sum_five(
-    values: tuple[U16, U16, U16, U16, U16], masks: tuple[U16, U16, U16, U16], share: F32, out: U8
-) -> None:
-    far_a, above, here, below, far_b = values
+def _sum_five(values: Any, masks: Any, out: U16) -> None:
+    """Sum five rows of bytes or words, the four beside the middle one under their masks."""
+    far_a, near_a, here, near_b, far_b = values
     mask_a, mask_far_a, mask_b, mask_far_b = masks
     for x in range(len(out)):
-        total = np.uint16(here[x] + np.uint16(above[x] & mask_a[x]))
+        total = np.uint16(np.uint16(here[x]) + np.uint16(near_a[x] & mask_a[x]))
         total = np.uint16(total + np.uint16(far_a[x] & mask_far_a[x]))
-        total = np.uint16(total + np.uint16(below[x] & mask_b[x]))
-        total = np.uint16(total + np.uint16(far_b[x] & mask_far_b[x]))
-        out[x] = np.uint8(np.int32(np.float32(total) * share[x] + np.float32(0.5)))
+        total = np.uint16(total + np.uint16(near_b[x] & mask_b[x]))
+        out[x] = np.uint16(total + np.uint16(far_b[x] & mask_far_b[x]))
 
 
 @kernel
 def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
     """Sums (W,) of the costs over the horizontal arms of row y; ``padded`` (W + 2 ARM,)."""
     n = len(out)
-    _sum_five_bytes(
+    _sum_five(
         (padded[:n], padded[1 : n + 1], padded[2 : n + 2], padded[3 : n + 3], padded[4 : n + 4]),
         (masks[0, 0, y], masks[0, 1, y], masks[1, 0, y], masks[1, 1, y]),
         out,
@@ -300,34 +284,11 @@ def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
 
 
 @kernel
-def _mean_along_column(ring: U16, y: int, masks: U16, share: F32, out: U8) -> None:
-    """Means (W,) over the vertical arms; ``ring`` (2 ARM + 1, W) holds row y at y modulo its length."""
+def _sum_along_column(ring: U16, y: int, masks: U16, out: U16) -> None:
+    """Sums (W,) over the vertical arms; ``ring`` (2 ARM + 1, W) holds row y at y modulo its length."""
     n = len(ring)
-    _sum_five(
-        (ring[(y - 2) % n], ring[(y - 1) % n], ring[y % n], ring[(y + 1) % n], ring[(y + 2) % n]),
-        (masks[0], masks[1], masks[2], masks[3]),
-        share,
-        out,
-    )
-
-
-@kernel
-def _widen_mask(mask: U8, out: U16) -> None:
-    for x in range(len(out)):
-        out[x] = np.uint16(np.uint16(mask[x]) * np.uint16(257))
-
-
-@kernel
-def _shares(counts: U16, y: int, masks: U16, share: F32) -> None:
-    """1 / size of the support region of every pixel of row y."""
-    n = len(counts)
-    far_a, above, here = counts[(y - 2) % n], counts[(y - 1) % n], counts[y % n]
-    below, far_b = counts[(y + 1) % n], counts[(y + 2) % n]
-    mask_a, mask_far_a, mask_b, mask_far_b = masks[0], masks[1], masks[2], masks[3]
-    for x in range(len(share)):
-        total = np.int32(here[x]) + np.int32(above[x] & mask_a[x]) + np.int32(far_a[x] & mask_far_a[x])
-        total += np.int32(below[x] & mask_b[x]) + np.int32(far_b[x] & mask_far_b[x])
-        share[x] = np.float32(1.0) / np.float32(total)
+    rows = ring[(y - 2) % n], ring[(y - 1) % n], ring[y % n], ring[(y + 1) % n], ring[(y + 2) % n]
+    _sum_five(rows, (masks[0], masks[1], masks[2], masks[3]), out)
 
 
 @kernel
@@ -350,6 +311,7 @@ def cost_volume(
     ring, counts = zeros((n, span, width), np.uint16), zeros((span, width), np.uint16)
     costs, ones = zeros((n, width + 2 * ARM), np.uint8), full(width + 2 * ARM, 1, np.uint8)
     share, wide = empty(width, np.float32), empty((2 * ARM, width), np.uint16)
+    total = empty(width, np.uint16)
     summed = 0
     for y in range(height):
         while summed < min(y + ARM + 1, height):
@@ -359,7 +321,14 @@ def cost_volume(
                 _sum_along_row(costs[q], masks, summed, ring[q, summed % span])
             summed += 1
         for k in range(2 * ARM):
-            _widen_mask(masks[2 + k // ARM, k % ARM, y], wide[k])
-        _shares(counts, y, wide, share)
+            mask, words = masks[2 + k // ARM, k % ARM, y], wide[k]
+            for x in range(width):
+                words[x] = np.uint16(np.uint16(mask[x]) * np.uint16(257))
+        _sum_along_column(counts, y, wide, total)
+        for x in range(width):
+            share[x] = np.float32(1.0) / np.float32(total[x])
         for q in range(n):
-            _mean_along_column(ring[q], y, wide, share, volume[y, q])
+            _sum_along_column(ring[q], y, wide, total)
+            out = volume[y, q]
+            for x in range(width):
+                out[x] = np.uint8(np.int32(np.float32(total[x]) * share[x] + np.float32(0.5)))

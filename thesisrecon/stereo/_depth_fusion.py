@@ -11,8 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from thesisrecon._numba import kernel
-from thesisrecon.arrays import F32, F64, U8
+from thesisrecon._numba import kernel, zeros
+from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.imaging.resampling import bilinear_samples
 from thesisrecon.records import PinholeView
@@ -24,112 +24,85 @@ Correspond = Callable[[int, int], Correspondence | None]
 A = TypeVar("A")
 B = TypeVar("B")
 
-GATE = 3.0
-"""Standard deviations within which estimates agree; limit of the innovation of the filter."""
+ALIKE = 0.03  #: largest relative difference of inverse depths on one surface
+GATE = 3.0  #: standard deviations within which estimates agree; limit of the innovation of the filter
 
 
-@kernel(error_model="numpy")
-def inverse_depths(xy: F32, sigma: F32, H: F64, e: F64, rho: F32, std: F32) -> None:
-    """Inverse depths and standard deviations (H, W) from correspondences (H, W, 2), ``sigma`` in pixels.
+def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
+    """Inverse depths and standard deviations (H, W) from the correspondence with another camera.
 
     A pixel of inverse depth rho is at H (x, y, 1) + rho e in the other view; rho minimises the distance to
     the correspondence. NaN if that is unknown or behind a camera.
     """
-    height, width = rho.shape
-    for v in range(height):
-        for u in range(width):
-            rho[v, u], std[v, u] = np.nan, np.nan
-            x, y = np.float64(xy[v, u, 0]), np.float64(xy[v, u, 1])
-            if not (np.isfinite(x) and np.isfinite(sigma[v, u])):
-                continue
-            hx = H[0, 0] * u + H[0, 1] * v + H[0, 2]
-            hy = H[1, 0] * u + H[1, 1] * v + H[1, 2]
-            hz = H[2, 0] * u + H[2, 1] * v + H[2, 2]
-            ax, ay = e[0] - x * e[2], e[1] - y * e[2]
-            bx, by = x * hz - hx, y * hz - hy
-            square = ax * ax + ay * ay
-            value = (ax * bx + ay * by) / square
-            w = hz + value * e[2]
-            if value > 0.0 and w > 0.0 and square > 0.0:
-                rho[v, u] = value
-                std[v, u] = sigma[v, u] * w / np.sqrt(square)
+    H, e = pixel_transfer(P, P_other)
+    v, u = np.nonzero(np.isfinite(pair.xy[..., 0]) & np.isfinite(pair.sigma))
+    xy, h = pair.xy[v, u].astype(np.float64), np.stack([u, v, np.ones_like(u)], axis=1) @ H.T
+    a, b = e[:2] - xy * e[2], xy * h[:, 2:] - h[:, :2]
+    square = np.sum(a * a, axis=1)
+    rho, std = np.full((2, *pair.sigma.shape), np.nan, dtype=np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = np.sum(a * b, axis=1) / square
+        w = h[:, 2] + value * e[2]
+        good = (value > 0.0) & (w > 0.0) & (square > 0.0)
+        rho[v, u] = np.where(good, value, np.nan)
+        std[v, u] = np.where(good, pair.sigma[v, u] * w / np.sqrt(square), np.nan)
+    return rho, std
 
 
-@kernel(error_model="numpy")
-def fuse_inverse_depths(
-    rho: F32, std: F32, gate: float, out: F32, out_std: F32, support: U8, conflicts: U8
-) -> None:
-    """Fuse several inverse depths (K, H, W) per pixel into one.
+def fuse_inverse_depths(found: Sequence[tuple[F32, F32]], shape: tuple[int, ...]) -> InverseDepth:
+    """Fuse several inverse depths, with standard deviations, (H, W) per pixel into one.
 
-    The estimate that most others agree with within ``gate`` standard deviations is averaged with these,
-    weighted by the inverse variances; among equals the more certain one. ``support`` and ``conflicts`` (H, W)
-    receive the numbers of estimates that agree and disagree.
+    The estimate that most others agree with is averaged with these, weighted by the inverse variances; among
+    equals the more certain one.
     """
-    count, height, width = rho.shape
-    for v in range(height):
-        for u in range(width):
-            known, best, most, weight_of_best = 0, -1, 0, 0.0
-            for k in range(count):
-                if not np.isfinite(rho[k, v, u]):
-                    continue
-                known += 1
-                n, weight = 0, 0.0
-                for m in range(count):
-                    if _agree(rho[k, v, u], std[k, v, u], rho[m, v, u], std[m, v, u], gate):
-                        n += 1
-                        weight += 1.0 / np.float64(std[m, v, u]) ** 2
-                if n > most or (n == most and weight > weight_of_best):
-                    best, most, weight_of_best = k, n, weight
-            support[v, u], conflicts[v, u] = most, known - most
-            if best < 0:
-                out[v, u], out_std[v, u] = np.nan, np.nan
-                continue
-            total, weights = 0.0, 0.0
-            for m in range(count):
-                if _agree(rho[best, v, u], std[best, v, u], rho[m, v, u], std[m, v, u], gate):
-                    w = 1.0 / np.float64(std[m, v, u]) ** 2
-                    total += w * rho[m, v, u]
-                    weights += w
-            mean, scatter = total / weights, 0.0
-            for m in range(count):
-                if _agree(rho[best, v, u], std[best, v, u], rho[m, v, u], std[m, v, u], gate):
-                    scatter += ((rho[m, v, u] - mean) / std[m, v, u]) ** 2
-            # A scatter larger than the standard deviations enlarges the result.
-            spread = scatter / (most - 1) if most > 1 else 1.0
-            out[v, u], out_std[v, u] = mean, np.sqrt(max(spread, 1.0) / weights)
+    none = np.full(shape, np.nan, dtype=np.float32)
+    rho, std = (np.stack(part) for part in zip(*(found or [(none, none)]), strict=True))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = 1.0 / std.astype(np.float64) ** 2
+        agree = np.stack([_agree(one, its_std, rho, std) for one, its_std in zip(rho, std, strict=True)])
+        votes, certainty = agree.sum(axis=1), np.where(agree, weight, 0.0).sum(axis=1)
+        best = np.where(votes == votes.max(axis=0), certainty, -1.0).argmax(axis=0)
+        group = np.take_along_axis(agree, best[None, None], axis=0)[0]
+        number, weights = votes.max(axis=0), np.where(group, weight, 0.0).sum(axis=0)
+        mean = np.where(group, weight * rho, 0.0).sum(axis=0) / weights
+        scatter = np.where(group, ((rho - mean) / std) ** 2, 0.0).sum(axis=0)
+        # A scatter larger than the standard deviations enlarges the result.
+        spread = np.maximum(scatter / np.maximum(number - 1, 1), 1.0)
+        fused = mean.astype(np.float32), np.sqrt(spread / weights).astype(np.float32)
+    conflicts = np.isfinite(rho).sum(axis=0) - number
+    known = number > 0
+    value, error = (np.where(known, part, np.float32(np.nan)) for part in fused)
+    return InverseDepth(value, error, number.astype(np.uint8), conflicts.astype(np.uint8))
 
 
-@kernel(error_model="numpy")
-def _agree(a: float, sa: float, b: float, sb: float, gate: float) -> bool:
+def _agree(a: F32, sa: F32, b: F32, sb: F32) -> B8:
     # A comparison with NaN is false.
-    return (a - b) * (a - b) <= gate * gate * (sa * sa + sb * sb)
+    return np.asarray((a - b) ** 2 <= np.float64(GATE) ** 2 * (sa * sa + sb * sb))
 
 
-@kernel(error_model="numpy")
-def update_kalman(rho: F32, std: F32, new: F32, new_std: F32, gate: float, alive: U8, support: U8) -> None:
+def update_kalman(state: InverseDepth, new: tuple[F32, F32], alive: B8) -> None:
     """Update the one-dimensional Kalman filter of every pixel (H, W) in place.
 
-    The first measurement starts the chain of a pixel; a missing measurement, or one beyond ``gate`` standard
-    deviations of the innovation, ends it: ``alive`` becomes 0. ``support`` counts the measurements.
+    The first measurement starts the chain of a pixel; a missing measurement, or one beyond ``GATE`` standard
+    deviations of the innovation, ends it: ``alive`` becomes False. ``state.views`` counts the measurements.
     """
-    height, width = rho.shape
-    for v in range(height):
-        for u in range(width):
-            if not alive[v, u]:
-                continue
-            z, s = np.float64(new[v, u]), np.float64(new_std[v, u])
-            if not np.isfinite(z):
-                alive[v, u] = 0
-            elif not np.isfinite(rho[v, u]):
-                rho[v, u], std[v, u], support[v, u] = z, s, 1
-            elif _agree(rho[v, u], std[v, u], z, s, gate):
-                variance = np.float64(std[v, u]) ** 2
-                gain = variance / (variance + s * s)
-                rho[v, u] += gain * (z - rho[v, u])
-                std[v, u] = np.sqrt((1.0 - gain) * variance)
-                support[v, u] += 1
-            else:
-                alive[v, u] = 0
+    first = np.isnan(state.value)
+    alive &= np.isfinite(new[0]) & (first | _agree(state.value, state.std, *new))
+    z, s, variance = new[0][alive], new[1][alive], state.std[alive].astype(np.float64) ** 2
+    gain = np.where(first[alive], 1.0, variance / (variance + s.astype(np.float64) ** 2))
+    before = np.where(first[alive], np.float32(0.0), state.value[alive])
+    state.value[alive] = before + gain * (z - before)
+    state.std[alive] = np.where(first[alive], s, np.sqrt((1.0 - gain) * variance))
+    state.views[alive] += 1
+
+
+@kernel
+def _projected(to: F64, u: int, v: int, z: float) -> tuple[float, float, float]:
+    """Pixel and depth in another view of a pixel at depth z."""
+    w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
+    x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
+    y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+    return x, y, w
 
 
 @kernel(error_model="numpy")
@@ -153,9 +126,7 @@ def count_agreement(
             z = np.float64(depth[v, u])
             if not np.isfinite(z):
                 continue
-            w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
-            x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
-            y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+            x, y, w = _projected(to, u, v, z)
             if not (w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5):
                 continue
             q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
@@ -169,10 +140,8 @@ def count_agreement(
                 contradict[v, u] += 1
             elif found >= w - bound:
                 # Depth of the nearest pixel on the ray of this pixel.
-                b = found * (back[2, 0] * x + back[2, 1] * y + back[2, 2]) + back[2, 3]
-                dx = (found * (back[0, 0] * x + back[0, 1] * y + back[0, 2]) + back[0, 3]) / b - u
-                dy = (found * (back[1, 0] * x + back[1, 1] * y + back[1, 2]) + back[1, 3]) / b - v
-                if b > 0.0 and dx * dx + dy * dy <= limits[0] * limits[0]:
+                a, b, ahead = _projected(back, x, y, found)
+                if ahead > 0.0 and (a - u) ** 2 + (b - v) ** 2 <= limits[0] ** 2:
                     agree[v, u] += 1
 
 
@@ -188,9 +157,7 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
             z = np.float64(depth[v, u])
             if not np.isfinite(z):
                 continue
-            w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
-            x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w
-            y = (z * (to[1, 0] * u + to[1, 1] * v + to[1, 2]) + to[1, 3]) / w
+            x, y, w = _projected(to, u, v, z)
             if w > 0.0 and -0.5 < x < columns - 0.5 and -0.5 < y < rows - 0.5:
                 q, p = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
                 # A comparison with NaN is false.
@@ -198,45 +165,65 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
                     out[q, p] = w
 
 
-@kernel(error_model="numpy")
-def surface_continuation(
-    rho: F32, std: F32, sure: U8, radius: int, alike: float, gate: float, joins: U8
-) -> None:
-    """Set ``joins`` (H, W) to 1 for pixels that continue the surface of ``sure`` neighbours.
+@kernel
+def _window_plane(
+    rho: F32, used: B8, at: tuple[int, int], radius: int
+) -> tuple[int, tuple[float, float, float], float, tuple[float, float], bool]:
+    """Fit a plane to the inverse depths of a window that are ``used`` and similar to the centre's.
 
-    A plane is fitted to the sure pixels of the window with inverse depths that differ by at most the share
-    ``alike``. They must be a quarter of the window and surround the pixel, and the plane must pass within
-    ``gate`` standard deviations.
+    Returns the number of pixels, the means of x, y and inverse depth relative to the centre, the sum of the
+    variances of x and y, the gradient, and whether it is determined.
     """
-    height, width = rho.shape
-    least = (2 * radius + 1) ** 2 // 4
-    for v in range(height):
-        for u in range(width):
-            joins[v, u] = 0
-            here = np.float64(rho[v, u])
-            if sure[v, u] or not np.isfinite(here):
+    v, u = at
+    here = np.float64(rho[at])
+    sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
+    for b in range(max(v - radius, 0), min(v + radius + 1, rho.shape[0])):
+        for a in range(max(u - radius, 0), min(u + radius + 1, rho.shape[1])):
+            d = np.float64(rho[b, a]) - here
+            # A comparison with NaN is false.
+            if used[b, a] and abs(d) <= ALIKE * here:
+                x, y = a - u, b - v
+                sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
+                sxd, syd = sxd + x * d, syd + y * d
+                sx, sy, sd, n = sx + x, sy + y, sd + d, n + 1
+    mx, my, md = sx / n, sy / n, sd / n
+    sxx, sxy, syy, sxd, syd = sxx - sx * mx, sxy - sx * my, syy - sy * my, sxd - sx * md, syd - sy * md
+    det = sxx * syy - sxy * sxy
+    gradient = (syy * sxd - sxy * syd) / det, (sxx * syd - sxy * sxd) / det
+    return n, (mx, my, md), (sxx + syy) / n, gradient, det > 1e-3 * sxx * syy
+
+
+@kernel
+def fit_planes(rho: F32, radius: int) -> F32:
+    """Inverse depths and their gradients (H, W, 3) at known pixels, gradient 0 with too few around."""
+    known, planes = np.isfinite(rho), zeros((*rho.shape, 3), np.float32)
+    for v in range(rho.shape[0]):
+        for u in range(rho.shape[1]):
+            planes[v, u, 0] = rho[v, u]
+            if known[v, u]:
+                n, _, _, (gx, gy), determined = _window_plane(rho, known, (v, u), radius)
+                if n >= 6 and determined:
+                    planes[v, u, 1], planes[v, u, 2] = gx, gy
+    return planes
+
+
+@kernel
+def surface_continuation(rho: F32, std: F32, sure: B8, radius: int, gate: float) -> B8:
+    """Pixels (H, W) that continue the surface of ``sure`` neighbours.
+
+    A plane is fitted to the sure pixels of the window of similar inverse depth. They must be a quarter of the
+    window and surround the pixel, and the plane must pass within ``gate`` standard deviations.
+    """
+    joins = zeros(rho.shape, np.bool_)
+    for v in range(rho.shape[0]):
+        for u in range(rho.shape[1]):
+            if sure[v, u] or not np.isfinite(rho[v, u]):
                 continue
-            sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0
-            for b in range(max(v - radius, 0), min(v + radius + 1, height)):
-                for a in range(max(u - radius, 0), min(u + radius + 1, width)):
-                    d = np.float64(rho[b, a]) - here
-                    if sure[b, a] and abs(d) <= alike * here:
-                        x, y = a - u, b - v
-                        sxx, sxy, syy = sxx + x * x, sxy + x * y, syy + y * y
-                        sxd, syd = sxd + x * d, syd + y * d
-                        sx, sy, sd, n = sx + x, sy + y, sd + d, n + 1
-            if n < least:
-                continue
-            mx, my = sx / n, sy / n
-            sxx, sxy, syy = sxx - sx * mx, sxy - sx * my, syy - sy * my
-            sxd, syd = sxd - sx * sd / n, syd - sy * sd / n
-            det = sxx * syy - sxy * sxy
+            n, (mx, my, md), spread, (gx, gy), determined = _window_plane(rho, sure, (v, u), radius)
             # Reject extrapolation: the pixel must lie within the spread of the window pixels.
-            if det <= 1e-3 * sxx * syy or mx * mx + my * my > 0.5 * (sxx + syy) / n:
-                continue
-            gx, gy = (syy * sxd - sxy * syd) / det, (sxx * syd - sxy * sxd) / det
-            if abs(sd / n - gx * mx - gy * my) <= gate * std[v, u]:
-                joins[v, u] = 1
+            if n >= (2 * radius + 1) ** 2 // 4 and determined and mx * mx + my * my <= 0.5 * spread:
+                joins[v, u] = abs(md - gx * mx - gy * my) <= gate * std[v, u]
+    return joins
 
 
 @dataclass(frozen=True)
@@ -262,8 +249,8 @@ def fuse_neighbours(
     with a single neighbour is kept; the depth map of another view must confirm it.
     """
     pairs = zip(neighbours, _with_idle_threads(pool, partial(correspond, view), neighbours), strict=True)
-    found = [_measured(views[view].P, views[other].P, pair) for other, pair in pairs if pair is not None]
-    return _fused(views[view].seen.shape, found)
+    found = [inverse_depths(views[view].P, views[j].P, pair) for j, pair in pairs if pair is not None]
+    return fuse_inverse_depths(found, views[view].seen.shape)
 
 
 def _with_idle_threads(pool: Executor | None, function: Callable[[A], B], items: Sequence[A]) -> list[B]:
@@ -290,7 +277,7 @@ def link_sequence(
     place = order.index(view)
     chains = order[place : place + links + 1], order[: place + 1][::-1][: links + 1]
     ends = [_filtered(chain, views, correspond) for chain in chains if len(chain) > 1]
-    result = _fused(views[view].seen.shape, [(end.value, end.std) for end in ends])
+    result = fuse_inverse_depths([(end.value, end.std) for end in ends], views[view].seen.shape)
     if ends:
         longest = np.maximum.reduce([end.views for end in ends])
         result.views[:] = np.where(np.isfinite(result.value), longest, 0)
@@ -300,16 +287,16 @@ def link_sequence(
 def _filtered(chain: Sequence[int], views: Mapping[int, PinholeView], correspond: Correspond) -> InverseDepth:
     """Kalman filter of the first view of a chain."""
     reference = views[chain[0]]
-    state = _unknown(reference.seen.shape)
-    alive = np.ones(reference.seen.shape, dtype=np.uint8)
+    unknown = np.full((2, *reference.seen.shape), np.nan, dtype=np.float32)
+    state = InverseDepth(*unknown, *np.zeros((2, *reference.seen.shape), dtype=np.uint8))
+    alive = np.ones(reference.seen.shape, dtype=bool)
     linked: Correspondence | None = None
     for previous, following in pairwise(chain):
         step = correspond(previous, following)
         if step is None:
             break
         linked = step if linked is None else _concatenated(linked, step)
-        new = _measured(reference.P, views[following].P, linked)
-        update_kalman(state.value, state.std, *new, GATE, alive, state.views)
+        update_kalman(state, inverse_depths(reference.P, views[following].P, linked), alive)
     return state
 
 
@@ -329,28 +316,7 @@ def _concatenated(first: Correspondence, second: Correspondence) -> Corresponden
     return Correspondence(xy.astype(np.float32), sigma.astype(np.float32))
 
 
-def _measured(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
-    """Inverse depth and standard deviation (H, W) from the correspondence with another camera."""
-    rho, std = np.empty_like(pair.sigma), np.empty_like(pair.sigma)
-    inverse_depths(pair.xy, pair.sigma, *pixel_transfer(P, P_other), rho, std)
-    return rho, std
-
-
 def pixel_transfer(P: F64, P_other: F64) -> tuple[F64, F64]:
     """H (3, 3) and e (3,) that take a pixel (x, y, 1) of inverse depth rho to H (x, y, 1) + rho e."""
     centre = camera_centre(P)
     return P_other[:, :3] @ np.linalg.inv(P[:, :3]), P_other @ (centre / centre[3])
-
-
-def _fused(shape: tuple[int, ...], found: Sequence[tuple[F32, F32]]) -> InverseDepth:
-    """Fusion of inverse depths and standard deviations (H, W)."""
-    result = _unknown(shape)
-    if found:
-        rho, std = (np.stack(part) for part in zip(*found, strict=True))
-        fuse_inverse_depths(rho, std, GATE, result.value, result.std, result.views, result.conflicts)
-    return result
-
-
-def _unknown(shape: tuple[int, ...]) -> InverseDepth:
-    unknown, counts = np.full((2, *shape), np.nan, dtype=np.float32), np.zeros((2, *shape), dtype=np.uint8)
-    return InverseDepth(unknown[0], unknown[1], counts[0], counts[1])

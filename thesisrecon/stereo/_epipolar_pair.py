@@ -17,7 +17,7 @@ import numpy as np
 from thesisrecon.arrays import F64, require_finite, require_shapes
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.two_view import (
     canonical_cameras,
     fundamental_from_cameras,
@@ -27,14 +27,11 @@ from thesisrecon.geometry.two_view import (
 )
 from thesisrecon.optimize.bundle.partial import triangulate_points
 
-Size = tuple[int, int]
-"""Width and height in pixels."""
+Size = tuple[int, int]  #: width and height in pixels
 _J = np.array([[0.0, -1.0], [1.0, 0.0]])
 MIN_MATCHES = 8
-MAX_SHRINK = 1.4
-"""Largest reduction of any pixel along any direction; the area is preserved on average."""
-MAX_GROWTH = 6.0
-"""Largest number of pixels of the frame relative to the larger image."""
+MAX_SHRINK = 1.4  #: largest reduction of any pixel along any direction; the area is preserved on average
+MAX_GROWTH = 6.0  #: largest number of pixels of the frame relative to the larger image
 
 
 @dataclass(frozen=True)
@@ -83,13 +80,11 @@ class EpipolarPencil:
         return np.asarray(about + np.arctan2(c * p[..., 1] - s * p[..., 0], c * p[..., 0] + s * p[..., 1]))
 
     def half_lines(self, side: int, phi: F64) -> HalfLines:
-        """Half epipolar lines of angles (N,)."""
-        l = plane_from_angle(phi) @ self.lines[side].T
-        norm = np.linalg.norm(l[:, :2], axis=1)
-        n, offset = l[:, :2] / norm[:, None], l[:, 2] / norm
-        e = self.epipole(side)
+        """Half epipolar lines of angles (...)."""
+        l, e = unit_normals(plane_from_angle(phi) @ self.lines[side].T), self.epipole(side)
         e = e / max(np.hypot(e[0], e[1]), abs(e[2]))
-        return HalfLines(-offset[:, None] * n, np.stack([-n[:, 1], n[:, 0]], axis=1), offset, e)
+        along = np.stack([-l[..., 1], l[..., 0]], axis=-1)
+        return HalfLines(-l[..., 2:] * l[..., :2], along, l[..., 2], e)
 
     def chords(self, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
         """Half-lines of angles (N,), and where they enter and leave the image; entry > exit if they miss."""
@@ -121,14 +116,14 @@ class EpipolarPencil:
 class HalfLines:
     """Half epipolar lines of a view in normalised coordinates; d(z - e) grows along the ``direction``."""
 
-    foot: F64  #: (N, 2) nearest to the image centre
-    direction: F64  #: (N, 2) unit vectors
-    distance: F64  #: (N,) of the foot from the centre
+    foot: F64  #: (..., 2) nearest to the image centre
+    direction: F64  #: (..., 2) unit vectors
+    distance: F64  #: (...) of the foot from the centre
     epipole: F64  #: (3,)
 
     @property
     def sagitta(self) -> F64:
-        """(N,) distance of each foot from the circle about the epipole through the centre.
+        """(...) distance of each foot from the circle about the epipole through the centre.
 
         D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, without
         cancellation for distant epipoles. It aligns columns of equal distance from the epipole.
@@ -136,7 +131,7 @@ class HalfLines:
         e = self.epipole
         D_w = float(np.hypot(e[0], e[1]))
         if D_w == 0.0:
-            return np.zeros(len(self.foot))
+            return np.zeros_like(self.distance)
         sign = -1.0 if e[2] < 0.0 else 1.0
         cosine = -(self.direction @ e[:2]) / D_w
         near = np.maximum(1.0 + cosine, 1.0)
@@ -147,14 +142,14 @@ class HalfLines:
 
     @property
     def start(self) -> F64:
-        """(N,) position of the epipole along the direction, infinite for an epipole at infinity."""
+        """(...) position of the epipole along the direction, infinite for an epipole at infinity."""
         e = self.epipole
         if e[2] == 0.0:
-            return np.full(len(self.foot), -np.inf)
+            return np.full_like(self.distance, -np.inf)
         return np.asarray(self.direction @ (e[:2] / e[2]))
 
     def on_half(self, t: F64) -> F64:
-        """Whether positions (N,) along the directions lie on the half-lines, not beyond the epipole."""
+        """Whether positions (...) along the directions lie on the half-lines, not beyond the epipole."""
         return np.asarray(t < self.start if self.epipole[2] < 0.0 else t > self.start)
 
 
@@ -184,7 +179,7 @@ class EpipolarPair:
 
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
-    """Prepare a pair with known F and matches, see :func:`thesisrecon.stereo.rectification.rectify_pair`."""
+    """Prepare two images with known F and matches for rectification."""
     matches = _checked_call(xy1, xy2, size1, size2)
     F = np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3) or not np.isfinite(F).all() or not F.any():
@@ -204,7 +199,7 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
 def pair_of_cameras(
     P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
 ) -> EpipolarPair:
-    """Prepare a pair of metric cameras, see :func:`thesisrecon.stereo.rectification.rectify_cameras`."""
+    """Prepare two undistorted images with known metric cameras for rectification."""
     none = np.empty((0, 2))
     matches = _checked_call(none if xy1 is None else xy1, none if xy2 is None else xy2, size1, size2)
     P = np.stack([P1, P2])

@@ -18,7 +18,7 @@ import scipy
 from thesisrecon.arrays import F64, resizing_transform
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.imaging.resampling import Rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_SHRINK,
@@ -85,10 +85,10 @@ class PlanarRectification(Rectification):
         return PlanarRectification(resizing_transform(scale) @ self.H, (width, height))
 
     def _original(self, side: int, xy: F64) -> F64:
-        return _moved(np.asarray(np.linalg.inv(self.H[side])), xy)
+        return map_in_front(np.linalg.inv(self.H[side]), xy)
 
     def _rectified(self, side: int, xy: F64) -> F64:
-        return _moved(self.H[side], xy)
+        return map_in_front(self.H[side], xy)
 
     def _lookup(self, side: int, rows: range) -> F64:
         G = np.linalg.inv(self.H[side])
@@ -97,13 +97,6 @@ class PlanarRectification(Rectification):
         with np.errstate(divide="ignore", invalid="ignore"):
             w = np.where(w > 0.0, 1.0 / w, np.nan)
         return np.stack([u * w, v * w], axis=-1)
-
-
-def _moved(H: F64, xy: F64) -> F64:
-    xh = homogenize(xy) @ H.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved: F64 = np.where(xh[:, 2:] > 0.0, xh[:, :2] / xh[:, 2:], np.nan)
-    return moved
 
 
 def common_orientation(pair: EpipolarPair) -> PlanarRectification:
@@ -347,13 +340,15 @@ class PolarRectification(Rectification):
     size: tuple[int, int]
 
     def _original(self, side: int, xy: F64) -> F64:
-        return self._on_lines(side, self.pencil.half_lines(side, self._angle_of(xy[:, 1])), xy)
+        columns, rows = xy.T
+        return self._on_lines(side, self._angle_of(rows), columns, rows)
 
-    def _on_lines(self, side: int, lines: HalfLines, xy: F64) -> F64:
-        along = (xy[:, 0] + self.origins[side] - self.shears[side] * xy[:, 1]) / self.scales[side]
+    def _on_lines(self, side: int, phi: F64, columns: F64, rows: F64) -> F64:
+        lines = self.pencil.half_lines(side, phi)
+        along = (columns + self.origins[side] - self.shears[side] * rows) / self.scales[side]
         t = self._sign * along / self.pencil.units[side] + lines.sagitta
-        pixels = self.pencil.pixels(side, lines.foot + t[:, None] * lines.direction)
-        return np.where(lines.on_half(t)[:, None], pixels, np.nan)
+        pixels = self.pencil.pixels(side, lines.foot + t[..., None] * lines.direction)
+        return np.where(lines.on_half(t)[..., None], pixels, np.nan)
 
     def _rectified(self, side: int, xy: F64) -> F64:
         phi = self.pencil.angles(side, xy, about=0.5 * float(self.angles[0] + self.angles[-1]))
@@ -364,35 +359,27 @@ class PolarRectification(Rectification):
         return np.stack([columns, rows], axis=1)
 
     def _lookup(self, side: int, rows: range) -> F64:
-        width = self.size[0]
-        lines = self.pencil.half_lines(side, self.angles[rows.start : rows.stop])
-        foot, direction, distance = (
-            np.repeat(part, width, axis=0) for part in (lines.foot, lines.direction, lines.distance)
-        )
-        columns = np.tile(np.arange(float(width)), len(rows))
-        xy = np.stack([columns, np.repeat(np.array(rows, dtype=np.float64), width)], axis=1)
-        found = self._on_lines(side, HalfLines(foot, direction, distance, lines.epipole), xy)
-        return found.reshape(len(rows), width, 2)
+        phi, number = self.angles[rows.start : rows.stop, None], np.array(rows, dtype=np.float64)[:, None]
+        return self._on_lines(side, phi, np.arange(float(self.size[0])), number)
 
     @property
     def _sign(self) -> float:
         return -1.0 if self.pencil.flipped else 1.0
 
+    @property
+    def _knots(self) -> tuple[F64, F64]:
+        """Numbers and angles of the rows, continued by half a row at both ends; not defined beyond."""
+        a, count = self.angles, len(self.angles)
+        ends = 1.5 * a[[0, -1]] - 0.5 * a[[1, -2]]
+        return np.clip(np.arange(-1.0, count + 1.0), -0.5, count - 0.5), np.array([ends[0], *a, ends[1]])
+
     def _angle_of(self, rows: F64) -> F64:
-        """Angles of rows (N,), which may be fractional; NaN more than half a row outside."""
-        last = len(self.angles) - 1
-        valid = (rows >= -0.5) & (rows <= last + 0.5)
-        k = np.clip(np.floor(np.where(valid, rows, 0.0)), 0, last - 1).astype(np.int64)
-        step = self.angles[k + 1] - self.angles[k]
-        return np.where(valid, self.angles[k] + (rows - k) * step, np.nan)
+        """Angles of rows (N,), which may be fractional."""
+        return np.interp(rows, *self._knots, left=np.nan, right=np.nan)
 
     def _row_of(self, phi: F64) -> F64:
-        """Inverse of :meth:`_angle_of`."""
-        last = len(self.angles) - 1
-        k = np.searchsorted(self._sign * self.angles, self._sign * phi, side="right") - 1
-        k = np.clip(k, 0, last - 1)
-        rows = k + (phi - self.angles[k]) / (self.angles[k + 1] - self.angles[k])
-        return np.where((rows >= -0.5) & (rows <= last + 0.5), rows, np.nan)
+        rows, angles = self._knots
+        return np.interp(self._sign * phi, self._sign * angles, rows, left=np.nan, right=np.nan)
 
 
 def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:

@@ -38,18 +38,6 @@ def _keep_second_best(total: U16, q: np.int16, index: I16, second: U16) -> None:
 
 
 @kernel
-def _set_sum(a: U8, b: U8, out: U16) -> None:
-    for x in range(len(out)):
-        out[x] = np.uint16(np.uint16(a[x]) + np.uint16(b[x]))
-
-
-@kernel
-def _add_bytes(values: U8, total: U16) -> None:
-    for x in range(len(total)):
-        total[x] = np.uint16(total[x] + np.uint16(values[x]))
-
-
-@kernel
 def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tuple[U16, I16]) -> None:
     """Least totals and their disparities for both images, and the second best totals of the left one."""
     n, width = total.shape
@@ -81,10 +69,12 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
     best, index, second = empty(width, np.uint16), empty(width, np.int16), empty(width, np.uint16)
     best_r, index_r = empty(width, np.uint16), empty(width, np.int16)
     for y in range(len(left)):
+        total[:] = 0
         for q in range(n):
-            _set_sum(sums[0, start + y, q], sums[1, start + y, q], total[q])
-            for k in range(2, pairs):
-                _add_bytes(sums[k, start + y, q], total[q])
+            for k in range(pairs):
+                values, of_pairs = sums[k, start + y, q], total[q]
+                for x in range(width):
+                    of_pairs[x] = np.uint16(of_pairs[x] + np.uint16(values[x]))
         _best_of_row(total, first, (best, index, second), (best_r, index_r))
         for x in range(width):
             q = int(index[x])

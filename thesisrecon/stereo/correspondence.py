@@ -13,13 +13,13 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.imaging.resampling import Rectification, bilinear_samples
 from thesisrecon.records import DisparityMap, Image, PinholeView
 from thesisrecon.stereo._cost import MAX_DISPARITIES
+from thesisrecon.stereo._epipolar_pair import pair_of_cameras, pair_of_fundamental
 from thesisrecon.stereo._postprocessing import match_both_sides
-from thesisrecon.stereo.rectification import METHODS, PLANAR, disparity_range, rectify_cameras, rectify_pair
+from thesisrecon.stereo.rectification import METHODS, PLANAR, disparity_range, rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
 
-Shape = tuple[int, ...]
-"""Height and width in pixels."""
+Shape = tuple[int, ...]  #: height and width in pixels
 MAX_COSTS = 400.0
 """Matching costs per pixel of the reference view; the frames of wide baselines are reduced to that."""
 
@@ -44,7 +44,8 @@ class PairMatching:
     ) -> Correspondence:
         """Compute the positions of the pixels of ``reference`` in ``other``."""
         own = reference.seen.shape, other.seen.shape
-        frame = rectify_cameras(reference.P, other.P, own[0][::-1], own[1][::-1], xy1=xy1, xy2=xy2)
+        sizes = own[0][::-1], own[1][::-1]
+        frame = rectify(pair_of_cameras(reference.P, other.P, *sizes, xy1=xy1, xy2=xy2))
         wanted = _searched_range(frame, xy1, xy2)
         costs = frame.size[0] * frame.size[1] * (wanted[1] - wanted[0] + 1) / reference.seen.size
         if costs > MAX_COSTS:
@@ -59,8 +60,8 @@ class PairMatching:
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
     ) -> RectifiedPair:
         """See `thesisrecon.config.DepthEstimator.match_two_views`."""
-        methods = PLANAR if planar else METHODS
-        frame = rectify_pair(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1], methods=methods)
+        pair = pair_of_fundamental(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1])
+        frame = rectify(pair, PLANAR if planar else METHODS)
         wanted = _searched_range(frame, xy1, xy2)
         gain = _brightness_gain(image1.rgb, image2.rgb, xy1, xy2)
         left = frame.warp(image1.levels, 0)

@@ -17,16 +17,8 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.imaging.on_demand import MappingOnDemand
 from thesisrecon.imaging.resampling import pinhole_frame, pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
-from thesisrecon.stereo._depth_fusion import (
-    InverseDepth,
-    count_agreement,
-    fuse_neighbours,
-    link_sequence,
-    pixel_transfer,
-    splat_depths,
-    surface_continuation,
-)
-from thesisrecon.stereo._plane_refinement import ALIKE, refine_depths, search_planes
+from thesisrecon.stereo import _depth_fusion
+from thesisrecon.stereo._plane_refinement import refine_depths, search_planes
 from thesisrecon.stereo._postprocessing import remove_speckles
 from thesisrecon.stereo.correspondence import Correspondence, PairMatching, RectifiedPair
 
@@ -72,18 +64,25 @@ def _select_neighbours(
     observe count less, and so does a view whose baseline has the direction of an earlier one, because views
     from other sides see surfaces that are occluded here.
     """
+    # Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones.
+    best_deg, sigma_below_deg, sigma_above_deg = 10.0, 3.0, 10.0
+    # A neighbour has this many common points with at least this triangulation angle.
+    min_angle_deg, min_points = 1.0, 12
     own = np.flatnonzero(points.seen[view])
-    points = replace(points, X=points.X[own], seen=points.seen[:, own])
+    X, seen = points.X[own], points.seen[:, own]
     centres = {i: dehomogenize(camera_centre(views[i].P)) for i in views}
     worth: dict[int, F64] = {}
-    direction: dict[int, F64] = {}
     for other in sorted(views.keys() - {view}):
-        weight = _weights(points, centres, view, other)
-        if weight is not None:
-            worth[other] = weight
-            baseline = centres[other] - centres[view]
-            direction[other] = baseline / np.linalg.norm(baseline)
-    served = np.zeros(len(points.X))
+        common = np.flatnonzero(seen[other])
+        angle = _angles_deg(X[common] - centres[view], X[common] - centres[other])
+        if int(np.sum(angle >= min_angle_deg)) >= min_points:
+            off = angle - best_deg
+            width = np.where(off < 0.0, sigma_below_deg, sigma_above_deg)
+            worth[other] = np.zeros(len(X))
+            worth[other][common] = np.where(angle >= min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
+    baseline = {j: centres[j] - centres[view] for j in worth}
+    direction = {j: along / np.linalg.norm(along) for j, along in baseline.items()}
+    served = np.zeros(len(X))
     chosen: list[int] = []
     while worth and len(chosen) < max_neighbours:
         gains = {
@@ -91,59 +90,33 @@ def _select_neighbours(
             * 0.7 ** sum(direction[j] @ direction[c] > 0.5 for c in chosen)
             for j, w in worth.items()
         }
-        best_neighbour = max(gains, key=lambda j: (gains[j], -j))
-        served += worth.pop(best_neighbour)
-        chosen.append(best_neighbour)
+        chosen.append(max(gains, key=lambda j: (gains[j], -j)))
+        served += worth.pop(chosen[-1])
     return tuple(chosen)
-
-
-def _weights(points: SparsePoints, centres: Mapping[int, F64], view: int, other: int) -> F64 | None:
-    """Weights (N,) of the points that ``other`` sees too, None if it cannot be a neighbour."""
-    # Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones.
-    best_deg, sigma_below_deg, sigma_above_deg = 10.0, 3.0, 10.0
-    # A neighbour has this many common points with at least this triangulation angle.
-    min_angle_deg, min_points = 1.0, 12
-    common = points.seen[other]
-    if int(common.sum()) < min_points:
-        return None
-    a, b = (points.X[common] - centres[i] for i in (view, other))
-    angle = _angles_deg(a, b)
-    if int(np.sum(angle >= min_angle_deg)) < min_points:
-        return None
-    off = angle - best_deg
-    width = np.where(off < 0.0, sigma_below_deg, sigma_above_deg)
-    weights = np.zeros(len(points.X))
-    weights[common] = np.where(angle >= min_angle_deg, np.exp(-0.5 * (off / width) ** 2), 0.0)
-    return weights
-
-
-MIN_VIEWS = 1
-"""Views that must confirm a pixel."""
 
 
 def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
     """Keep the depths that the depth maps of other views confirm (Merrell et al., ICCV 2007).
 
     A pixel is projected into another view, and the depth there is projected back. It is confirmed if both
-    agree and contradicted if the other view sees through it. It is kept if ``MIN_VIEWS`` views and more than
-    contradict it confirm it, or if none contradicts it and it continues the surface of confirmed pixels.
+    agree and contradicted if the other view sees through it. It is kept if more views confirm than contradict
+    it, or if none contradicts it and it continues the surface of confirmed pixels.
     """
     # Limits of the reprojection error, and of the depth difference: a share plus standard deviations.
     reprojection_px, max_relative, max_sigmas = 1.5, 0.01, 2.0
     # Window of the surface continuation, and distance from its plane in standard deviations.
     radius, gate = 5, 2.0
-    agree, contradict, joins = np.zeros((3, *depth_map.depth.shape), dtype=np.uint8)
+    agree, contradict = np.zeros((2, *depth_map.depth.shape), dtype=np.uint8)
     limits = np.array([reprojection_px, max_relative, max_sigmas])
     own = depth_map.depth, depth_map.std
     for other in others:
         to, back = _transfer(depth_map.P, other.P), _transfer(other.P, depth_map.P)
-        count_agreement(own, to, (other.depth, other.std), back, limits, agree, contradict)
-    keep = (agree >= MIN_VIEWS) & (agree > contradict)
+        _depth_fusion.count_agreement(own, to, (other.depth, other.std), back, limits, agree, contradict)
+    keep = agree > contradict
     with np.errstate(divide="ignore"):
         rho = (1.0 / depth_map.depth).astype(np.float32)
     std = depth_map.std * rho * rho
-    surface_continuation(rho, std, keep.astype(np.uint8), radius, ALIKE, gate, joins)
-    keep |= (contradict == 0) & (joins > 0)
+    keep |= (contradict == 0) & _depth_fusion.surface_continuation(rho, std, keep, radius, gate)
     return _without_small_regions(keep_depths(replace(depth_map, views=np.maximum(agree, 1)), keep))
 
 
@@ -157,7 +130,7 @@ def _without_small_regions(depth_map: DepthMap) -> DepthMap:
 
 def _transfer(P: F64, P_other: F64) -> F64:
     """(3, 4) from (z x, z y, z, 1) of one camera to z' (x', y', 1) of the other; z is the depth."""
-    return np.column_stack(pixel_transfer(P, P_other))
+    return np.column_stack(_depth_fusion.pixel_transfer(P, P_other))
 
 
 def keep_depths(depth_map: DepthMap, keep: B8) -> DepthMap:
@@ -180,7 +153,7 @@ def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[i
     offers = []
     for other in others:
         offer = np.full_like(own.depth, np.nan)
-        splat_depths(other.depth, _transfer(other.P, own.P), offer)
+        _depth_fusion.splat_depths(other.depth, _transfer(other.P, own.P), offer)
         offers.append(np.where(unknown, offer, np.float32(np.nan)))
     worth = [int(np.isfinite(offer).sum()) for offer in offers]
     order = sorted(range(len(offers)), key=lambda k: (-worth[k], k))
@@ -345,10 +318,9 @@ class MultiViewStereo:
         registered = np.flatnonzero(reconstruction.registered).tolist()
 
         def undistorted(side: int) -> Mapping[int, PinholeView]:
-            def make(view: int) -> PinholeView:
-                return pinhole_view(images[view], reconstruction, view, max_side=side)
-
-            return MappingOnDemand(registered, make, VIEW_BYTES)
+            return MappingOnDemand(
+                registered, lambda i: pinhole_view(images[i], reconstruction, i, max_side=side), VIEW_BYTES
+            )
 
         frames = {i: pinhole_frame(images[i], reconstruction, i, max_side=self.max_side) for i in registered}
         views = undistorted(self.max_side)
@@ -376,9 +348,9 @@ class MultiViewStereo:
                 return None
 
         if self.sequence_links:
-            found = link_sequence(view, scene.views, self.sequence_links, correspond)
+            found = _depth_fusion.link_sequence(view, scene.views, self.sequence_links, correspond)
         else:
-            found = fuse_neighbours(view, scene.views, scene.neighbours[view], correspond, pool)
+            found = _depth_fusion.fuse_neighbours(view, scene.views, scene.neighbours[view], correspond, pool)
         keep = scene.views[view].seen
         if self.refinement:
             found = refine_depths(scene.views[view], [scene.views[j] for j in scene.neighbours[view]], found)
@@ -413,7 +385,7 @@ class MultiViewStereo:
         return sorted(near | set(order[: max(self.min_comparison_views - len(near), 0)]))
 
 
-def _depth_map(view: PinholeView, found: InverseDepth, keep: B8) -> DepthMap:
+def _depth_map(view: PinholeView, found: _depth_fusion.InverseDepth, keep: B8) -> DepthMap:
     """Convert inverse depths to depths; those not kept or not significantly above 0 are unknown."""
     sure = 3.0  # Standard deviations by which an inverse depth must exceed 0, that of infinity
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -11,13 +11,7 @@ import numpy as np
 from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.imaging.resampling import Rectification
-from thesisrecon.stereo._epipolar_pair import (
-    EpipolarPair,
-    Size,
-    disparity_bounds,
-    pair_of_cameras,
-    pair_of_fundamental,
-)
+from thesisrecon.stereo._epipolar_pair import EpipolarPair, Size, disparity_bounds
 from thesisrecon.stereo._frames import (
     PolarRectification,
     common_orientation,
@@ -30,12 +24,10 @@ from thesisrecon.stereo._frames import (
     singular_values,
 )
 
-BENDING = 0.03
-"""Penalty of polar frames, which bend straight lines."""
+BENDING = 0.03  #: penalty of polar frames, which bend straight lines
 
 Method = Callable[[EpipolarPair], Rectification]
-PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)
-"""Methods from F with homographies."""
+PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)  #: methods from F with homographies
 METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
 """All methods; the common orientation needs cameras."""
 
@@ -111,17 +103,15 @@ def measure_quality(rectification: Rectification, pair: EpipolarPair) -> Rectifi
     found = found if len(found) else np.full((1, 2), np.nan)
     angles, aspects = zip(*midlines, strict=True)
     width, height = rectification.size
-    slope = float("nan")
     left, right = matches_in_frame(rectification, pair.matches)
-    if len(left) >= 3:
-        slope = float(np.sqrt(np.mean(np.sum(disparity_gradients(left, right) ** 2, axis=1))))
+    slopes = disparity_gradients(left, right) if len(left) >= 3 else np.full((1, 2), np.nan)
     return RectificationQuality(
         orthogonality_deg=angles,
         aspect=aspects,
         size_ratio=width * height / max(w * h for w, h in pair.pencil.sizes),
         min_scale=float(found[:, 1].min()),
         stretch=float(np.exp(np.std(np.log(np.maximum(found, 1e-12))))),
-        disparity_slope=slope,
+        disparity_slope=float(np.sqrt(np.mean(np.sum(slopes**2, axis=1)))),
     )
 
 
@@ -156,20 +146,16 @@ def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectific
     Those within the angle and aspect limits take precedence; methods that fail are skipped. If all fail, the
     ``StageFailure`` of the last is raised.
     """
-    best: Rectification | None = None
-    least, failure = (True, np.inf), StageFailure(Notice("no-rectification-method"))
+    found: list[Rectification] = []
+    failure = StageFailure(Notice("no-rectification-method"))
     for method in methods:
         try:
-            found = method(pair)
+            found.append(method(pair))
         except StageFailure as reason:
             failure = reason
-            continue
-        cost = _cost(found, measure_quality(found, pair))
-        if best is None or cost < least:
-            best, least = found, cost
-    if best is None:
+    if not found:
         raise failure
-    return best
+    return min(found, key=lambda frame: _cost(frame, measure_quality(frame, pair)))
 
 
 def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, float]:
@@ -182,20 +168,6 @@ def _cost(found: Rectification, quality: RectificationQuality) -> tuple[bool, fl
     bent = BENDING if isinstance(found, PolarRectification) else 0.0
     cost = quality.distortion + bent + size_weight * np.log(quality.size_ratio)
     return turned > max_turn_deg or aspect > max_aspect, float(cost)
-
-
-def rectify_pair(
-    F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size, *, methods: Sequence[Method] = METHODS
-) -> Rectification:
-    """Rectify two images with known fundamental matrix."""
-    return rectify(pair_of_fundamental(F, xy1, xy2, size1, size2), methods)
-
-
-def rectify_cameras(
-    P1: F64, P2: F64, size1: Size, size2: Size, *, xy1: F64 | None = None, xy2: F64 | None = None
-) -> Rectification:
-    """Rectify two undistorted images with known metric cameras."""
-    return rectify(pair_of_cameras(P1, P2, size1, size2, xy1=xy1, xy2=xy2))
 
 
 def disparity_range(

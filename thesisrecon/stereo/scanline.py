@@ -6,7 +6,6 @@ Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,31 +16,15 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, checked_range, estimate_noise, prepare_stereo_images
 from thesisrecon.stereo._postprocessing import final_confidence, texture_of
 
-OCCLUDED = -32768
-"""Disparity of an occluded pixel."""
-NO_MATCH = -1
-"""Cost of a match with a missing pixel."""
+OCCLUDED = -32768  #: disparity of an occluded pixel
+NO_MATCH = -1  #: cost of a match with a missing pixel
 INFINITE = 1 << 60
 RADIX = 1 << 24
 """Keys are cost * RADIX + number of discontinuities: the smaller key has the greater likelihood or, if equal,
 fewer discontinuities.
 """
 MATCHED, LEFT_OCCLUDED, RIGHT_OCCLUDED = 0, 1, 2
-ROWS, WARM_UP = 96, 8
-"""Rows of a strip, and rows above it that are solved first to provide a previous row."""
-
-
-@kernel
-def _add_row(values: I32, out: I32) -> None:
-    for x in range(len(out)):
-        out[x] = np.int32(out[x] + values[x])
-
-
-@kernel
-def _add_squares(a: I16, b: I16, out: I32) -> None:
-    for x in range(len(out)):
-        apart = np.int32(b[x]) - np.int32(a[x])
-        out[x] = np.int32(out[x] + apart * apart)
+ROWS, WARM_UP = 96, 8  #: rows of a strip, and rows above it that are solved first to provide a previous row
 
 
 @kernel
@@ -54,7 +37,10 @@ def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) ->
         out[q] = 0
         if hi > lo:
             for k in range(n):
-                _add_squares(right[k, y, lo - d : hi - d], left[k, y, lo:hi], out[q, lo:hi])
+                a, b, total = right[k, y, lo - d : hi - d], left[k, y, lo:hi], out[q, lo:hi]
+                for x in range(len(total)):
+                    apart = np.int32(b[x]) - np.int32(a[x])
+                    total[x] = np.int32(total[x] + apart * apart)
 
 
 @kernel
@@ -96,65 +82,50 @@ def _least(matched: int, left_occluded: int, right_occluded: int) -> tuple[int, 
 
 @kernel
 def _enter_column(
-    i: int,
-    first: int,
-    costs: I32,
-    penalties: tuple[int, int, int],
-    above: tuple[I32, I32],
-    keys: tuple[I64, I64],
-    states: U8,
+    i: int, first: int, costs: I32, occluded: int, above: tuple[I32, I32], keys: tuple[I64, I64], states: U8
 ) -> None:
-    """Keys (3, D) of the nodes (i, j) from those with i - 1.
+    """Keys (3, D) of the nodes (i, j) from those with i - 1; ``occluded`` is the key of an occluded pixel.
 
-    ``penalties`` of an occluded pixel and of discontinuities along and across the row, as keys. ``states``
-    (D,) receives the predecessor of each of the three states, two bits each.
+    ``states`` (D,) receives the predecessor of each of the three states, two bits each.
     """
     n, width = costs.shape
     previous, present = keys
-    occluded, along, across = penalties
     up = above[0][i - 1]
-    left_occluded = occluded + (across if up != OCCLUDED else 0)
     for q in range(min(n - 1, i - first - 1), max(-1, i - first - width - 1), -1):
         d = first + q
         aside = above[1][i - d - 1]
         # Unreachable keys stay far above all others and need no test.
-        key, state = _least(previous[0, q], previous[1, q] + along, previous[2, q] + along)
-        key += across if up != OCCLUDED and up != d else 0
-        key += across if aside != OCCLUDED and aside != d else 0
+        key, state = _least(previous[0, q], previous[1, q] + 1, previous[2, q] + 1)
+        key += (up != OCCLUDED and up != d) + (aside != OCCLUDED and aside != d)
         cost = costs[q, i - 1]
         present[0, q] = key + cost * RADIX if cost != NO_MATCH else INFINITE
         traced = state
         if q > 0:
-            key, state = _least(previous[0, q - 1] + along, previous[1, q - 1], previous[2, q - 1] + along)
-            present[1, q] = key + left_occluded
+            key, state = _least(previous[0, q - 1] + 1, previous[1, q - 1], previous[2, q - 1] + 1)
+            present[1, q] = key + occluded + (up != OCCLUDED)
             traced |= state << 2
         if q < n - 1:
-            key, state = _least(present[0, q + 1] + along, present[1, q + 1] + along, present[2, q + 1])
-            present[2, q] = key + occluded + (across if aside != OCCLUDED else 0)
+            key, state = _least(present[0, q + 1] + 1, present[1, q + 1] + 1, present[2, q + 1])
+            present[2, q] = key + occluded + (aside != OCCLUDED)
             traced |= state << 4
         states[q] = traced
 
 
 @kernel
 def _solve_row(
-    costs: I32,
-    first: int,
-    penalties: tuple[int, int, int, int],
-    above: tuple[I32, I32],
-    left: I32,
-    right: I32,
+    costs: I32, first: int, penalties: tuple[int, int], above: tuple[I32, I32], left: I32, right: I32
 ) -> None:
     """Find the maximum-likelihood correspondences of one row from costs (D, W), ``NO_MATCH`` without a match.
 
-    Among solutions of equal likelihood the one with the fewest discontinuities is taken. A node (i, j) has
-    passed i left and j right pixels, i - j = d. It is entered by a match, by an occluded left pixel or by an
-    occluded right pixel, which are its three states. ``penalties``: cost of an occluded pixel and of one
-    outside the other image, in steps; count of a discontinuity along the row and against the previous row, 0
-    or 1. ``above`` are the disparities (W,) of the previous row in both images; ``left`` and ``right`` (W,)
-    receive the new ones, ``OCCLUDED`` where occluded.
+    Among solutions of equal likelihood the one with the fewest discontinuities along the row and against the
+    previous row is taken. A node (i, j) has passed i left and j right pixels, i - j = d. It is entered by a
+    match, by an occluded left pixel or by an occluded right pixel, which are its three states. ``penalties``:
+    cost of an occluded pixel and of one outside the other image, in steps. ``above`` are the disparities (W,)
+    of the previous row in both images; ``left`` and ``right`` (W,) receive the new ones, ``OCCLUDED`` where
+    occluded.
     """
     n, width = costs.shape
-    occluded, border, along, across = penalties
+    occluded, border = penalties
     keys = full((2, 3, n), INFINITE, np.int64)
     states = zeros((width + 1, n), np.uint8)
     best, last = INFINITE, (0, 0, MATCHED)
@@ -165,8 +136,7 @@ def _solve_row(
         if i - first >= 0 and i - first < n:
             present[MATCHED, i - first] = i * border * RADIX
         if i > 0:
-            scaled = (occluded * RADIX, along, across)
-            _enter_column(i, first, costs, scaled, above, (previous, present), states[i])
+            _enter_column(i, first, costs, occluded * RADIX, above, (previous, present), states[i])
         else:
             for q in range(min(n, -first)):
                 if first + q >= -width:
@@ -205,21 +175,11 @@ def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) ->
 
 
 @kernel
-def _forbid(valid_left: U8, valid_right: U8, first: int, costs: I32) -> None:
-    n, width = costs.shape
-    for q in range(n):
-        for x in range(width):
-            j = x - first - q
-            if j < 0 or j >= width or valid_left[x] == 0 or valid_right[j] == 0:
-                costs[q, x] = NO_MATCH
-
-
-@kernel
 def _solve_rows(
     left: tuple[I16, U8],
     right: tuple[I16, U8],
     disparities: tuple[int, int],
-    model: tuple[int, float, int, int, int, int],
+    model: tuple[int, float, int, int],
     likelihood: F64,
     out: tuple[I32, F32],
 ) -> None:
@@ -230,7 +190,7 @@ def _solve_rows(
     disparities (H, W), ``OCCLUDED`` where occluded, and their probabilities.
     """
     first, last = disparities
-    radius, scale, penalties = model[0], model[1], (model[2], model[3], model[4], model[5])
+    radius, scale, penalties = model[0], model[1], (model[2], model[3])
     height, width = left[1].shape
     n, span = last - first + 1, 2 * radius + 1
     ring, total = empty((span, n, width), np.int32), empty(width, np.int32)
@@ -246,17 +206,19 @@ def _solve_rows(
             lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
             total[:] = 0
             for dy in range(-radius, radius + 1):
-                _add_row(ring[min(max(y + dy, 0), height - 1) % span, q], total)
+                row = ring[min(max(y + dy, 0), height - 1) % span, q]
+                for x in range(width):
+                    total[x] = np.int32(total[x] + row[x])
+            costs[q] = NO_MATCH
             if hi > lo:
                 _window_costs(total, lo, hi, radius, scale, costs[q])
-        _forbid(left[1][y], right[1][y], first, costs)
+            for x in range(lo, hi):
+                if left[1][y, x] == 0 or right[1][y, x - d] == 0:
+                    costs[q, x] = NO_MATCH
         now, before = found[y & 1], found[1 - (y & 1)]
         _solve_row(costs, first, penalties, (before[0], before[1]), now[0], now[1])
         out[0][y] = now[0]
         _posterior(costs, first, now[0], likelihood, out[1][y])
-
-
-Cohesion = Literal["none", "along", "along and across"]
 
 
 @dataclass(frozen=True)
@@ -267,14 +229,11 @@ class MaximumLikelihoodScanline:
     components; with the mean as the unknown true value a match costs |z - z'|^2 / (4 s^2). An occluded pixel
     costs ln(P_D phi^m / ((1 - P_D) (2 pi s^2)^(m / 2))) with the detection probability P_D and values uniform
     over phi = 256 grey levels. Ordering and uniqueness hold by construction, and occlusions are part of the
-    solution.
+    solution. Among solutions of equal likelihood the one with the fewest discontinuities is taken (MLMH+V).
     """
 
     radius: int = 1
     """A measurement consists of the colours within this radius; the paper uses single pixels (0)."""
-    cohesion: Cohesion = "along and across"
-    """Minimise the discontinuities among solutions of equal likelihood along the row (MLMH), or also against
-    the previous row (MLMH+V)."""
     out_of_view: bool = True
     """Pixels outside the other camera's view cost as much as an expected match, which does not bias the
     disparities; the paper charges them as occluded, which pulls both row ends to disparity 0."""
@@ -282,8 +241,6 @@ class MaximumLikelihoodScanline:
     def __post_init__(self) -> None:
         if not 0 <= self.radius <= 4:
             raise ValueError(f"radius must be in 0 .. 4; got {self.radius}")
-        if self.cohesion not in ("none", "along", "along and across"):
-            raise ValueError(f"cohesion must be none, along, or along and across; got {self.cohesion}")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """See `thesisrecon.stereo.semi_global.SemiGlobalMatching.match`; the disparities are whole numbers.
@@ -310,8 +267,6 @@ class MaximumLikelihoodScanline:
             steps_per_nat / (4.0 * variance * LEVELS**2),
             round(steps_per_nat * occluded),
             round(steps_per_nat * (match_nats * components if self.out_of_view else occluded)),
-            int(self.cohesion != "none"),
-            int(self.cohesion == "along and across"),
         )
         likelihood = np.exp(-np.arange(int(significant * steps_per_nat) + 2) / steps_per_nat)
         likelihood[-1] = 0.0

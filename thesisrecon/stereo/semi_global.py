@@ -15,38 +15,12 @@ from numpy.typing import ArrayLike
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, I16, U8, U64
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo._cost import (
-    ARM,
-    CENSUS_BITS,
-    LEVELS,
-    WEIGHT_SHIFT,
-    StereoImage,
-    census,
-    checked_range,
-    cost_volume,
-    estimate_noise,
-    prepare_stereo_images,
-    row_strips,
-    support_masks,
-)
-from thesisrecon.stereo._postprocessing import (
-    best_disparities,
-    check_left_right,
-    disparity_noise,
-    edge_preserving_mean,
-    fill_pinholes,
-    final_confidence,
-    remove_speckles,
-    texture_of,
-)
+from thesisrecon.stereo import _cost, _postprocessing
 
-TOP = 127
-"""Upper limit of matching cost plus penalty: the sum of two opposite path costs then fits one byte."""
+TOP = 127  #: upper limit of matching cost plus penalty: the sum of two opposite path costs then fits one byte
 Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
-BLOCK = 192
-"""Rows transposed together for the horizontal paths; a multiple of 8."""
-TILE = 64
-"""Columns transposed together; a multiple of 8."""
+BLOCK = 192  #: rows transposed together for the horizontal paths; a multiple of 8
+TILE = 64  #: columns transposed together; a multiple of 8
 ODD = np.uint64(0x00FF00FF00FF00FF)
 ODD_PAIRS = np.uint64(0x0000FFFF0000FFFF)
 ODD_FOURS = np.uint64(0x00000000FFFFFFFF)
@@ -125,28 +99,10 @@ def _extend_row(
             _extend(
                 cost[q, a:b], (below, before[q, c:d], above), base[c:d], p2[c:d], P1, path[q, a:b], least[a:b]
             )
-        for x in range(a):
-            path[q, x] = cost[q, x]
-            least[x] = min(least[x], cost[q, x])
-        for x in range(b, width):
-            path[q, x] = cost[q, x]
-            least[x] = min(least[x], cost[q, x])
-
-
-@kernel
-def _start_row(cost: U8, path: U8, least: U8) -> None:
-    least[:] = 255
-    for q in range(len(cost)):
-        for x in range(len(least)):
-            value = cost[q, x]
-            path[q, x] = value
-            least[x] = min(least[x], value)
-
-
-@kernel
-def _add(values: U8, total: U8) -> None:
-    for x in range(len(total)):
-        total[x] = np.uint8(total[x] + values[x])
+        for first, last in ((0, a), (b, width)):
+            for x in range(first, last):
+                path[q, x] = cost[q, x]
+                least[x] = min(least[x], cost[q, x])
 
 
 @kernel
@@ -165,7 +121,8 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
     rows, n, width = costs.shape
     unreachable = full(width, np.uint8(255 - P1), np.uint8)
     least, p2 = empty((2, width), np.uint8), empty(width, np.uint8)
-    _start_row(costs[0], total[0], least[0])
+    start = (P1, width, unreachable)  # No column continues a path.
+    _extend_row(costs[0], total[0], least[0], p2, start, total[0], least[0])
     for y in range(1, rows):
         # The sum still holds the path from above only, from which the next row continues.
         _shifted(P2[y], shift, p2)
@@ -173,7 +130,8 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
         old, new = least[(y - 1) & 1], least[y & 1]
         _extend_row(costs[y], total[y - 1], old, p2, settings, total[y], new)
     paths = empty((2, n, width), np.uint8)
-    _start_row(costs[rows - 1], paths[(rows - 1) & 1], least[(rows - 1) & 1])
+    path, new = paths[(rows - 1) & 1], least[(rows - 1) & 1]
+    _extend_row(costs[rows - 1], path, new, p2, start, path, new)
     for y in range(rows - 1, -1, -1):
         path = paths[y & 1]
         if y < rows - 1:
@@ -181,7 +139,9 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> Non
             old = least[(y + 1) & 1]
             _extend_row(costs[y], paths[(y + 1) & 1], old, P2[y + 1], settings, path, least[y & 1])
         for q in range(n):
-            _add(path[q], total[y, q])
+            values, sums = path[q], total[y, q]
+            for x in range(width):
+                sums[x] = np.uint8(sums[x] + values[x])
 
 
 @kernel
@@ -329,19 +289,19 @@ class SemiGlobalMatching:
         """
         # Standard deviation in grey levels of quantisation and viewpoint change, added to the image noise.
         min_noise = 1.0
-        first, last = checked_range(disparity_range)
-        images = prepare_stereo_images(left, right)
-        measured = float(np.mean([estimate_noise(image) for image in images]))
+        first, last = _cost.checked_range(disparity_range)
+        images = _cost.prepare_stereo_images(left, right)
+        measured = float(np.mean([_cost.estimate_noise(image) for image in images]))
         noise = float(np.hypot(min_noise, measured))
         (height, width), n, pairs = images[0].valid.shape, last - first + 1, self.paths // 2
         bits = np.empty((2, height, width), np.int32)
         for image, out in zip(images, bits, strict=True):
-            census(image.grey, out)
-        arms = np.empty((4, ARM if self.support else 0, height, width), np.uint8)
+            _cost.census(image.grey, out)
+        arms = np.empty((4, _cost.ARM if self.support else 0, height, width), np.uint8)
         if self.support:
             # The colour difference at which an arm of the support ends is five standard deviations.
-            tolerance = np.int16(min(round(5.0 * noise * LEVELS), 255 * LEVELS))
-            support_masks(images[0].channels, images[0].valid, tolerance, arms)
+            tolerance = np.int16(min(round(5.0 * noise * _cost.LEVELS), 255 * _cost.LEVELS))
+            _cost.support_masks(images[0].channels, images[0].valid, tolerance, arms)
         # A partner outside the image costs a share of the maximal cost.
         weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(0.4 * MAX_COST))
         penalties, P1_cost = _adapted_P2(images[0], noise), np.uint8(round(P1 * MAX_COST))
@@ -351,7 +311,7 @@ class SemiGlobalMatching:
         # One byte per pixel and disparity for the cost, and one for each pair of opposite paths.
         memory = 1e6 * self.memory_mb
         room = max(memory - 2 * scratch_size(height, n, width), 0.5 * memory)
-        for start, stop, top, bottom in row_strips(height, (1 + pairs) * width * n, room):
+        for start, stop, top, bottom in _cost.row_strips(height, (1 + pairs) * width * n, room):
             rows = slice(top, bottom)
             features = [
                 (bits[side, rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows])
@@ -363,40 +323,41 @@ class SemiGlobalMatching:
             volume, sums, scratch = np.split(whole, [cells, (1 + pairs) * cells])
             volume, sums = volume.reshape(-1, n, width), sums.reshape(pairs, -1, n, width)
             support = np.ascontiguousarray(arms[:, :, rows])
-            cost_volume(features[0], features[1], support, first, weights, outside, volume)
+            _cost.cost_volume(features[0], features[1], support, first, weights, outside, volume)
             steps = np.ascontiguousarray(penalties[:, rows])
             sum_paths(volume, steps, P1_cost, sums, scratch.reshape(2, transposed))
             own = found[:, start:stop]
-            best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
+            _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
-        return self._postprocess(found[0], found[1], found[2], texture_of(images[0], measured))
+        return self._postprocess(*found, _postprocessing.texture_of(images[0], measured))
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
-        one = MAX_COST << WEIGHT_SHIFT
-        cap = min(max(round(self.truncation * noise * LEVELS * channels), channels), 255 * LEVELS * channels)
-        of_bit = round(self.census_share * one / CENSUS_BITS)
+        one = MAX_COST << _cost.WEIGHT_SHIFT
+        unit = _cost.LEVELS * channels
+        cap = min(max(round(self.truncation * noise * unit), channels), 255 * unit)
+        of_bit = round(self.census_share * one / _cost.CENSUS_BITS)
         of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))
         return np.array([of_bit, of_level, cap], np.int16)
 
     def _postprocess(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
         """Check, filter and smooth the disparities (H, W) of the left image; inputs are overwritten."""
         step = np.float32(1.0)  # Largest disparity difference of neighbours on one surface
-        check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
+        _postprocessing.check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
         # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
-        remove_speckles(left, texture > np.float32(1.7), step, 60)
-        closed, smooth = fill_pinholes(left, least=5), np.empty_like(left)
+        _postprocessing.remove_speckles(left, texture > np.float32(1.7), step, 60)
+        closed, smooth = _postprocessing.fill_pinholes(left, least=5), np.empty_like(left)
         closed[np.isnan(texture)] = np.nan
-        edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
-        confidence = final_confidence(confidence, left, smooth, texture)
-        return DisparityMap(smooth, confidence, disparity_noise(closed, smooth))
+        _postprocessing.edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
+        confidence = _postprocessing.final_confidence(confidence, left, smooth, texture)
+        return DisparityMap(smooth, confidence, _postprocessing.disparity_noise(closed, smooth))
 
 
-def _adapted_P2(image: StereoImage, noise: float) -> U8:
+def _adapted_P2(image: _cost.StereoImage, noise: float) -> U8:
     """P2 / (1 + g / ``EDGE``) with the intensity step g, at least ``MIN_P2``; see :func:`adaptive_P2`."""
     edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
     out = np.empty((4, *image.valid.shape), np.uint8)
-    scale = np.float32(edge * noise * LEVELS * len(image.channels))
+    scale = np.float32(edge * noise * _cost.LEVELS * len(image.channels))
     adaptive_P2(image.grey, np.float32(P2 * MAX_COST), np.float32(MIN_P2 * MAX_COST), scale, out)
     return out
 

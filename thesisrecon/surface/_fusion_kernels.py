@@ -6,51 +6,53 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon._numba import empty, kernel, zeros
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F32, F64, I32, I64, U8
 
-SIDE = 8
-"""Voxels per side of a block."""
+SIDE = 8  #: voxels per side of a block
 
 
-class MapSamples(NamedTuple):
-    """A depth map prepared for fusion: depth, std and ``cosine`` (H, W) float32, NaN = unknown.
+class FusionMap(NamedTuple):
+    """A depth map prepared for fusion.
 
+    ``P`` = K [R t] (3, 4) and ``focal`` length in pixels; depth, std and ``cosine`` (H, W), NaN = unknown.
     ``cosine``: distance across the surface per unit of depth; ``slope``: largest relative depth step between
     neighbours on one surface.
     """
 
+    P: F64
+    focal: float
     depth: F32
     std: F32
     cosine: F32
     slope: float
 
 
-class Window(NamedTuple):
-    """The blocks of a voxel grid whose values are in memory, from number ``first`` on.
+class VoxelGrid(NamedTuple):
+    """Sparse voxel grid, and the values of its blocks from number ``first`` on.
 
     ``blocks`` (B, 3): grid positions of all blocks; ``place`` (X, Y, Z): block number at each position or -1.
     ``value``, ``weight``, ``vertex`` (W, 8, 8, 8): signed distance, its weight, and vertex number or -1.
     """
 
-    first: int
+    origin: F64
+    voxel: float
     blocks: I64
     place: I32
+    first: int
     value: F32
     weight: F32
     vertex: I32
 
 
 @kernel
-def touched_blocks(
-    samples: MapSamples, rays: F64, centre: F64, reach: float, edge: float, marked: U8
-) -> None:
+def touched_blocks(surface: FusionMap, rays: F64, centre: F64, reach: float, edge: float, marked: U8) -> None:
     """Mark the blocks (X, Y, Z) of size ``edge`` that lie within ``reach`` of the surface.
 
     ``rays`` (3, 3): from (x, y, 1) to the point at depth 1 relative to the centre; ``centre`` (3,): of the
     camera, relative to the grid origin.
     """
-    depth, cosine = samples.depth, samples.cosine
+    depth, cosine = surface.depth, surface.cosine
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
             z = depth[y, x]
@@ -72,7 +74,7 @@ def touched_blocks(
 
 @kernel
 def integrate_view(
-    blocks: I64, voxel: float, P: F64, surface: MapSamples, truncation: float, value: F32, weight: F32
+    blocks: I64, voxel: float, P: F64, surface: FusionMap, truncation: float, value: F32, weight: F32
 ) -> None:
     """Add one depth map to the signed distances of blocks (Curless and Levoy 1996).
 
@@ -81,7 +83,7 @@ def integrate_view(
     + (truncation / 8)^2) with the standard deviation s across the surface: the surface is assumed to be plane
     near the ray, with an error that grows with 1 / cos^2.
     """
-    depth, std, cosine, slope = surface
+    depth, std, cosine, slope = surface.depth, surface.std, surface.cosine, surface.slope
     height, width = depth.shape
     base = (truncation / 8.0) ** 2
     for b in range(blocks.shape[0]):
@@ -149,7 +151,7 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
 
 
 @kernel
-def _find(window: Window, i: int, j: int, k: int) -> int:
+def _find(window: VoxelGrid, i: int, j: int, k: int) -> int:
     """Row of the block at grid voxel (i, j, k) in the window, -1 if there is no block."""
     place = window.place
     if i < 0 or j < 0 or k < 0:
@@ -161,12 +163,12 @@ def _find(window: Window, i: int, j: int, k: int) -> int:
 
 
 @kernel
-def place_vertices(rows: tuple[int, int], window: Window, points: F64) -> int:
+def place_vertices(rows: tuple[int, int], window: VoxelGrid, points: F64) -> int:
     """Place one vertex in each cell of eight voxels that the surface passes (surface nets, Gibson 1998).
 
     ``rows``: first and last + 1 block; their cells in ``window.vertex`` receive their vertex number or -1,
-    counted from the first block; ``points`` (N, 3) receives the first N vertices in voxels, each the mean of
-    the zero crossings of the cell edges. Returns the number of vertices.
+    counted from the first block; ``points`` (N, 3) receives the vertices in voxels, each the mean of the zero
+    crossings of the cell edges. Returns the number of vertices.
     """
     count = 0
     corner = empty(8)
@@ -189,11 +191,10 @@ def place_vertices(rows: tuple[int, int], window: Window, points: F64) -> int:
                         inside += corner[c] < 0.0
                     if not known or inside == 0 or inside == 8:
                         continue
-                    if count < points.shape[0]:
-                        _mean_crossing(corner, points[count])
-                        points[count, 0] += x
-                        points[count, 1] += y
-                        points[count, 2] += z
+                    _mean_crossing(corner, points[count])
+                    points[count, 0] += x
+                    points[count, 1] += y
+                    points[count, 2] += z
                     window.vertex[own, i, j, k] = count
                     count += 1
     return count
@@ -220,14 +221,13 @@ def _mean_crossing(corner: F64, point: F64) -> None:
 
 
 @kernel
-def join_vertices(rows: tuple[int, int], window: Window, points: F64, known: int, faces: I32) -> int:
+def join_vertices(rows: tuple[int, int], window: VoxelGrid, points: F64, known: int, faces: I32) -> int:
     """Create two triangles across each voxel edge that the surface crosses, anticlockwise from outside.
 
     ``rows``: first and last + 1 block; ``points`` of the vertices from number ``known`` on; ``faces`` (M, 3)
     receives the first M faces; the shorter diagonal is used. Returns the number of faces.
     """
     count = 0
-    step = zeros(3, np.int64)
     ring = empty(4, np.int64)
     blocks, value, weight = window.blocks, window.value, window.weight
     for b in range(rows[0], rows[1]):
@@ -240,9 +240,7 @@ def join_vertices(rows: tuple[int, int], window: Window, points: F64, known: int
                     start = value[own, i, j, k]
                     x, y, z = blocks[b, 0] * SIDE + i, blocks[b, 1] * SIDE + j, blocks[b, 2] * SIDE + k
                     for axis in range(3):
-                        step[:] = 0
-                        step[axis] = 1
-                        X, Y, Z = x + step[0], y + step[1], z + step[2]
+                        X, Y, Z = x + (axis == 0), y + (axis == 1), z + (axis == 2)
                         n = _find(window, X, Y, Z)
                         if n < 0 or not weight[n, X % SIDE, Y % SIDE, Z % SIDE] > 0.0:
                             continue
@@ -256,11 +254,10 @@ def join_vertices(rows: tuple[int, int], window: Window, points: F64, known: int
                         first = _squared(points, ring[0] - known, ring[2] - known) <= _squared(
                             points, ring[1] - known, ring[3] - known
                         )
-                        if count + 2 <= faces.shape[0]:
-                            for t in range(3):
-                                faces[count, t] = ring[t] if first else ring[(t + 1) % 4]
-                            for t in range(3):
-                                faces[count + 1, t] = ring[(t + 2) % 4] if first else ring[(t + 3) % 4]
+                        turn = 0 if first else 1
+                        for t in range(3 if count + 2 <= faces.shape[0] else 0):
+                            faces[count, t] = ring[(t + turn) % 4]
+                            faces[count + 1, t] = ring[(t + turn + 2) % 4]
                         count += 2
     return count
 
@@ -274,7 +271,7 @@ def _squared(points: F64, a: int, b: int) -> float:
 
 
 @kernel
-def _ring(window: Window, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
+def _ring(window: VoxelGrid, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
     """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
     for t in range(4):

@@ -96,8 +96,7 @@ def remove_small_parts(mesh: TexturedMesh) -> TexturedMesh:
     return select_faces(mesh, area[part] >= min_part_share * area.sum())
 
 
-GRAZING_DEG = 10.0
-"""Surfaces break where they are seen at a smaller angle."""
+GRAZING_DEG = 10.0  #: surfaces break where they are seen at a smaller angle
 
 
 def max_depth_slope(P: F64, grazing_deg: float) -> float:

@@ -22,8 +22,7 @@ BLOCK_FACES = 150_000
 """Faces that are simplified as one block; vertices between blocks stay for the next round."""
 SHARES, LONGEST = (0.08, 0.32), 8.0
 """Limits tried for a number of faces, and longest new side; unit: side of a square of a face's mean area."""
-MAX_FAN = 24
-"""Largest number of faces around a vertex."""
+MAX_FAN = 24  #: largest number of faces around a vertex
 
 
 class MeshState(NamedTuple):

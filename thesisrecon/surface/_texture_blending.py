@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -43,12 +43,9 @@ PART_TEXELS, LARGE_PART_TEXELS, CHUNK_POINTS = 1 << 17, 1 << 19, 1 << 14
 """Texels of a part of the surface if all views are in memory, and otherwise; points of one task."""
 BATCH_VIEWS, OBSERVED = 8, 1 << 22
 """Views that are used together; points times views from which the gains are estimated."""
-RIM_TEXELS = 1
-"""Texels by which a chart is extrapolated for bilinear sampling."""
-MAX_BLENDED = 32
-"""Views that are blended at a point, those of the largest weights."""
-SCATTER = 20.0
-"""Distance from the median colour in grey levels at which the weight is a quarter."""
+RIM_TEXELS = 1  #: texels by which a chart is extrapolated for bilinear sampling
+MAX_BLENDED = 32  #: views that are blended at a point, those of the largest weights
+SCATTER = 20.0  #: distance from the median colour in grey levels at which the weight is a quarter
 
 
 class ViewSurface(NamedTuple):
@@ -83,11 +80,8 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
     for n in range(points.shape[0]):
         weight[n] = 0.0
         X, Y, Z = points[n]
-        towards = (
-            normals[n, 0] * (centre[0] - X)
-            + normals[n, 1] * (centre[1] - Y)
-            + normals[n, 2] * (centre[2] - Z)
-        )
+        a, b, c = normals[n]
+        towards = a * (centre[0] - X) + b * (centre[1] - Y) + c * (centre[2] - Z)
         z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
         if not (z > 0.0 and towards > 0.0):
             continue
@@ -105,9 +99,9 @@ def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, co
         lower = trust[below, x] + s * (trust[below, right] - trust[below, x])
         weight[n] = np.float32((upper + t * (lower - upper)) * scale * towards / (z * z * z))
         for k in range(3):
-            a, b = np.float32(rgb[y, x, k]), np.float32(rgb[y, right, k])
-            c, d = np.float32(rgb[below, x, k]), np.float32(rgb[below, right, k])
-            top, bottom = a + s * (b - a), c + s * (d - c)
+            one, two = np.float32(rgb[y, x, k]), np.float32(rgb[y, right, k])
+            three, four = np.float32(rgb[below, x, k]), np.float32(rgb[below, right, k])
+            top, bottom = one + s * (two - one), three + s * (four - three)
             color[n, k] = np.float32((top + t * (bottom - top)) * gain[k])
 
 
@@ -191,59 +185,36 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
             out[n, k] = np.float32(mean[k] / total)
 
 
-@kernel
 def grow_colors(texture: U8, drawn: B8) -> None:
     """Extend the drawn texels by the mean of their neighbours."""
-    height, width = drawn.shape
-    before = drawn.copy()
-    total = zeros(3)
-    for y in range(height):
-        for x in range(width):
-            if before[y, x]:
-                continue
-            total[:] = 0.0
-            count = 0
-            for j in range(max(y - 1, 0), min(y + 2, height)):
-                for i in range(max(x - 1, 0), min(x + 2, width)):
-                    if before[j, i]:
-                        count += 1
-                        for k in range(3):
-                            total[k] += texture[j, i, k]
-            if count:
-                drawn[y, x] = True
-                for k in range(3):
-                    texture[y, x, k] = int(total[k] / count + 0.5)
+    y, x = np.nonzero(scipy.ndimage.binary_dilation(drawn, np.ones((3, 3))) & ~drawn)
+    last, total, count = np.array(drawn.shape) - 1, np.zeros((len(y), 3)), np.zeros(len(y), np.int64)
+    for dy, dx in product((-1, 0, 1), repeat=2):
+        # Beyond the border a texel is its own neighbour, which is not drawn.
+        inside = (y + dy >= 0) & (y + dy <= last[0]) & (x + dx >= 0) & (x + dx <= last[1])
+        at = np.where(inside, y + dy, y), np.where(inside, x + dx, x)
+        total += texture[at] * drawn[at][:, None]
+        count += drawn[at]
+    texture[y, x] = (total / count[:, None] + 0.5).astype(np.uint8)
+    drawn[y, x] = True
 
 
-@kernel
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
     """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
 
     ``corners`` (M, 3, 3): in homogeneous texels; ``face`` (H, W), -1 for none, and ``weights`` (H, W, 2) of
     corners 1 and 2 are updated from the left, right, upper or lower neighbour.
     """
-    height, width = face.shape
-    before = face.copy()
-    for y in range(height):
-        for x in range(width):
-            if before[y, x] >= 0:
-                continue
-            for side in range(4):
-                j = y + (side == 3) - (side == 2)
-                i = x + (side == 1) - (side == 0)
-                if not (0 <= j < height and 0 <= i < width) or before[j, i] < 0:
-                    continue
-                c = corners[before[j, i]]
-                ax, ay = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1]
-                bx, by = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1]
-                area = ax * by - ay * bx
-                dx, dy = x - c[0, 0], y - c[0, 1]
-                p, q = dx * by - dy * bx, ax * dy - ay * dx
-                if max(abs(p), abs(q)) <= farthest * abs(area) and area != 0.0:
-                    face[y, x] = before[j, i]
-                    weights[y, x, 0] = np.float32(p / area)
-                    weights[y, x, 1] = np.float32(q / area)
-                    break
+    (height, width), before = face.shape, np.pad(face, 1, constant_values=-1)
+    for top, left in ((1, 0), (1, 2), (0, 1), (2, 1)):
+        beside = before[top : top + height, left : left + width]
+        y, x = np.nonzero((face < 0) & (beside >= 0))
+        first, second, third = corners[beside[y, x], :, :2].transpose(1, 2, 0)
+        (ax, ay), (bx, by), (dx, dy) = second - first, third - first, np.stack([x, y]) - first
+        area, p, q = ax * by - ay * bx, dx * by - dy * bx, ax * dy - ay * dx
+        near = (np.maximum(np.abs(p), np.abs(q)) <= farthest * np.abs(area)) & (area != 0.0)
+        face[y[near], x[near]] = beside[y[near], x[near]]
+        weights[y[near], x[near]] = np.stack([p[near], q[near]], axis=1) / area[near, None]
 
 
 def paint_texture(

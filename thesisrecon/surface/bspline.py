@@ -15,13 +15,9 @@ from thesisrecon.optimize.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import GRAZING_DEG, components, max_depth_slope, same_surface
 
-_POLYNOMIALS = (
-    np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]])
-    / 6.0
-)
+_POLYNOMIALS = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 """Row i: coefficients of 1, u, u^2, u^3 of the i-th non-zero B-spline, u in [0, 1]."""
-WINDOW = 5
-"""Cells of the window of the discrepancy principle along each side."""
+WINDOW = 5  #: cells of the window of the discrepancy principle along each side
 
 
 def _basis(u: F64, derivative: int = 0) -> F64:
@@ -278,15 +274,11 @@ class BSplineSurface:
     5 x 5 cells around it do not exceed the noise level, which the softest spline provides
     (the errors of adjacent depths are correlated). At surface breaks both sides have separate coefficients;
     pixels without depth stay empty.
-
-    Parameters
-    ----------
-    knot_px : int
-        Distance of the knots. Connected regions smaller than a cell are outliers: within ``knot_px`` of a
-        surface they take its depth, elsewhere they become empty.
     """
 
     knot_px: int = 4
+    """Distance of the knots. Connected regions smaller than a cell are outliers: within ``knot_px`` of a
+    surface they take its depth, elsewhere they become empty."""
 
     def __post_init__(self) -> None:
         if self.knot_px < 2:

@@ -9,71 +9,48 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any
 
 import numpy as np
 import scipy
 
 from thesisrecon._numba import ThreadPool
-from thesisrecon.arrays import B8, F32, F64, I32, I64
-from thesisrecon.camera import decompose_camera
+from thesisrecon.arrays import B8, F32, F64, I32
+from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.records import DepthMap, TexturedMesh
+from thesisrecon.surface import _mesh
 from thesisrecon.surface._fusion_kernels import (
     SIDE,
-    MapSamples,
-    Window,
+    FusionMap,
+    VoxelGrid,
     integrate_view,
     join_vertices,
     place_vertices,
     touched_blocks,
 )
-from thesisrecon.surface._mesh import (
-    GRAZING_DEG,
-    max_depth_slope,
-    remove_small_parts,
-    select_faces,
-    surface_from_depth,
-    triangulate_grid,
-)
 from thesisrecon.surface._simplification import simplify_surface
 
 GROUP_BYTES, MEDIAN_PIXELS = 2**30, 2**26
 """Prepared depth maps in memory at a time, and pixels from which the voxel size is computed."""
+TRUNCATION_VOXELS = 3.0  #: truncation of the signed distances; less certain depths are ignored
 SLAB_BLOCKS, TASK_BLOCKS = 8192, 512
 """Blocks in memory at a time, besides a layer before and after them, and blocks of one task."""
 
 
 @dataclass(frozen=True)
-class _Grid:
-    """Sparse voxel grid; ``place`` (X, Y, Z): block number at each position or -1."""
-
-    origin: F64
-    voxel: float
-    blocks: I64
-    place: I32
-
-
-@dataclass(frozen=True)
 class VolumetricFusion:
-    """Fusion of depth maps in a truncated signed distance field.
-
-    Parameters
-    ----------
-    voxel_px : float
-        Voxel size in pixels of the depth maps at their median depth; larger if the model is too large.
-    tolerance : float
-        RMS distance by which the simplified surface may deviate from the faces it replaces, in standard
-        deviations of the fused depths there (of at most a voxel); 0: no simplification.
-    """
+    """Fusion of depth maps in a truncated signed distance field."""
 
     voxel_px: float = 1.5
+    """Voxel size in pixels of the depth maps at their median depth; larger if the model is too large."""
     tolerance: float = 0.25
+    """RMS distance by which the simplified surface may deviate from the faces it replaces, in standard
+    deviations of the fused depths there (of at most a voxel); 0: no simplification."""
 
     # Largest number of blocks of 8 x 8 x 8 voxels (4 kB each); voxels are enlarged to fit.
     max_blocks = 250_000
@@ -95,88 +72,63 @@ class VolumetricFusion:
         if self.tolerance:
             limit, longest = self.tolerance * np.minimum(std, max_std_voxels * voxel), longest_voxels * voxel
             surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
-        return remove_small_parts(surface)
+        return _mesh.remove_small_parts(surface)
 
     def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
         """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
+        maps = OnDemand(len(depth_maps), lambda n: _measured(depth_maps[n]), GROUP_BYTES)
         with ThreadPool(threads) as pool:
-            measured = _PreparedMaps(depth_maps, pool)
-            grid = self._lay_out(measured)
-            return *_Extraction(grid, measured, pool).surface(), grid.voxel
+            grid = self._lay_out(maps, sum(one.depth.size for one in depth_maps), pool)
+            return *_zero_level(grid, maps, pool), grid.voxel
 
-    def _lay_out(self, measured: _PreparedMaps) -> _Grid:
-        """Voxel grid; leaves the depths that are certain enough for its truncation distance."""
-        truncation_voxels = 3.0  # Truncation of the signed distances; less certain depths are ignored
+    def _lay_out(self, maps: Sequence[FusionMap], pixels: int, pool: ThreadPool) -> VoxelGrid:
+        """Empty grid of the smallest voxels whose blocks fit into memory."""
         voxel_growth = 1.15  # Factor by which voxels are enlarged until the blocks fit into memory
-        step = max(1, -(-measured.pixels // MEDIAN_PIXELS))
+        step = max(1, -(-pixels // MEDIAN_PIXELS))
         footprints = [
-            (m.samples.depth / np.float32(m.focal))[np.isfinite(m.samples.depth)][::step]
-            for group in measured
-            for m in group
+            (m.depth / np.float32(m.focal))[np.isfinite(m.depth)][::step]
+            for m in chain.from_iterable(_certain_maps(maps, np.inf, pool))
         ]
         if not sum(map(len, footprints)):
             raise _nothing_to_fuse()
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
-            measured.truncation = truncation_voxels * voxel
-            grid = _grid(measured, voxel)
+            grid = _empty_grid(maps, voxel, pool)
             if grid is not None and len(grid.blocks) <= self.max_blocks:
                 return grid
             voxel *= voxel_growth
 
 
-@dataclass(frozen=True)
-class _FusionMap:
-    """A depth map prepared for fusion: camera ``P`` (3, 4), ``focal`` length in pixels, and ``samples``."""
+def _certain_maps(
+    maps: Sequence[FusionMap], truncation: float, pool: ThreadPool
+) -> Iterator[list[FusionMap]]:
+    """Groups of maps without depths whose standard deviation across the surface exceeds the truncation."""
+    group = 8  # Maps that are in memory at a time, besides those kept in ``GROUP_BYTES``
 
-    P: F64
-    focal: float
-    samples: MapSamples
-
-    def without_uncertain_depths(self, truncation: float) -> _FusionMap:
-        """Without depths whose standard deviation across the surface exceeds the truncation."""
+    def certain(n: int) -> FusionMap:
+        one = maps[n]
         with np.errstate(invalid="ignore"):
-            certain = self.samples.std * self.samples.cosine <= truncation
-        depth = np.where(certain, self.samples.depth, np.float32(np.nan))
-        return replace(self, samples=self.samples._replace(depth=depth))
+            depth = np.where(one.std * one.cosine <= truncation, one.depth, np.float32(np.nan))
+        return one._replace(depth=depth)
 
-    def camera(self, origin: F64) -> F64:
-        """K [R t] with another origin."""
-        K, R, t = decompose_camera(self.P)
-        return np.asarray(K @ np.column_stack([R, t + R @ origin]))
-
-    @property
-    def rays(self) -> tuple[F64, F64]:
-        """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
-        K, R, t = decompose_camera(self.P)
-        return np.ascontiguousarray(R.T @ np.linalg.inv(K)), -R.T @ t
+    for first in range(0, len(maps), group):
+        yield list(pool.map(certain, range(first, min(first + group, len(maps)))))
 
 
-class _PreparedMaps:
-    """Depth maps of some certainty prepared for fusion, in groups; ``GROUP_BYTES`` of them are in memory."""
-
-    def __init__(self, maps: Sequence[DepthMap], pool: ThreadPool) -> None:
-        self.pixels = sum(one.depth.size for one in maps)
-        self.pool, self.truncation = pool, np.inf
-        self.prepared = OnDemand(len(maps), lambda n: _measured(maps[n]), GROUP_BYTES)
-
-    def __iter__(self) -> Iterator[list[_FusionMap]]:
-        group = 8
-
-        def certain(n: int) -> _FusionMap:
-            return self.prepared[n].without_uncertain_depths(self.truncation)
-
-        for first in range(0, len(self.prepared), group):
-            yield list(self.pool.map(certain, range(first, min(first + group, len(self.prepared)))))
+def _rays(P: F64) -> tuple[F64, F64]:
+    """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
+    directions = np.linalg.inv(P[:, :3])
+    return directions, -directions @ P[:, 3]
 
 
-def _measured(depth_map: DepthMap) -> _FusionMap:
+def _measured(depth_map: DepthMap) -> FusionMap:
     fused_grazing_deg = 5.0  # Surfaces break where they are seen at a smaller angle
-    K = decompose_camera(depth_map.P)[0]
-    slope = max_depth_slope(depth_map.P, fused_grazing_deg)
-    depth = _without_grazing(depth_map, slope)
-    samples = MapSamples(depth, depth_map.std, _incidence_cosines(depth, K), slope)
-    return _FusionMap(depth_map.P, float(np.sqrt(K[0, 0] * K[1, 1])), samples)
+    K, R, t = decompose_camera(depth_map.P)
+    slope = _mesh.max_depth_slope(depth_map.P, fused_grazing_deg)
+    depth, focal = _without_grazing(depth_map, slope), float(np.sqrt(K[0, 0] * K[1, 1]))
+    return FusionMap(
+        compose_camera(K, R, t), focal, depth, depth_map.std, _incidence_cosines(depth, K), slope
+    )
 
 
 def _nothing_to_fuse() -> StageFailure:
@@ -231,14 +183,13 @@ def _without_grazing(depth_map: DepthMap, slope: float) -> F32:
     return np.where(flat, np.float32(np.nan), depth)
 
 
-def _grid(measured: _PreparedMaps, voxel: float) -> _Grid | None:
+def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> VoxelGrid | None:
     """Blocks within the truncation of any depth; None if their bounding box is too large."""
-    low, high, reach = np.full(3, np.inf), np.full(3, -np.inf), measured.truncation
-    for one in chain.from_iterable(measured):
-        directions, centre = one.rays
-        depth = one.samples.depth
-        y, x = np.nonzero(np.isfinite(depth))
-        xyz = centre + depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
+    low, high, reach = np.full(3, np.inf), np.full(3, -np.inf), TRUNCATION_VOXELS * voxel
+    for one in chain.from_iterable(_certain_maps(maps, reach, pool)):
+        directions, centre = _rays(one.P)
+        y, x = np.nonzero(np.isfinite(one.depth))
+        xyz = centre + one.depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
@@ -249,98 +200,83 @@ def _grid(measured: _PreparedMaps, voxel: float) -> _Grid | None:
     if np.prod(shape.astype(float)) > 2e8:
         return None
     marked = np.zeros(tuple(shape), dtype=np.uint8)
-    for one in chain.from_iterable(measured):
-        directions, centre = one.rays
-        touched_blocks(one.samples, directions, centre - origin, reach, edge, marked)
+    for one in chain.from_iterable(_certain_maps(maps, reach, pool)):
+        directions, centre = _rays(one.P)
+        touched_blocks(one, directions, centre - origin, reach, edge, marked)
     blocks = np.argwhere(marked).astype(np.int64)
     place = np.full(marked.shape, -1, dtype=np.int32)
     place[tuple(blocks.T)] = np.arange(len(blocks))
-    return _Grid(origin, voxel, blocks, place)
+    none = np.empty((0, SIDE, SIDE, SIDE), np.float32)
+    return VoxelGrid(origin, voxel, blocks, place, 0, none, none, none.astype(np.int32))
 
 
-class _Extraction:
-    """Zero level of the fused distances as a surface net, computed slab by slab.
+def _zero_level(grid: VoxelGrid, maps: Sequence[FusionMap], pool: ThreadPool) -> tuple[TexturedMesh, F64]:
+    """Zero level of the fused distances as a surface net, and the standard deviation at each vertex.
 
-    A slab is a range of layers of blocks across the first axis. The layers before and after it are in memory,
-    too: its faces use vertices of the former, and its cells voxels of the latter.
+    It is computed slab by slab, a range of layers of blocks across the first axis. The layers before and
+    after it are in memory, too: its faces use vertices of the former, and its cells voxels of the latter.
+    Weights are inverse variances.
     """
-
-    def __init__(self, grid: _Grid, measured: _PreparedMaps, pool: ThreadPool) -> None:
-        self.grid, self.measured, self.pool = grid, measured, pool
-
-    def surface(self) -> tuple[TexturedMesh, F64]:
-        """Return the surface and the standard deviation at each vertex: weights are inverse variances."""
-        grid = self.grid
-        # The first block of each layer, with an empty layer before the first and after the last one.
-        layers = np.searchsorted(grid.blocks[:, 0], np.arange(-1, grid.place.shape[0] + 2)).tolist()
-        none = np.empty((0, SIDE, SIDE, SIDE), np.float32)
-        window = Window(0, grid.blocks, grid.place, none, none, none.astype(np.int32))
-        points, faces, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], [none[:, 0, 0, 0]]
-        first, known = 1, 0
-        while first < len(layers) - 2:
-            last = max(first + 1, min(bisect_right(layers, layers[first] + SLAB_BLOCKS), len(layers) - 1) - 1)
-            window = self._moved(window, layers[first - 1], layers[last + 1])
-            rows = [*range(layers[first], layers[last], TASK_BLOCKS), layers[last]]
-            found = list(self.pool.map(partial(_placed, window), pairwise(rows)))
-            starts = np.cumsum([known + len(points[-1]), *map(len, found)]).tolist()
-            near = np.concatenate([points[-1], *found])
-            for start, (begin, end) in zip(starts[:-1], pairwise(rows), strict=True):
-                own = window.vertex[begin - window.first : end - window.first]
-                own[own >= 0] += start
-                weights.append(window.weight[begin - window.first : end - window.first][own >= 0])
-            join = partial(_joined, window, near, known)
-            faces += self.pool.map(join, pairwise(rows), map(len, found))
-            known += len(points[-1])
-            points.append(near[len(points[-1]) :])
-            first = last
-        vertices = np.concatenate(points)
-        vertices *= grid.voxel
-        vertices += grid.origin
-        return TexturedMesh(vertices, np.concatenate(faces)), 1.0 / np.sqrt(
-            np.concatenate(weights, dtype=float)
-        )
-
-    def _moved(self, old: Window, begin: int, end: int) -> Window:
-        """The window of blocks ``begin`` to ``end``; those after the old one's are computed."""
-        kept = slice(begin - old.first, None)
-        done, size = len(old.value) - kept.start, end - begin
-        value, weight, vertex = (
-            np.concatenate([array[kept], np.zeros((size - done, *array.shape[1:]), array.dtype)])
-            for array in (old.value, old.weight, old.vertex)
-        )
-
-        def integrate(group: Sequence[_FusionMap], part: tuple[int, int]) -> None:
-            rows, truncation = slice(*part), self.measured.truncation
-            blocks = self.grid.blocks[begin + part[0] : begin + part[1]]
-            for one in group:
-                P = one.camera(self.grid.origin)
-                integrate_view(blocks, self.grid.voxel, P, one.samples, truncation, value[rows], weight[rows])
-
-        for group in self.measured:
-            list(self.pool.map(partial(integrate, group), pairwise([*range(done, size, TASK_BLOCKS), size])))
-        return old._replace(first=begin, value=value, weight=weight, vertex=vertex)
+    # The first block of each layer, with an empty layer before the first and after the last one.
+    layers = np.searchsorted(grid.blocks[:, 0], np.arange(-1, grid.place.shape[0] + 2)).tolist()
+    points, faces, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
+    first, known = 1, 0
+    while first < len(layers) - 2:
+        last = max(first + 1, min(bisect_right(layers, layers[first] + SLAB_BLOCKS), len(layers) - 1) - 1)
+        grid = _moved(grid, layers[first - 1], layers[last + 1], maps, pool)
+        rows = [*range(layers[first], layers[last], TASK_BLOCKS), layers[last]]
+        found = list(pool.map(partial(_placed, grid), pairwise(rows)))
+        starts = np.cumsum([known + len(points[-1]), *map(len, found)]).tolist()
+        near = np.concatenate([points[-1], *found])
+        for start, (begin, end) in zip(starts[:-1], pairwise(rows), strict=True):
+            own = grid.vertex[begin - grid.first : end - grid.first]
+            own[own >= 0] += start
+            weights.append(grid.weight[begin - grid.first : end - grid.first][own >= 0])
+        faces += pool.map(partial(_joined, grid, near, known), pairwise(rows), map(len, found))
+        known += len(points[-1])
+        points.append(near[len(points[-1]) :])
+        first = last
+    vertices = np.concatenate(points)
+    vertices *= grid.voxel
+    vertices += grid.origin
+    std = 1.0 / np.sqrt(np.concatenate(weights, dtype=float))
+    return TexturedMesh(vertices, np.concatenate(faces)), std
 
 
-def _placed(window: Window, rows: tuple[int, int]) -> F64:
-    """The vertices (N, 3) of some blocks."""
-    place = partial(place_vertices, rows, window)
-    return np.asarray(_filled(place, 128 * (rows[1] - rows[0]), np.float64))
+def _moved(grid: VoxelGrid, begin: int, end: int, maps: Sequence[FusionMap], pool: ThreadPool) -> VoxelGrid:
+    """The grid with the values of blocks ``begin`` to ``end``; those after the previous ones are computed."""
+    kept, truncation = slice(begin - grid.first, None), TRUNCATION_VOXELS * grid.voxel
+    done, size = len(grid.value) - kept.start, end - begin
+    value, weight, vertex = (
+        np.concatenate([array[kept], np.zeros((size - done, *array.shape[1:]), array.dtype)])
+        for array in (grid.value, grid.weight, grid.vertex)
+    )
+
+    def integrate(group: Sequence[FusionMap], part: tuple[int, int]) -> None:
+        rows, blocks = slice(*part), grid.blocks[begin + part[0] : begin + part[1]]
+        for one in group:
+            P = np.column_stack([one.P[:, :3], one.P[:, 3] + one.P[:, :3] @ grid.origin])
+            integrate_view(blocks, grid.voxel, P, one, truncation, value[rows], weight[rows])
+
+    parts = [*pairwise([*range(done, size, TASK_BLOCKS), size])]
+    for group in _certain_maps(maps, truncation, pool):
+        list(pool.map(partial(integrate, group), parts))
+    return grid._replace(first=begin, value=value, weight=weight, vertex=vertex)
 
 
-def _joined(window: Window, points: F64, known: int, rows: tuple[int, int], vertices: int) -> I32:
-    """The faces (M, 3) of some blocks with a number of vertices."""
-    join = partial(join_vertices, rows, window, points, known)
-    return np.asarray(_filled(join, 3 * vertices, np.int32))
+def _placed(grid: VoxelGrid, rows: tuple[int, int]) -> F64:
+    """The vertices (N, 3) of some blocks, at most one per voxel."""
+    points = np.empty((SIDE**3 * (rows[1] - rows[0]), 3))
+    return points[: place_vertices(rows, grid, points)].copy()
 
 
-def _filled(fill: Callable[[Any], int], guess: int, kind: type[Any]) -> Any:
-    """Rows (N, 3) that a kernel fills in and counts; it runs again if the guess of N was too low."""
-    rows = np.empty((guess, 3), dtype=kind)
-    count = fill(rows)
-    if count > guess:
-        rows = np.empty((count, 3), dtype=kind)
-        fill(rows)
-    return rows[:count]
+def _joined(grid: VoxelGrid, points: F64, known: int, rows: tuple[int, int], vertices: int) -> I32:
+    """The faces (M, 3) of some blocks; they are joined again if there are more than usual per vertex."""
+    join, faces = partial(join_vertices, rows, grid, points, known), np.empty((3 * vertices, 3), np.int32)
+    if (count := join(faces)) > len(faces):
+        faces = np.empty((count, 3), np.int32)
+        join(faces)
+    return faces[:count]
 
 
 @dataclass(frozen=True)
@@ -349,14 +285,9 @@ class DepthSheets:
 
     The map with the most depths comes first. Nothing is averaged, so sheets overlap slightly at their
     borders.
-
-    Parameters
-    ----------
-    step : int
-        Row and column step of the triangulation.
     """
 
-    step: int = 2
+    step: int = 2  #: row and column step of the triangulation
 
     def __post_init__(self) -> None:
         if self.step < 1:
@@ -368,12 +299,12 @@ class DepthSheets:
         sheets: list[TexturedMesh] = []
         shows: list[Callable[[F64], B8]] = []
         for depth_map in order:
-            sheet = remove_small_parts(surface_from_depth(depth_map, step=self.step))
+            sheet = _mesh.remove_small_parts(_mesh.surface_from_depth(depth_map, step=self.step))
             shown = np.zeros(len(sheet.vertices), dtype=bool)
             for earlier in shows:
                 shown |= earlier(sheet.vertices)
             shows.append(self._coverage_test(depth_map))
-            sheets.append(select_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
+            sheets.append(_mesh.select_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
         if not sum(len(sheet.faces) for sheet in sheets):
             raise _nothing_to_fuse()
         starts = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets[:-1])])
@@ -387,8 +318,8 @@ class DepthSheets:
         max_relative = 0.02
         depth = depth_map.depth[:: self.step, :: self.step].astype(np.float64)
         std = depth_map.std[:: self.step, :: self.step].astype(np.float64)
-        slope = self.step * max_depth_slope(depth_map.P, GRAZING_DEG)
-        whole: B8 = np.asarray(triangulate_grid(depth, std, slope)[1].all(axis=-1))
+        slope = self.step * _mesh.max_depth_slope(depth_map.P, _mesh.GRAZING_DEG)
+        whole: B8 = np.asarray(_mesh.triangulate_grid(depth, std, slope)[1].all(axis=-1))
 
         def shown(X: F64) -> B8:
             z = X @ depth_map.P[2, :3] + depth_map.P[2, 3]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 
 import numpy as np
 
@@ -29,65 +30,53 @@ from thesisrecon.surface._texture_blending import (
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 
-CHART_MARGIN = 2
-"""Pixels around each chart, so that reduced textures do not mix charts."""
-REDUCED_BYTES = 2**28
-"""Reduced images in memory; more are made again when they are used."""
+CHART_MARGIN = 2  #: pixels around each chart, so that reduced textures do not mix charts
+MAX_TEXELS = 4096 * 4096
+REDUCED_BYTES = 2**28  #: reduced images in memory; more are made again when they are used
 
 
-@dataclass(frozen=True)
-class TextureAtlas:
-    """Texture at the resolution of the view that shows each part of the surface best (2.6).
+def texture_mesh(
+    mesh: TexturedMesh,
+    views: Sequence[PinholeView],
+    *,
+    max_texels: int = MAX_TEXELS,
+    threads: int = 1,
+) -> TexturedMesh:
+    """Texture a mesh at the resolution of the view that shows each part of the surface best (2.6).
 
-    Parameters
-    ----------
-    max_texels : int
-        Limit of the texture size; images are reduced to fit.
+    Images are reduced until the texture has at most ``max_texels``.
     """
-
-    max_texels: int = 4096 * 4096
-
-    def __post_init__(self) -> None:
-        if self.max_texels < 1:
-            raise ValueError(f"max_texels must be >= 1; got {self.max_texels}")
-
-    def texture(self, mesh: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
-        """Texture a mesh."""
-        min_scale = 0.05  # Smallest reduction of the images
-        neighbours = face_neighbours(mesh.faces)
-        given = [view_camera(view) for view in views]
+    min_scale = 0.05  # Smallest reduction of the images
+    neighbours = face_neighbours(mesh.faces)
+    given = [view_camera(view) for view in views]
+    buffers = depth_buffers(mesh, views)
+    label = choose_views(mesh, views, buffers, neighbours, threads=threads)
+    if not (label >= 0).any():
+        raise StageFailure(Notice("no-texture"), "no image shows the outside of a face completely")
+    chart = label_charts(label, neighbours)
+    scale = 1.0
+    while True:
+        cameras = [camera.scaled(scale) for camera in given] if scale < 1.0 else given
+        xy = _corners(mesh, cameras, label)
+        rectangles = _rectangles(xy, label, chart, cameras)
+        offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
+        if size[0] * size[1] <= max_texels:
+            break
+        if scale <= min_scale:
+            need = f"{len(rectangles)} charts need {size[0] * size[1]} texels, the limit is {max_texels}"
+            raise StageFailure("the texture is too large", need, "increase max_texels")
+        scale = max(0.95 * scale * np.sqrt(max_texels / (size[0] * size[1])), min_scale)
+    uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
+    if scale < 1.0:
+        whole = views
+        views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
         buffers = depth_buffers(mesh, views)
-        label = choose_views(mesh, views, buffers, neighbours, threads=threads)
-        if not (label >= 0).any():
-            raise StageFailure(Notice("no-texture"), "no image shows the outside of a face completely")
-        chart = label_charts(label, neighbours)
-        scale = 1.0
-        while True:
-            cameras = [camera.scaled(scale) for camera in given] if scale < 1.0 else given
-            xy = _corners(mesh, cameras, label)
-            rectangles = _rectangles(xy, label, chart, cameras)
-            offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
-            if size[0] * size[1] <= self.max_texels:
-                break
-            if scale <= min_scale:
-                texels = size[0] * size[1]
-                raise StageFailure(
-                    "the texture is too large",
-                    f"{len(rectangles)} charts need {texels} texels, the limit is {self.max_texels}",
-                    "increase max_texels",
-                )
-            scale = max(0.95 * scale * np.sqrt(self.max_texels / (size[0] * size[1])), min_scale)
-        uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
-        if scale < 1.0:
-            whole = views
-            views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
-            buffers = depth_buffers(mesh, views)
-        cut_out = _fill(views, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
-        seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
-        prepared = prepare_views(mesh, views, buffers, threads=threads)
-        texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
-        uv, texture = _swatches(neighbours, label, uv, texture)
-        return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
+    cut_out = _fill(views, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
+    seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
+    prepared = prepare_views(mesh, views, buffers, threads=threads)
+    texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
+    uv, texture = _swatches(neighbours, label, uv, texture)
+    return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
 
 @kernel
@@ -166,13 +155,11 @@ def choose_views(
     label = np.full(len(mesh.faces), -1, dtype=np.int64)
     best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
 
-    def see(first: int) -> tuple[F32, I64]:
-        quality = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
-        visible[:, first // 8] = np.packbits(quality > 0.0, axis=1)[:, 0]
-        return quality.max(axis=1), first + quality.argmax(axis=1)
-
-    def spread_shares(first: int) -> tuple[F32, I64]:
+    def best_of_eight(first: int, spreading: bool) -> tuple[F32, I64]:
         share = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+        if not spreading:
+            visible[:, first // 8] = np.packbits(share > 0.0, axis=1)[:, 0]
+            return share.max(axis=1), first + share.argmax(axis=1)
         share /= np.maximum(best, np.float32(1e-20))[:, None]
         spread, other = share.copy(), np.empty_like(share)
         for _ in range(smooth_rounds):
@@ -182,8 +169,8 @@ def choose_views(
 
     with ThreadPool(threads) as pool:
         # Faces that the diffusion leaves without shares keep their best view.
-        for highest, work in ((best, see), (most, spread_shares)):
-            for value, view in pool.map(work, range(0, len(views), 8)):
+        for highest, spreading in ((best, False), (most, True)):
+            for value, view in pool.map(best_of_eight, range(0, len(views), 8), repeat(spreading)):
                 higher = value > highest
                 highest[higher], label[higher] = value[higher], view[higher]
     for _ in range(3):
@@ -372,22 +359,15 @@ class LinearSurface:
 
 @dataclass(frozen=True)
 class SurfaceModel:
-    """Fit, fuse and texture the surfaces of depth maps.
-
-    Parameters
-    ----------
-    surface, fusion
-        Surface fitted to each depth map, and fusion of these surfaces.
-    max_glb_mb : float
-        Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
-        model-full.glb holds all of it, as do the tiles.
-    """
+    """Fit, fuse and texture the surfaces of depth maps."""
 
     surface: LinearSurface | BSplineSurface = field(default_factory=LinearSurface)
+    """Surface fitted to each depth map."""
     fusion: VolumetricFusion | DepthSheets = field(default_factory=VolumetricFusion)
+    """Fusion of these surfaces."""
     max_glb_mb: float = 50.0
-
-    atlas = TextureAtlas()
+    """Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
+    model-full.glb holds all of it, as do the tiles."""
 
     def __post_init__(self) -> None:
         if not self.max_glb_mb >= 5.0:
@@ -418,4 +398,4 @@ class SurfaceModel:
         if without is not None:
             used = [n for n, view in enumerate(views) if view.view != without]
             given, views = views, OnDemand(len(used), lambda n: given[used[n]])
-        return self.atlas.texture(surface, views, threads=threads)
+        return texture_mesh(surface, views, threads=threads)

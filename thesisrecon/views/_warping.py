@@ -16,13 +16,13 @@ from thesisrecon.imaging.resampling import cubic_weights
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle extends beyond its edges, so that rounding leaves no gaps."""
-MIN_AREA = 1e-9
-"""Twice the area (px^2) of the smallest triangle that is drawn."""
+MIN_AREA = 1e-9  #: twice the area (px^2) of the smallest triangle that is drawn
 STRETCH, ENLARGED = 3.0, 2.0
 """Neighbouring pixels of one surface come at most this far apart (px), or so many times their median
 distance in an enlarged view."""
-SPARSE = 16
-"""Subsampling step for the median."""
+Corner = tuple[float, float, float, float, float]
+"""Position in a view, inverse depth, and pixel of the source."""
+SPARSE = 16  #: subsampling step for the median
 
 
 @kernel
@@ -35,102 +35,83 @@ def _joined(target: F64, inverse_depth: F32, a: tuple[int, int], b: tuple[int, i
 
 
 @kernel
-def _draw_triangle(
-    target: F64,
-    inverse_depth: F32,
-    corners: tuple[int, int, int, int, int, int],
-    rows: tuple[int, int],
-    source: F32,
-    front: F32,
+def _corner(target: F64, inverse_depth: F32, at: tuple[int, int]) -> Corner:
+    y, x = at
+    return target[y, x, 0], target[y, x, 1], float(inverse_depth[at]), float(x), float(y)
+
+
+@kernel
+def _draw(
+    corners: tuple[Corner, Corner, Corner], centred: bool, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
-    """Draw the triangle of three source pixels, clockwise in the image; back faces are not drawn."""
-    ya, xa, yb, xb, yc, xc = corners
-    ax, ay = target[ya, xa, 0], target[ya, xa, 1]
-    bx, by = target[yb, xb, 0] - ax, target[yb, xb, 1] - ay
-    cx, cy = target[yc, xc, 0] - ax, target[yc, xc, 1] - ay
+    """Draw a triangle, or the parallelogram of its sides ``centred`` at the first corner; no back faces."""
+    (ax, ay, an, au, av), b, c = corners
+    bx, by, bn, bu, bv = b[0] - ax, b[1] - ay, b[2] - an, b[3] - au, b[4] - av
+    cx, cy, cn, cu, cv = c[0] - ax, c[1] - ay, c[2] - an, c[3] - au, c[4] - av
     area = bx * cy - by * cx
     if area < MIN_AREA:
         return
-    low_y, high_y = min(0.0, by, cy) + ay - SLACK, max(0.0, by, cy) + ay + SLACK
-    low_x, high_x = min(0.0, bx, cx) + ax - SLACK, max(0.0, bx, cx) + ax + SLACK
-    na = inverse_depth[ya, xa]
-    nb, nc = inverse_depth[yb, xb] - na, inverse_depth[yc, xc] - na
-    first, last = max(int(np.ceil(low_y)), rows[0]), min(int(np.floor(high_y)) + 1, rows[1])
-    left, right = max(int(np.ceil(low_x)), 0), min(int(np.floor(high_x)) + 1, front.shape[1])
-    for y in range(first, last):
-        for x in range(left, right):
+    high_x, high_y = max(0.0, bx, cx), max(0.0, by, cy)
+    low_x, low_y = min(0.0, bx, cx), min(0.0, by, cy)
+    if centred:
+        high_x, high_y = 0.5 * (abs(bx) + abs(cx)), 0.5 * (abs(by) + abs(cy))
+        low_x, low_y = -high_x, -high_y
+    top, left = int(np.ceil(ay + low_y - SLACK)), int(np.ceil(ax + low_x - SLACK))
+    bottom, right = int(np.floor(ay + high_y + SLACK)), int(np.floor(ax + high_x + SLACK))
+    for y in range(max(top, rows[0]), min(bottom + 1, rows[1])):
+        for x in range(max(left, 0), min(right + 1, front.shape[1])):
             px, py = x - ax, y - ay
-            b, c = (px * cy - py * cx) / area, (bx * py - by * px) / area
-            if b < -SLACK or c < -SLACK or b + c > 1.0 + SLACK:
+            s, t = (px * cy - py * cx) / area, (bx * py - by * px) / area
+            if (0.5 - max(abs(s), abs(t)) if centred else min(s, t, 1.0 - s - t)) < -SLACK:
                 continue
-            near = np.float32(na + b * nb + c * nc)
+            near = np.float32(an + s * bn + t * cn)
             # The comparison is false only where something nearer is there.
             if front[y, x] >= near:
                 continue
             front[y, x] = near
-            source[y, x, 0] = xa + b * (xb - xa) + c * (xc - xa)
-            source[y, x, 1] = ya + b * (yb - ya) + c * (yc - ya)
+            source[y, x, 0] = au + s * bu + t * cu
+            source[y, x, 1] = av + s * bv + t * cv
 
 
 @kernel
 def _slope(
-    target: F64, inverse_depth: F32, at: tuple[int, int], step: tuple[int, int], limits: F64, out: F64
-) -> int:
-    """Write the change of position and inverse depth per ``step``; return the number of neighbours used."""
+    target: F64, inverse_depth: F32, at: tuple[int, int], step: tuple[int, int], limits: F64
+) -> tuple[int, float, float, float]:
+    """Number of neighbours used, and the change of position and inverse depth per ``step``."""
     height, width = inverse_depth.shape
     ahead, behind = (at[0] + step[0], at[1] + step[1]), (at[0] - step[0], at[1] - step[1])
     has_ahead = ahead[0] < height and ahead[1] < width and _joined(target, inverse_depth, at, ahead, limits)
     has_behind = behind[0] >= 0 and behind[1] >= 0 and _joined(target, inverse_depth, at, behind, limits)
     to, fro = (ahead if has_ahead else at), (behind if has_behind else at)
     count = int(has_ahead) + int(has_behind)
-    for k in range(2):
-        out[k] = (target[to[0], to[1], k] - target[fro[0], fro[1], k]) / max(count, 1)
-    out[2] = (inverse_depth[to] - inverse_depth[fro]) / max(count, 1)
-    return count
+    a, b = target[to], target[fro]
+    each = max(count, 1)
+    return count, (a[0] - b[0]) / each, (a[1] - b[1]) / each, (inverse_depth[to] - inverse_depth[fro]) / each
 
 
 @kernel
 def _draw_footprint(
-    surface: tuple[F64, F32],
+    target: F64,
+    inverse_depth: F32,
     at: tuple[int, int],
     limits: F64,
     rows: tuple[int, int],
-    picture: tuple[F32, F32],
+    source: F32,
+    front: F32,
 ) -> None:
     """Draw the parallelogram onto which a pixel maps, from the positions of its neighbours."""
-    target, inverse_depth = surface
-    source, front = picture
-    across, down = empty(3), empty(3)
-    n_across = _slope(target, inverse_depth, at, (0, 1), limits, across)
-    n_down = _slope(target, inverse_depth, at, (1, 0), limits, down)
+    n_across, ax, ay, an = _slope(target, inverse_depth, at, (0, 1), limits)
+    n_down, dx, dy, dn = _slope(target, inverse_depth, at, (1, 0), limits)
     if n_across == 2 and n_down == 2:
         return
     # A pixel without neighbours keeps its known shape.
     if n_across == 0:
-        across[0], across[1] = (down[1], -down[0]) if n_down else (1.0, 0.0)
+        ax, ay = (dy, -dx) if n_down else (1.0, 0.0)
     if n_down == 0:
-        down[0], down[1] = -across[1], across[0]
-    area = across[0] * down[1] - across[1] * down[0]
-    if area < MIN_AREA:
-        return
-    tx, ty, near = target[at[0], at[1], 0], target[at[0], at[1], 1], inverse_depth[at]
-    reach_x = 0.5 * (abs(across[0]) + abs(down[0])) + SLACK
-    reach_y = 0.5 * (abs(across[1]) + abs(down[1])) + SLACK
-    first, last = max(int(np.ceil(ty - reach_y)), rows[0]), min(int(np.floor(ty + reach_y)) + 1, rows[1])
-    left, right = max(int(np.ceil(tx - reach_x)), 0), min(int(np.floor(tx + reach_x)) + 1, front.shape[1])
-    for y in range(first, last):
-        for x in range(left, right):
-            px, py = x - tx, y - ty
-            u = (px * down[1] - py * down[0]) / area
-            v = (across[0] * py - across[1] * px) / area
-            if abs(u) > 0.5 + SLACK or abs(v) > 0.5 + SLACK:
-                continue
-            here = np.float32(near + u * across[2] + v * down[2])
-            if front[y, x] >= here:
-                continue
-            front[y, x] = here
-            source[y, x, 0] = min(max(at[1] + u, 0.0), inverse_depth.shape[1] - 1.0)
-            source[y, x, 1] = min(max(at[0] + v, 0.0), inverse_depth.shape[0] - 1.0)
+        dx, dy = -ay, ax
+    x, y, near, u, v = middle = _corner(target, inverse_depth, at)
+    beside, under = (x + ax, y + ay, near + an, u + 1.0, v), (x + dx, y + dy, near + dn, u, v + 1.0)
+    _draw((middle, beside, under), True, rows, source, front)
 
 
 @kernel
@@ -158,36 +139,36 @@ def _draw_surface(
     height, width = inverse_depth.shape
     for y in range(height):
         for x in range(width):
-            a = (y, x)
+            a, b, c, d = (y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)
             # Skip pixels without position or depth (NaN).
             if np.isnan(inverse_depth[a] + target[y, x, 0] + target[y, x, 1]):
                 continue
             if _outside_rows(target, a, limits[1], rows):
                 continue
-            right = x + 1 < width and _joined(target, inverse_depth, a, (y, x + 1), limits)
-            below = y + 1 < height and _joined(target, inverse_depth, a, (y + 1, x), limits)
+            right = x + 1 < width and _joined(target, inverse_depth, a, b, limits)
+            below = y + 1 < height and _joined(target, inverse_depth, a, c, limits)
             if x + 1 < width and y + 1 < height:
-                across = _joined(target, inverse_depth, (y + 1, x), (y + 1, x + 1), limits)
-                down = _joined(target, inverse_depth, (y, x + 1), (y + 1, x + 1), limits)
-                corner_a, corner_d = right and below, across and down
-                if corner_a:
-                    _draw_triangle(target, inverse_depth, (y, x, y, x + 1, y + 1, x), rows, source, front)
-                if corner_d:
-                    _draw_triangle(
-                        target, inverse_depth, (y + 1, x + 1, y + 1, x, y, x + 1), rows, source, front
-                    )
+                across = _joined(target, inverse_depth, c, d, limits)
+                down = _joined(target, inverse_depth, b, d, limits)
+                p, q = _corner(target, inverse_depth, a), _corner(target, inverse_depth, b)
+                r, s = _corner(target, inverse_depth, c), _corner(target, inverse_depth, d)
+                both = right and below and across and down
+                if right and below:
+                    _draw((p, q, r), False, rows, source, front)
+                if across and down:
+                    _draw((s, r, q), False, rows, source, front)
                 # These two reach over the diagonal that the others leave.
-                if right and down and not (corner_a and corner_d):
-                    _draw_triangle(target, inverse_depth, (y, x + 1, y + 1, x + 1, y, x), rows, source, front)
-                if below and across and not (corner_a and corner_d):
-                    _draw_triangle(target, inverse_depth, (y + 1, x, y, x, y + 1, x + 1), rows, source, front)
+                if right and down and not both:
+                    _draw((q, s, p), False, rows, source, front)
+                if below and across and not both:
+                    _draw((r, p, s), False, rows, source, front)
             inner = right and below and x > 0 and y > 0
             if not (
                 inner
                 and _joined(target, inverse_depth, a, (y, x - 1), limits)
                 and _joined(target, inverse_depth, a, (y - 1, x), limits)
             ):
-                _draw_footprint((target, inverse_depth), a, limits, rows, (source, front))
+                _draw_footprint(target, inverse_depth, a, limits, rows, source, front)
 
 
 @kernel
@@ -324,7 +305,7 @@ def forward_map(
     front = np.full((size[1], size[0]), np.nan, dtype=np.float32)
     limits = np.array([step, max(STRETCH, ENLARGED * _median_distance(target))])
     run_in_strips(lambda rows: _draw_surface(target, near, limits, rows, source, front), size[1], threads)
-    return source, front
+    return np.clip(source, 0.0, np.array(near.shape[::-1], np.float32) - 1.0, out=source), front
 
 
 def _median_distance(target: F64) -> float:

@@ -9,63 +9,21 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F32, F64, U8
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.imaging.raster import run_in_strips
-from thesisrecon.imaging.resampling import weighted_median
+from thesisrecon.imaging.resampling import bilinear_samples, weighted_median
 from thesisrecon.records import DisparityMap
 from thesisrecon.views._warping import fill_holes, forward_map, sample
 
-ONE_SURFACE_PX = 1.0
-"""Neighbouring disparities that differ by more belong to different surfaces."""
-REACH, STEP = 12, 3
-"""Radius and step of the search for the disparity of a guessed pixel."""
+ONE_SURFACE_PX = 1.0  #: neighbouring disparities that differ by more belong to different surfaces
+REACH, STEP = 12, 3  #: radius and step of the search for the disparity of a guessed pixel
 WINDOW = 2 * REACH // STEP + 1
-NEAR = 2
-"""Radius of the median over guessed pixels."""
-MIN_DEPTH = 0.2
-"""Minimum third coordinate of its corners, in units of that of its centre."""
-SPARSE = 7
-"""Subsampling step for medians."""
+NEAR = 2  #: radius of the median over guessed pixels
+MIN_DEPTH = 0.2  #: minimum third coordinate of its corners, in units of that of its centre
+SPARSE = 7  #: subsampling step for medians
 UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR = 0.01, 0.2, 0.2
 """Blending weight of guessed pixels, minimum of known ones, and factor beside a depth discontinuity."""
-
-
-@kernel
-def disparity_from_rectified(
-    maps: tuple[F32, F32], H: F64, rows: tuple[int, int], places: F64, disparity: F32, sure: F32
-) -> None:
-    """Transfer disparity and confidence from the rectified frame to the pixels of an image.
-
-    ``maps``: disparities without holes, confidences (0 if unknown); H takes the image to the frame.
-    ``places`` (h, w, 2) receives positions in the frame, NaN beyond the line at infinity; ``disparity`` is
-    bilinear on one surface, otherwise nearest; ``sure`` receives the confidence, 0 outside the frame.
-    """
-    field, confidence = maps
-    height, width = field.shape
-    for y in range(rows[0], rows[1]):
-        for x in range(disparity.shape[1]):
-            w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
-            if not w > 0.0:
-                places[y, x] = np.nan
-                disparity[y, x] = np.nan
-                sure[y, x] = 0.0
-                continue
-            px = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w
-            py = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w
-            places[y, x, 0], places[y, x, 1] = px, py
-            inside = px > -0.5 and py > -0.5 and px < width - 0.5 and py < height - 0.5
-            u, v = min(max(px, 0.0), width - 1.0), min(max(py, 0.0), height - 1.0)
-            x0, y0 = min(int(u), max(width - 2, 0)), min(int(v), max(height - 2, 0))
-            x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-            a, b, c, d = field[y0, x0], field[y0, x1], field[y1, x0], field[y1, x1]
-            near_y, near_x = int(np.rint(v)), int(np.rint(u))
-            if max(max(a, b), max(c, d)) - min(min(a, b), min(c, d)) <= ONE_SURFACE_PX:
-                top, bottom = a + (u - x0) * (b - a), c + (u - x0) * (d - c)
-                disparity[y, x] = top + (v - y0) * (bottom - top)
-            else:
-                disparity[y, x] = field[near_y, near_x]
-            sure[y, x] = confidence[near_y, near_x] if inside else 0.0
 
 
 @kernel
@@ -105,91 +63,44 @@ def filter_extrapolated_by_colour(
                 out[y, x] = weighted_median(values[:n], weights[:n], np.argsort(values[:n]), 0.5 * total)
 
 
-@kernel
-def filter_extrapolated_by_median(disparity: F32, sure: F32, rows: tuple[int, int], out: F32) -> None:
-    """Replace disparities of confidence 0 by the median of their neighbours."""
-    height, width = disparity.shape
-    values = empty((2 * NEAR + 1) ** 2, np.float32)
-    for y in range(rows[0], rows[1]):
-        for x in range(width):
-            out[y, x] = disparity[y, x]
-            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
-                continue
-            n = 0
-            for v in range(max(y - NEAR, 0), min(y + NEAR + 1, height)):
-                for u in range(max(x - NEAR, 0), min(x + NEAR + 1, width)):
-                    if not np.isnan(disparity[v, u]):
-                        values[n] = disparity[v, u]
-                        n += 1
-            if values[:n].max() - values[:n].min() > ONE_SURFACE_PX:
-                out[y, x] = np.sort(values[:n])[n // 2]
+def filter_extrapolated_by_median(disparity: F32, sure: F32) -> F32:
+    """Replace disparities of confidence 0 by the median of their neighbours if these differ."""
+    out, padded = disparity.copy(), np.pad(disparity, NEAR, constant_values=np.nan)
+    y, x = np.nonzero((sure <= 0.0) & ~np.isnan(disparity))
+    # Sorted, unknown pixels come last.
+    around = np.sort([padded[y + b, x + a] for b in range(2 * NEAR + 1) for a in range(2 * NEAR + 1)], axis=0)
+    n, known = np.arange(len(y)), np.isfinite(around).sum(axis=0)
+    differ = around[known - 1, n] - around[0] > ONE_SURFACE_PX
+    out[y[differ], x[differ]] = around[known // 2, n][differ]
+    return out
 
 
-@kernel
-def intermediate_positions(
-    places: F64, disparity: F32, share: float, G: F64, rows: tuple[int, int], target: F64
-) -> None:
-    """Move pixels at ``places`` left by a share of their disparity and map them by G to the view."""
-    for y in range(rows[0], rows[1]):
-        for x in range(disparity.shape[1]):
-            u, v = places[y, x, 0] - share * disparity[y, x], places[y, x, 1]
-            w = G[2, 0] * u + G[2, 1] * v + G[2, 2]
-            if w > 0.0:
-                target[y, x, 0] = (G[0, 0] * u + G[0, 1] * v + G[0, 2]) / w
-                target[y, x, 1] = (G[1, 0] * u + G[1, 1] * v + G[1, 2]) / w
-            else:
-                target[y, x] = np.nan
-
-
-@kernel
-def _at(values: F32, source: F32, y: int, x: int) -> float:
-    """The value (h, w) of the pixel nearest to the source (H, W, 2) of a pixel."""
-    v = min(max(int(np.rint(source[y, x, 1])), 0), values.shape[0] - 1)
-    u = min(max(int(np.rint(source[y, x, 0])), 0), values.shape[1] - 1)
-    return float(values[v, u])
-
-
-@kernel
 def blend(
     colors: tuple[F32, F32],
     fronts: tuple[F32, F32],
-    sources: tuple[F32, F32],
     weights: tuple[F32, F32],
     limits: tuple[float, float, float],
     out: tuple[F32, F32],
 ) -> None:
-    """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and positions ``sources``.
+    """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and ``weights`` (H, W).
 
     Where both inverse depths agree, the weighted mean is used. Otherwise known pixels replace guessed ones,
-    the nearer of two known pixels is used, and the farther of two guessed ones. ``weights`` (h, w) belong to
-    the source pixels; ``limits``: tolerance of inverse depth, weight up to which a pixel is guessed, and s.
+    the nearer of two known pixels is used, and the farther of two guessed ones. ``limits``: tolerance of
+    inverse depth, weight up to which a pixel is guessed, and s.
     """
     alike, guess, s = limits
-    rgb, near = out
-    for y in range(near.shape[0]):
-        for x in range(near.shape[1]):
-            n0, n1 = fronts[0][y, x], fronts[1][y, x]
-            if np.isnan(n0) and np.isnan(n1):
-                rgb[y, x] = np.nan
-                near[y, x] = np.nan
-                continue
-            w0 = 0.0 if np.isnan(n0) else _at(weights[0], sources[0], y, x)
-            w1 = 0.0 if np.isnan(n1) else _at(weights[1], sources[1], y, x)
-            if w0 > 0.0 and w1 > 0.0 and abs(n0 - n1) > alike:
-                sure0, sure1 = w0 > guess, w1 > guess
-                first = n0 > n1 if sure0 and sure1 else (n0 < n1 if sure0 == sure1 else sure0)
-                w0, w1 = (w0, 0.0) if first else (0.0, w1)
-            if w0 > 0.0 and w1 > 0.0:
-                w0, w1 = (1.0 - s) * w0, s * w1
-            t = w1 / (w0 + w1)
-            for c in range(rgb.shape[2]):
-                if t == 0.0:
-                    rgb[y, x, c] = colors[0][y, x, c]
-                elif t == 1.0:
-                    rgb[y, x, c] = colors[1][y, x, c]
-                else:
-                    rgb[y, x, c] = (1.0 - t) * colors[0][y, x, c] + t * colors[1][y, x, c]
-            near[y, x] = n0 if w0 >= w1 else n1
+    (n0, n1), (w0, w1), (first, second) = fronts, weights, colors
+    with np.errstate(invalid="ignore"):
+        # Comparisons with NaN are false.
+        apart, nearer = np.abs(n0 - n1) > alike, n0 > n1
+        sure0, sure1 = w0 > guess, w1 > guess
+        second_only = np.where(sure0 == sure1, nearer != sure0, sure1)
+        t = s * w1 / ((1.0 - s) * w0 + s * w1)
+    empty0, empty1 = np.isnan(n0), np.isnan(n1)
+    t = np.select([empty0 & empty1, empty0, empty1, apart], [np.nan, 1.0, 0.0, second_only], t)[..., None]
+    # Weights of 0 must not meet NaN.
+    mixed = (1.0 - t) * np.where(t < 1.0, first, 0.0) + t * np.where(t > 0.0, second, 0.0)
+    out[0][:], out[1][:] = mixed, np.where(t[..., 0] <= 0.5, n0, n1)
 
 
 def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
@@ -297,13 +208,8 @@ class InterpolatedPair:
         dark, bright = 8.0, 247.0  # Range of levels used for the ratio of exposures
         first = self._sides[0]
         grid = np.ix_(range(0, self.size[1], SPARSE), range(0, self.size[0], SPARSE))
-        places = first.places[grid].copy()
-        places[..., 0] -= first.disparity[grid]
-        back = np.linalg.inv(self.H[1])
-        at = np.concatenate([places, np.ones((*places.shape[:2], 1))], axis=2) @ back.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            source = np.where(at[..., 2:] > 0.0, at[..., :2] / at[..., 2:], np.nan).astype(np.float32)
-        levels = first.levels[grid], sample(self._sides[1].levels, source)
+        source = map_in_front(np.linalg.inv(self.H[1]), _shifted(first.places[grid], first.disparity[grid]))
+        levels = first.levels[grid], sample(self._sides[1].levels, source.astype(np.float32))
         known = first.weight[grid] > UNKNOWN_WEIGHT
         with np.errstate(invalid="ignore"):
             for level in levels:
@@ -326,27 +232,26 @@ class InterpolatedPair:
         """Colours (h, w, 3) and disparities (h, w), NaN where neither image shows the scene."""
         same_surface_px = 1.5  # Largest difference of disparity between pixels of one surface
         warped = [self._warped(side, s, threads) for side in (0, 1)]
-        weights = self._sides[0].weight, self._sides[1].weight
-        limits = same_surface_px, 1.5 * UNKNOWN_WEIGHT, s
+        limits = same_surface_px, 1.5 * UNKNOWN_WEIGHT, np.float64(s)
         out = np.empty_like(warped[0][0]), np.empty_like(warped[0][1])
 
         def work(rows: tuple[int, int]) -> None:
             part = slice(*rows)
-            colors, near, sources = ((a[part], b[part]) for a, b in zip(*warped, strict=True))
-            blend(colors, near, sources, weights, limits, (out[0][part], out[1][part]))
+            colors, near, weights = ((a[part], b[part]) for a, b in zip(*warped, strict=True))
+            blend(colors, near, weights, limits, (out[0][part], out[1][part]))
 
         run_in_strips(work, self.size[1], threads)
         return out
 
     def _warped(self, side: int, s: float, threads: int) -> tuple[F32, F32, F32]:
-        """Image ``side`` in the view at s: colours with its exposure, disparities and source pixels."""
-        this = self._sides[side]
-        target = np.empty_like(this.places)
+        """Image ``side`` in the view at s: colours with its exposure, disparities and blending weights."""
+        this, share = self._sides[side], s - side
         G = original_from_rectified(self.H, self.size, s)
-        share = s - side
+        target = np.empty_like(this.places)
 
         def move(rows: tuple[int, int]) -> None:
-            intermediate_positions(this.places, this.disparity, share, G, rows, target)
+            part = slice(*rows)
+            target[part] = map_in_front(G, _shifted(this.places[part], share * this.disparity[part]))
 
         run_in_strips(move, self.size[1], threads)
         source, near = forward_map(
@@ -354,7 +259,13 @@ class InterpolatedPair:
         )
         colors = sample(this.levels, source, threads=threads)
         colors *= self.gain ** np.float32(share)
-        return colors, near, source
+        x, y = np.rint(np.nan_to_num(source)).astype(np.int64).transpose(2, 0, 1)
+        return colors, near, this.weight[y, x]
+
+
+def _shifted(places: F64, disparity: F32 | F64) -> F64:
+    """Positions (..., 2) moved left by disparities (...)."""
+    return np.stack([places[..., 0] - disparity, places[..., 1]], axis=-1)
 
 
 def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
@@ -363,20 +274,23 @@ def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     colour = 30.0
     guess_weight = 0.5  # Weight of guessed disparities relative to known ones in the median
     # Without any known disparity the views are cross-dissolved.
-    maps = np.nan_to_num(_with_all_rows(found.filled())), np.ascontiguousarray(found.confidence)
-    shape = image.shape[:2]
-    places = np.empty((*shape, 2))
-    disparity, sure = (np.empty(shape, dtype=np.float32) for _ in range(2))
-    disparity_from_rectified(maps, np.ascontiguousarray(H), (0, shape[0]), places, disparity, sure)
+    field, shape = np.nan_to_num(_with_all_rows(found.filled())), image.shape[:2]
+    places = map_in_front(H, np.stack(np.indices(shape, dtype=np.float64)[::-1], axis=-1))
+    last = np.array(field.shape[::-1]) - 1.0
+    inside = ((places > -0.5) & (places < last + 0.5)).all(axis=2)
+    x, y = np.clip(np.nan_to_num(places), 0.0, last).transpose(2, 0, 1)
+    between, spread = (part[..., 0] for part in bilinear_samples(field[..., None], x, y))
+    nearest = np.rint(y).astype(np.int64), np.rint(x).astype(np.int64)
+    disparity = np.where(spread <= ONE_SURFACE_PX, between, field[nearest]).astype(np.float32)
+    disparity[np.isnan(places[..., 0])] = np.nan
+    sure = np.where(inside, found.confidence[nearest], 0.0).astype(np.float32)
     levels, filtered = image.astype(np.float32), np.empty_like(disparity)
 
     def by_colour(rows: tuple[int, int]) -> None:
         filter_extrapolated_by_colour(levels, disparity, sure, rows, (colour, guess_weight), filtered)
 
     run_in_strips(by_colour, shape[0], preparing)
-    run_in_strips(
-        lambda rows: filter_extrapolated_by_median(filtered, sure, rows, disparity), shape[0], preparing
-    )
+    disparity = filter_extrapolated_by_median(filtered, sure)
     return _Side(levels, places, disparity, _blending_weights(disparity, sure))
 
 

@@ -15,12 +15,10 @@ TILT_WEIGHT = 0.02
 """Squared ratio of typical roll to typical tilt of hand-held cameras (about 3 and 20 degrees)."""
 GROWTH = 1.1 ** np.arange(13)
 """Radius factors, tried in this order until the orbit keeps clear of the model and shows it."""
-SHOWN = 0.9
-"""Minimum visible share of the model, in units of the median over the cameras."""
+SHOWN = 0.9  #: minimum visible share of the model, in units of the median over the cameras
 TURNING = 3.0
 """Where the rotation per path length exceeds this multiple of its mean, it determines the speed."""
-SAMPLE = 5000
-"""Model points that are used to choose an orbit."""
+SAMPLE = 5000  #: model points that are used to choose an orbit
 
 
 def _fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:

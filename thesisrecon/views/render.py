@@ -24,10 +24,8 @@ from thesisrecon.imaging.raster import (
 )
 from thesisrecon.records import RenderedView, TexturedMesh
 
-STRIP = 16
-"""Rows that are coloured at a time, so that intermediate arrays stay in cache."""
-PART_SAMPLES = 2**21
-"""Samples that are rasterised at a time in each thread: one takes 20 bytes."""
+STRIP = 16  #: rows that are coloured at a time, so that intermediate arrays stay in cache
+PART_SAMPLES = 2**21  #: samples that are rasterised at a time in each thread: one takes 20 bytes
 
 
 @kernel

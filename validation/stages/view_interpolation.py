@@ -17,8 +17,14 @@ from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from thesisrecon.views import render as similarity
-from thesisrecon.views.tensor import CalibratedPair, camera_at, default_intrinsics
-from thesisrecon.views.tensor_synthesis import AGREE_PX, TensorSynthesis, prepare_synthesis
+from thesisrecon.views.tensor import (
+    AGREE_PX,
+    CalibratedPair,
+    TensorSynthesis,
+    camera_at,
+    default_intrinsics,
+    prepare_synthesis,
+)
 from validation.references.libraries import one_thread
 from validation.references.opencv import OpenCVSemiGlobal
 from validation.runs.records import Judgement, Outcome, Picture, ReportOptions, Stage, Task
