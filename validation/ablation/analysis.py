@@ -77,8 +77,10 @@ def analyse(rows: Rows) -> Analysis:
     others = [(name, plan.baseline) for name in names if name != plan.baseline]
     steps = list(zip(names[1:], names, strict=False)) if plan.study.mode == "ladder" else []
     cells = tuple(cell for m in plan.measures for cell in _cells(table, m))
-    compared = (tuple(c for m in plan.measures for c in _comparisons(table, m, p)) for p in (others, steps))
-    return Analysis(plan, rows, cells, *compared, tuple(_warnings(rows)))
+    compared, by_step = (
+        tuple(c for m in plan.measures for c in _comparisons(table, m, pairs)) for pairs in (others, steps)
+    )
+    return Analysis(plan, rows, cells, compared, by_step, tuple(_warnings(rows)))
 
 
 class _Table:
@@ -236,9 +238,10 @@ def measure_table(analysis: Analysis, measure: Measure) -> tuple[list[str], list
     baseline and, in a ladder, from the step before. Under several: the means with their verdicts.
     """
     plan = analysis.plan
-    cells, found, steps = (
+    cells = {(c.variant, c.condition): c for c in analysis.cells if c.measure == measure}
+    found, steps = (
         {(c.variant, c.condition): c for c in some if c.measure == measure}
-        for some in (analysis.cells, analysis.comparisons, analysis.steps)
+        for some in (analysis.comparisons, analysis.steps)
     )
     several = len(plan.conditions) > 1
     head = [f"{measure.name}, {measure.unit}" if measure.unit else measure.name]

@@ -224,7 +224,7 @@ def _comparison_record(c: Comparison) -> Mapping[str, Any]:
 def write_tables(analysis: Analysis, out: Path) -> list[Path]:
     """Write ``rows``, ``comparisons`` and ``means`` as CSV, and the tables for people as ``tables.md``."""
     write_text(out / "tables.md", f"{stamp()}\n\n{text_of(analysis)}\n")
-    tables = {
+    tables: dict[str, list[Mapping[str, Any]]] = {
         "rows": _row_records(analysis),
         "comparisons": [_comparison_record(c) for c in (*analysis.comparisons, *analysis.steps)],
         "means": [{**vars(c), "measure": c.measure.name, "unit": c.measure.unit} for c in analysis.cells],

@@ -100,8 +100,8 @@ class Stage(Protocol):
     """
 
     name: str
-    title: str
-    definition: str
+    title: str = ""
+    definition: str = ""
     scenes: tuple[str, ...] = ()
     own: bool = False
     always: tuple[str, ...] = ()

@@ -32,8 +32,8 @@ from validation.runs.study import Part
 from validation.runs.tables import text_table
 from validation.scenes.many_views import walk, walk_street, write_street, write_views
 
-STAGES = ("images", "features", "pairs", "matches", "tracks", "projective")
-STAGES += ("selfcalibration", "metric", "dense", "model", "outputs")
+STAGES = ["images", "features", "pairs", "matches", "tracks", "projective"]
+STAGES += ["selfcalibration", "metric", "dense", "model", "outputs"]
 AFTER = {"matches": "tracks", "metric": "outputs", "model": "outputs"}
 """Stage that reports its end -> the following stage, which does not report its beginning."""
 
