@@ -280,7 +280,7 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
     R = _triad(Y) @ _triad(X).swapaxes(1, 2)
     t = Y.mean(axis=1) - np.einsum("bij,bj->bi", R, X.mean(axis=1))
     # The triads of points on one line, as of equal rays, are no bases.
-    return np.concatenate([R, t[:, :, None]], axis=2)[np.linalg.det(R) > 0.5]
+    return np.asarray(np.concatenate([R, t[:, :, None]], axis=2)[np.linalg.det(R) > 0.5])
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:

@@ -237,7 +237,7 @@ def corners_from_matches(
     does not depend on the order of the pairs, and the pairs with ``index1`` and ``index2``. A corner is at
     most once in a pair: only its match with the least distances from the corners stays.
     """
-    ends = [xy for p in pairs for xy in (p.xy1, p.xy2)]
+    ends: list[F64] = [xy for p in pairs for xy in (p.xy1, p.xy2)]
     lengths = [len(xy) for xy in ends]
     view = np.repeat(np.array([i for p in pairs for i in (p.i, p.j)], dtype=np.int64), lengths)
     xy, number = np.concatenate([np.empty((0, 2)), *ends]), np.empty(len(view), np.int64)

@@ -150,7 +150,7 @@ def _assess(
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
     return MetricResult(
-        _as_reconstruction(model, reasons), intervals, check, not failed_checks, tuple(failed_checks),
+        _as_reconstruction(model, reasons), tuple(intervals), check, not failed_checks, tuple(failed_checks),
         warnings, (*enlarged, *limitations), report, poses,
     )  # fmt: skip
 

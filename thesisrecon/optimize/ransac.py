@@ -32,4 +32,4 @@ def search_models(
             least, best = float(cost.min()), models[cost.argmin()]
         if drawn * np.log1p(-min((1.0 - least) ** size, 1.0 - 1e-9)) < np.log(risk):
             break
-    return best
+    return np.asarray(best)

@@ -131,7 +131,9 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             colors=colors,
             affine=affine,
             model=made("the model in report.html", for_page.result, warnings, None),
-            depths=made("a depth map in report.html", lambda: _thinned_maps(result), warnings, {}),
+            depths=made(
+                "a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]()
+            ),
             until=None if until == "model" else until,
             end=failure,
         )

@@ -386,7 +386,7 @@ class ParallelLines:
 def _points_at_infinity(P: F64, v: F64) -> F64:
     """Triangulated points (D', 4) of the directions that vanishing points v (V, D, 3) in P determine."""
     v = v / np.linalg.norm(v, axis=2, keepdims=True)
-    seen = np.isfinite(v).all(axis=2)
+    seen: B8 = np.asarray(np.isfinite(v).all(axis=2))
     used = np.flatnonzero(seen.sum(axis=0) >= 2)
     found = [_triangulate_directions(P[None, seen[:, d]], v[None, seen[:, d], d]) for d in used]
     X = [point for points, determined in found for point in points[determined]]

@@ -97,7 +97,7 @@ def update_kalman(state: InverseDepth, new: tuple[F32, F32], alive: B8) -> None:
 
 
 @kernel
-def _projected(to: F64, u: int, v: int, z: float) -> tuple[float, float, float]:
+def _projected(to: F64, u: float, v: float, z: float) -> tuple[float, float, float]:
     """Pixel and depth in another view of a pixel at depth z."""
     w = z * (to[2, 0] * u + to[2, 1] * v + to[2, 2]) + to[2, 3]
     x = (z * (to[0, 0] * u + to[0, 1] * v + to[0, 2]) + to[0, 3]) / w

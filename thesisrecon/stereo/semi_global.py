@@ -329,7 +329,8 @@ class SemiGlobalMatching:
             own = found[:, start:stop]
             _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
-        return self._postprocess(*found, _postprocessing.texture_of(images[0], measured))
+        left, right, confidence = found
+        return self._postprocess(left, right, confidence, _postprocessing.texture_of(images[0], measured))
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""

@@ -117,7 +117,7 @@ def _certain_maps(
 
 def _rays(P: F64) -> tuple[F64, F64]:
     """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
-    directions = np.linalg.inv(P[:, :3])
+    directions: F64 = np.asarray(np.linalg.inv(P[:, :3]), dtype=np.float64)
     return directions, -directions @ P[:, 3]
 
 

@@ -275,7 +275,7 @@ def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     guess_weight = 0.5  # Weight of guessed disparities relative to known ones in the median
     # Without any known disparity the views are cross-dissolved.
     field, shape = np.nan_to_num(_with_all_rows(found.filled())), image.shape[:2]
-    places = map_in_front(H, np.stack(np.indices(shape, dtype=np.float64)[::-1], axis=-1))
+    places = map_in_front(H, np.moveaxis(np.indices(shape, dtype=np.float64)[::-1], 0, -1))
     last = np.array(field.shape[::-1]) - 1.0
     inside = ((places > -0.5) & (places < last + 0.5)).all(axis=2)
     x, y = np.clip(np.nan_to_num(places), 0.0, last).transpose(2, 0, 1)
