@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -168,7 +168,7 @@ class MultiScaleCorners:
         return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]
 
     def _seeds(self, levels: list[_PyramidLevel], found: list[tuple[F64, F32]]) -> Seeds:
-        upright, turned = list[tuple[F64, ...]](), list[tuple[F64, ...]]()
+        upright, turned = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         for index, (level, (corners, response)) in enumerate(zip(levels, found, strict=True)):
             kept = self._select(corners, response, int(self.seeds_per_level / np.sqrt(2.0) ** index))
             xy = level.to_image(corners[kept])

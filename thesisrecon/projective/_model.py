@@ -23,7 +23,6 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.
 NO_PARALLAX = 0.95
-MORE_OVERLAP = "take images that overlap by more than half and show texture"
 _NO_PARALLAX_REASONS = {
     "pure rotation": "the camera only rotated about its centre (pure rotation)",
     "plane": (

@@ -20,7 +20,6 @@ from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.noise import noise_from_distances
 from thesisrecon.projective._model import (
-    MORE_OVERLAP,
     NO_PARALLAX,
     ProjectiveModel,
     adjust_all,
@@ -143,7 +142,10 @@ class Factorization:
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             found = f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted"
-            raise StageFailure("no initial pair is left for the factorization", found, MORE_OVERLAP)
+            raise StageFailure(
+                "no initial pair is left for the factorization", found,
+                "take images that overlap by more than half and show texture",
+            )  # fmt: skip
         selected, keep = working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)

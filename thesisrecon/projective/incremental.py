@@ -21,7 +21,6 @@ from thesisrecon.optimize.bundle.partial import refine_camera
 from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
-    MORE_OVERLAP,
     ProjectiveModel,
     adjust_all,
     adjust_locally,
@@ -123,7 +122,8 @@ class IncrementalProjective:
         ranked = rank_initial_pairs(tracks, inside)
         if not ranked:
             found = f"none of {counted(len(pairs), 'pair')} was verified"
-            raise StageFailure("no image pair was accepted", found, MORE_OVERLAP)
+            advice = "take images that overlap by more than half and show texture"
+            raise StageFailure("no image pair was accepted", found, advice)
         require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             tried = f"all {len(ranked)} accepted image pairs were tried"

@@ -101,7 +101,8 @@ def _descend(
     for _ in range(iterations):
         N, g = normal_equations(x)
         diagonal = np.einsum("bii->bi", N)
-        N = N + damped[:, None, None] * np.eye(x.shape[1]) * (diagonal + 1e-12)[:, None, :]
+        # Products with an identity matrix would be NaN where the diagonal is infinite.
+        diagonal += damped[:, None] * (diagonal + 1e-12)
         trial = project(x - _solve_batch(N, g))
         trial_cost = cost_of(trial)
         better = np.asarray(trial_cost < cost)

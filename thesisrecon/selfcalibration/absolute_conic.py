@@ -255,8 +255,8 @@ def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | Non
         found = f"singular values {s[4] / max(s[0], 1e-300):.1e} and {s[5] / max(s[0], 1e-300):.1e} of 1"
     if angle < 1.0:
         reason = "the cameras do not rotate, so the plane at infinity does not determine the calibration"
-        found = f"largest rotation {angle:.1f} deg; {found}"
-        return StageFailure(reason, found, "rotate the camera between images")
+        evidence = f"largest rotation {angle:.1f} deg; {found}"
+        return StageFailure(reason, evidence, "rotate the camera between images")
     pixel = frame.pixel_from_unit[frame.views[frame.reference]] @ axis
     with np.errstate(divide="ignore", invalid="ignore"):
         place = pixel[:2] / pixel[2]
