@@ -39,8 +39,10 @@ def self_calibrate(
 
     Parameters
     ----------
-    reconstruction, sizes : Reconstruction or ndarray (V, 3, 4), array_like (V, 2) or (2,)
-        Projective reconstruction of at least three views, or P alone with image width and height.
+    reconstruction : Reconstruction or ndarray (V, 3, 4)
+        Projective reconstruction of at least three views, or their cameras P alone.
+    sizes : array_like (V, 2) or (2,)
+        Image width and height, for plain P.
     X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
         Points and their pixels for plain P, as in :func:`thesisrecon.reconstruction_from_cameras`. Without
         them the world may be mirrored, and noise is not considered.
@@ -61,7 +63,8 @@ def self_calibrate(
     Raises
     ------
     ValueError, StageFailure
-        If an argument is invalid; if no calibration is determined.
+        If the reconstruction is not projective, the method is unknown or the seed is invalid; if no
+        calibration is determined.
 
     Examples
     --------
@@ -99,14 +102,20 @@ def absolute_dual_quadric(
     Parameters
     ----------
     reconstruction, sizes, X, xy, config
-        As for :func:`self_calibrate`, which raises the same.
+        As for :func:`self_calibrate`.
     method : {"nonlinear", "linear"}
-        Least squares over all unknown intrinsics, or linear equations, which are biased for most lenses.
+        Nonlinear least squares over all unknown intrinsics, or linear equations, which are biased for most
+        lenses.
 
     Returns
     -------
     SelfCalibration
         ``Q`` (4, 4), ``K`` (V, 3, 3), ``identifiable``, ``reasons`` and the rest.
+
+    Raises
+    ------
+    ValueError, StageFailure
+        As :func:`self_calibrate`.
 
     Examples
     --------
@@ -182,28 +191,37 @@ def upgrade_affine(
 ) -> Reconstruction:  # fmt: skip
     """Upgrade a projective reconstruction to an affine one (3.4.3, chapter 7).
 
+    Parallel lines and ratios of lengths along them are then those of the scene.
+
     Parameters
     ----------
-    reconstruction, plane : Reconstruction, ndarray (4,)
-        Projective reconstruction, and its plane at infinity (None: located by :func:`plane_at_infinity`).
+    reconstruction : Reconstruction
+        Projective reconstruction.
+    plane : ndarray (4,), optional
+        Plane at infinity in the projective frame; None: located by :func:`plane_at_infinity`.
     config, images, seed
         As for :func:`self_calibrate`.
 
     Returns
     -------
     Reconstruction
-        Parallel lines, and ratios of lengths along them, are those of the scene.
+        The same cameras and points in an affine frame.
 
     Raises
     ------
     ValueError, StageFailure
-        If an argument is invalid; if the plane at infinity cannot be located.
+        If the reconstruction is not projective, the plane is zero or not finite, or the seed is invalid; if
+        the plane at infinity cannot be located.
 
     Examples
     --------
-    ``projective`` as in the example of `thesisrecon.self_calibrate`:
-
-    >>> from thesisrecon import upgrade_affine
+    >>> import numpy as np
+    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
+    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
+    >>> projective = Reconstruction(
+    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
+    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
+    ... )
     >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
     >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
     ('affine', True)
@@ -261,12 +279,15 @@ def _method(
 def kruppa(F: F64, sizes: I64) -> F64:
     """Calibrate one constant camera from fundamental matrices alone, by the Kruppa equations (section 7.3).
 
-    Square pixels without skew and a principal point within about 1 % of the image centre are assumed.
+    Square pixels without skew and a principal point within about 1 % of the image centre are assumed. F is
+    normalised first; :class:`KruppaEquations` also allows different cameras.
 
     Parameters
     ----------
-    F, sizes : ndarray (M, 3, 3) or (3, 3), array_like (2,) or (V, 2)
-        Fundamental matrices of M pairs of images of the camera, px; their width and height, all equal.
+    F : ndarray (M, 3, 3) or (3, 3)
+        Fundamental matrices of M pairs of images of the camera, px.
+    sizes : array_like (2,) or (V, 2)
+        Width and height of the images, all equal.
 
     Returns
     -------
@@ -275,8 +296,10 @@ def kruppa(F: F64, sizes: I64) -> F64:
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if the focal length is not determined, or has several solutions.
+    ValueError
+        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
+    StageFailure
+        If the equations do not determine the focal length, or have several solutions.
 
     Examples
     --------

@@ -91,31 +91,44 @@ def bundle_adjust(
     cameras : sequence of Camera, tuple (K, R, t) or Reconstruction
         Initial cameras; or K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
         reconstruction: its registered views and, if X and xy are not given, its valid points and inliers.
-    X, xy, sizes : ndarray (N, 3), ndarray (V, N, 2) or Tracks or Observations, array_like (V, 2) or (2,)
-        Initial points; their pixels, NaN = not seen, or a list with ``view_index``, ``point_index`` and
-        ``xy``; image width and height, for plain arrays.
+    X : ndarray (N, 3)
+        Initial points.
+    xy : ndarray (V, N, 2), Tracks or Observations
+        Pixels of the points, NaN = not seen; or a list with ``view_index``, ``point_index`` and ``xy``.
+    sizes : array_like (V, 2) or (2,), optional
+        Image width and height, for plain arrays.
     shared : bool or ndarray (V,) of int
-        Whether images of the same size share their free intrinsics, from their mean; or camera numbers.
-    free, prior : sequence of str, mapping of str to float
-        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3"; and standard
-        deviations of these about the given cameras: relative for "focal", px for "principal_point", "skew".
-    loss, loss_px, sigma_px : {"huber", "squared"}, float, float
-        Loss; the residual at which Huber's becomes linear (None: two standard deviations of the noise); the
-        standard deviation of one image coordinate (None: estimated from the residuals).
+        True: images of the same size share their free intrinsics, which start at their mean; False: each
+        image has its own; or a camera number per image.
+    free : sequence of str
+        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
+    prior : mapping of str to float, optional
+        Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
+        relative for "focal", in pixels for "principal_point" and "skew".
+    loss, loss_px : {"huber", "squared"}, float
+        Loss, and the residual at which Huber's loss becomes linear (None: two standard deviations of the
+        noise).
+    sigma_px : float, optional
+        Standard deviation of one image coordinate. None: estimated from the residuals.
     max_iterations : int
         Maximum number of linear solves; if they do not suffice, ``converged`` is false.
 
     Returns
     -------
     BundleAdjustment
-        Cameras, points, residuals, and covariances of the linearised problem at the minimum; poses and points
-        without observations are unchanged.
+        Cameras, points, residuals and covariances; poses and points without observations are unchanged.
 
     Raises
     ------
     ValueError
         If the arrays do not fit together, pixels lie far outside their images, most points lie behind the
         cameras, there are fewer equations than unknowns, or an option is invalid.
+
+    Notes
+    -----
+    The covariances are those of the linearised problem at the minimum, with the noise estimated from the
+    residuals (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the
+    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
 
     Examples
     --------
@@ -273,7 +286,8 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
 def cheirality(P: F64, X: F64) -> F64:
     """Return chi = det(M)^(1/3) W / t (3.27), positive in front of the camera, 0 at infinity.
 
-    The scales of X and P do not matter; the magnitude is an inverse depth (the thesis takes it for a depth).
+    The scales of X and P do not matter, negative ones included. The magnitude is an inverse depth (the thesis
+    takes it for a depth), without a unit if P is not normalised.
 
     Parameters
     ----------
@@ -305,11 +319,14 @@ def resect(
 
     Parameters
     ----------
-    X, xy, K : array_like (N, 3), (N, 2) and (3, 3)
-        Points, N >= 6 (N >= 4 with K), and their pixels; the calibration matrix (None: estimated, which needs
-        points off one plane).
-    threshold_px, seed : float or None, int or numpy.random.Generator
-        Reprojection error of an inlier during the search (None: all points are inliers); the random seed.
+    X, xy : array_like (N, 3) and (N, 2)
+        Points, N >= 6 (N >= 4 with K), and their pixels.
+    K : ndarray (3, 3), optional
+        Calibration matrix; None: estimated, which needs points off one plane.
+    threshold_px : float or None
+        Reprojection error of an inlier during the search; None: all points are inliers.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
 
     Returns
     -------
@@ -318,9 +335,12 @@ def resect(
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if there are too few points or inliers, all points lie in one plane and K
-        is not given, or points are behind the camera that fits them, as in left-handed coordinates.
+    ValueError
+        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
+        lengths and K33 = 1.
+    StageFailure
+        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
+        behind the camera that fits them, as in left-handed coordinates.
 
     Examples
     --------
@@ -366,7 +386,7 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     Raises
     ------
     ValueError
-        If an argument is invalid or infinite.
+        Unknown method, wrong shapes, infinite pixels, or unsuitable cameras.
 
     Examples
     --------
@@ -395,22 +415,24 @@ def reconstruction_from_cameras(
     *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
     stratum: Stratum = "metric", sigma_px: float = 1.0,
 ) -> Reconstruction:  # fmt: skip
-    """Return the reconstruction of plain arrays, in which all views are registered.
+    """Return the reconstruction of plain arrays.
 
     Parameters
     ----------
     *cameras : ndarray
         P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
-    sizes, X, xy : array_like (V, 2) or (2,), ndarray (N, 3) or (N, 4), ndarray (V, N, 2)
-        Image width and height; points (None: triangulated), and their pixels, NaN where not observed.
+    sizes : array_like (V, 2) or (2,)
+        Image width and height.
+    X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
+        Points, and their pixels, NaN where not observed; X None: triangulated from xy.
     stratum, sigma_px : {"metric", "affine", "projective"}, float
         Frame of P, and the noise of one image coordinate.
 
     Returns
     -------
     Reconstruction
-        ``ValueError`` if the arrays do not fit together, K is no calibration matrix or R no rotation as in
-        :class:`thesisrecon.Camera`, or pixels lie far outside their images.
+        All views registered; ``ValueError`` if the arrays do not fit together, K is no calibration matrix
+        or R no rotation as in :class:`thesisrecon.Camera`, or pixels lie far outside their images.
 
     Examples
     --------

@@ -90,17 +90,23 @@ def export(
 
     Parameters
     ----------
-    model, out : SparseModel or RunResult or path, path
-        A model, a run or its output folder, or a COLMAP model; the folder of the export, created if missing.
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+    out : path
+        Folder of the export; created if missing.
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
         of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
-    images, masks : path, optional
-        Folders of the original images (those of a COLMAP model are used as stored, without EXIF rotation) and
-        of their masks; None: those that the run was made from. Transparent pixels are masked too.
-    threads, overwrite : int, bool
-        Number of images that are undistorted at the same time (0: one per processor); replace files of the
-        same names that thesisrecon did not write, or that were changed since.
+    images : path, optional
+        Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
+        are used as stored, without EXIF rotation.
+    masks : path, optional
+        Folder of the masks of the original images; None: that of the run, if it had masks. Transparent pixels
+        of the images are masked too.
+    threads : int
+        Number of images that are undistorted at the same time; 0: one per processor.
+    overwrite : bool
+        Replace files of the same names that thesisrecon did not write, or that were changed since.
 
     Returns
     -------
@@ -359,7 +365,8 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     Raises
     ------
     ValueError, UsageError, OutputError
-        If the mesh is invalid; if the name does not end in .glb; if the file cannot be written.
+        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
+        cannot be written.
 
     Examples
     --------

@@ -68,20 +68,29 @@ def reconstruct_from_matches(
     matches : mapping
         (i, j) -> (M, 2) rows of ``keypoints[i]`` and ``keypoints[j]``; or a pair of (M, 2) positions in
         images i and j, which are joined to tracks where they lie within a pixel of each other.
-    sizes, out, names : array_like (V, 2), path, sequence of V str
-        Width and height of the images; the output folder (None: no files are kept); the names of the images
-        (by default "image-0" and so on).
+    sizes : array_like (V, 2)
+        Width and height of the images.
+    out : path, optional
+        Output folder, as for :func:`reconstruct`; None: no files are kept.
+    names : sequence of V str, optional
+        Names of the images; by default "image-0" and so on.
     images : path, or sequence of V path, array or Image, optional
-        For colours, depth maps and the textured model: a folder with files of these names, or the images.
+        The images, for colours, depth maps and the textured model: a folder with files of these names, or the
+        images in the order of the keypoints.
     **options
-        As for :func:`reconstruct`, except ``pairs`` and ``every``; ``masks``: matches in masked pixels are
-        dropped; ``until``: "metric" without images.
+        As for :func:`reconstruct`: ``config``, ``seed``, ``progress``, ``preset``, ``max_size``, ``cameras``,
+        ``set``, ``masks`` (matches in masked pixels are dropped), ``until`` ("metric" without images),
+        ``threads``, ``executor``, ``overwrite``, ``shared``.
 
     Returns
     -------
     RunResult
-        As of :func:`reconstruct`. ``UsageError`` if the input contradicts itself, ``StageFailure`` if it
-        cannot be reconstructed.
+        As of :func:`reconstruct`.
+
+    Raises
+    ------
+    UsageError, StageFailure
+        If the input contradicts itself; if it cannot be reconstructed.
 
     Examples
     --------
@@ -119,12 +128,17 @@ def reconstruct_from_tracks(
         Observations in pixels of the images; in an array NaN where a point is not seen. They may contain
         outliers: pairs of images are verified by the points that they share.
     sizes, out, names, images, **options
-        As for :func:`reconstruct_from_matches`, which raises the same.
+        As for :func:`reconstruct_from_matches`.
 
     Returns
     -------
     RunResult
         As of :func:`reconstruct`.
+
+    Raises
+    ------
+    UsageError, StageFailure
+        If the input contradicts itself; if it cannot be reconstructed.
 
     Examples
     --------
@@ -155,13 +169,18 @@ def reconstruct_from_colmap(
         A database with keypoints and matches (the verified matches, or the raw ones if there are none), or a
         folder with a sparse model of any kind of camera, binary or text, whose tracks are used.
     out, images, **options
-        As for :func:`reconstruct_from_matches`, which raises the same; ``images`` is the folder of COLMAP's
-        images, which are used as stored, without EXIF rotation.
+        As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images,
+        which are used as stored, without EXIF rotation.
 
     Returns
     -------
     RunResult
         As of :func:`reconstruct`.
+
+    Raises
+    ------
+    UsageError, StageFailure
+        If there is no database or model; if it cannot be reconstructed.
 
     Examples
     --------

@@ -111,8 +111,9 @@ def align_to_positions(
     model : SparseModel, RunResult or path
         A model, a run or its output folder, or a COLMAP model.
     positions : mapping of str to (3,), or path
-        Image name -> position in any unit of length; or a CSV file of ``name,x,y,z``. Latitude, longitude and
-        height (degrees and metres, WGS84) of its header become metres east, north and up of their median.
+        Image name -> position, in metres or any other unit of length; or a CSV file of ``name,x,y,z``. If
+        its header names latitude, longitude and height (degrees and metres, WGS84), they become metres east,
+        north and up of their median.
     seed : int
         Random seed of the triples, which are drawn only for more than 18 positions.
 
@@ -240,13 +241,20 @@ def scaled(
 
     Parameters
     ----------
-    model, name1, name2, distance : SparseModel or RunResult or path, str, str, float
-        A model as of :func:`align_to_positions`; two images, and the distance of their camera centres.
+    model : SparseModel, RunResult or path
+        A model, a run or its output folder, or a COLMAP model.
+    name1, name2, distance : str, str, float
+        Two images, and the distance of their camera centres in the new unit.
 
     Returns
     -------
     SparseModel
-        The scaled model; the origin stays. ``UsageError`` if an image is unknown, or a distance not positive.
+        The scaled model; the origin stays.
+
+    Raises
+    ------
+    UsageError
+        If an image is unknown, or a distance is not positive.
 
     Examples
     --------
@@ -281,12 +289,14 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     Returns
     -------
     dict of str to Camera
-        In pixels of the original images; ``as_stored`` of COLMAP models and of runs from COLMAP's matches.
+        In pixels of the original images, (0, 0) = centre of the top-left pixel; ``as_stored`` of COLMAP
+        models and of runs from COLMAP's matches or tracks.
 
     Raises
     ------
     UsageError
-        If there is no such file, it is damaged or empty, or a camera has no K or size, or another lens.
+        If there is no such file, it is damaged or empty, a camera has no K or size, or its lens is neither
+        a pinhole nor radial.
 
     Examples
     --------
@@ -322,8 +332,13 @@ def load(out: str | Path) -> RunResult:
     Returns
     -------
     RunResult
-        Without what is not stored: the pixels of ``images`` (grey), ``views`` and ``depth_maps``.
-        ``UsageError`` if no run has finished in the folder, or a file is damaged.
+        As the run returned it, except for what is not stored: the pixels of ``images`` (grey), ``views`` and
+        ``depth_maps``.
+
+    Raises
+    ------
+    UsageError
+        If no run has finished in the folder, or a file is damaged.
 
     Examples
     --------
@@ -354,8 +369,10 @@ def save(result: RunResult, folder: str | Path, *, overwrite: bool = False) -> N
 
     Parameters
     ----------
-    result, folder : RunResult, path
-        Result of a run, copied if its output folder still holds it; the folder is created if missing.
+    result : RunResult
+        Result of a run; if its output folder still holds it, the files are copied.
+    folder : path
+        Created if missing.
     overwrite : bool
         Replace files of these names that thesisrecon did not write, or that were changed since.
 
@@ -385,10 +402,6 @@ Model = str | Path | SparseModel | RunResult | Mapping[str, Camera]
 def compare_models(a: Model, b: Model) -> ModelComparison:
     """Compare two metric models of the same images after the similarity that takes a to b.
 
-    Cameras are paired by name; if no name is common, by name without folder and suffix; if there is none
-    either, a trajectory is paired by order with a model of as many cameras. The similarity needs three common
-    cameras whose centres are not on one line. Intrinsics are compared at the image size in b.
-
     Parameters
     ----------
     a, b : path, RunResult, SparseModel or mapping of str to Camera
@@ -398,8 +411,18 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
     Returns
     -------
     ModelComparison
-        Errors of each common camera, their summary, and the distances of the points. ``UsageError`` if a
-        model cannot be read or there is no common camera.
+        Errors of each common camera, their summary, and the distances of the points.
+
+    Raises
+    ------
+    UsageError
+        If a model cannot be read or there is no common camera.
+
+    Notes
+    -----
+    Cameras are paired by name; if no name is common, by name without folder and suffix; if there is none
+    either, a trajectory is paired by order with a model of as many cameras. The similarity needs three common
+    cameras whose centres are not on one line. Intrinsics are compared at the image size in b.
 
     Examples
     --------
@@ -413,6 +436,8 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
     >>> comparison = compare_models(a, b)
     >>> round(comparison.similarity.scale, 6), comparison.focal_error_rel.round(6).tolist()
     (2.0, [0.01, 0.01, 0.01])
+    >>> bool(comparison.summary["centre_error"]["max"] < 1e-12)
+    True
     """
     first, second = _model(a, "first"), _model(b, "second")
     pairs = _pairs(first, second)

@@ -34,13 +34,16 @@ def match_pair(
     ----------
     image1, image2 : path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
         The two images; transparent pixels are masked.
-    config, seed : PipelineConfig, str or path, int
-        Settings, the name of a preset, or a TOML file (None: the preset ``default``); the random seed.
+    config : PipelineConfig, str or path, optional
+        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
+    seed : int
+        Random seed.
 
     Returns
     -------
     TwoView
-        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images.
+        Verified matches ``xy1``, ``xy2`` (N, 2) and ``F``, in pixels of the given images, also if they were
+        matched at a smaller size (``config.images.max_size_px``).
 
     Raises
     ------
@@ -99,8 +102,10 @@ def draw_epipolar_lines(
     ----------
     image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         Files, read at full size, or images.
-    F, xy1, xy2, max_lines : ndarray (3, 3), (N, 2) and (N, 2), int
-        Fundamental matrix and matches in pixels of these images, and how many of them to draw.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches in pixels of these images.
+    max_lines : int
+        Number of matches to draw, spread over all; each has one colour in both images.
 
     Returns
     -------
@@ -138,8 +143,10 @@ def estimate_homography(
     ----------
     xy1, xy2 : array_like (N, 2)
         Matched points, N >= 4, px.
-    threshold_px, seed : float or None, int or numpy.random.Generator
-        Distance of an inlier during the search (None: all matches are inliers); the random seed.
+    threshold_px : float or None
+        Distance of an inlier during the search; None: all matches are inliers.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
 
     Returns
     -------
@@ -148,8 +155,10 @@ def estimate_homography(
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if the matches or inliers are too few, or do not determine H.
+    ValueError
+        If the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
 
     Examples
     --------
@@ -177,16 +186,22 @@ def estimate_trifocal(
     """Estimate the trifocal tensor from points and lines of three views.
 
     Minimises Huber's loss of the distances of points to their reprojections and of segment endpoints to the
-    reprojected lines. Points that contradict the epipolar geometry of a pair of views are left out first.
+    reprojected lines: the maximum likelihood for Gaussian noise, tolerant of a few wrong matches. Points that
+    contradict the epipolar geometry of a pair of views are left out first.
 
     Parameters
     ----------
-    xy1, xy2, xy3, segments : array_like (N, 2), ndarray (3, M, 2, 2)
-        Matched points of the three views, px, and endpoints of matched line segments, which need not
-        correspond. 4 N + 2 M >= 26.
-    threshold_px, loss_px, seed : float or None, float, int or numpy.random.Generator
-        Threshold of the fundamental matrices by which wrong points are found, from 12 points on (None: no
-        search); the residual at which Huber's loss becomes linear; the random seed.
+    xy1, xy2, xy3 : array_like (N, 2)
+        Matched points of the three views, px.
+    segments : ndarray (3, M, 2, 2), optional
+        Endpoints of matched line segments, px; the endpoints need not correspond. 4 N + 2 M >= 26.
+    threshold_px : float or None
+        Threshold of the fundamental matrices by which wrong points are found, from 12 points on; None: no
+        search.
+    loss_px : float
+        Residual at which Huber's loss becomes linear.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from.
 
     Returns
     -------
@@ -195,9 +210,11 @@ def estimate_trifocal(
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if there are too few matches, or they do not determine the tensor, exactly
-        or within their noise: points of one plane or line, pure rotation, random matches.
+    ValueError
+        If the shapes are wrong or values are not finite.
+    StageFailure
+        If there are too few matches, or they do not determine the tensor, exactly or within their noise:
+        points of one plane or line, pure rotation, random matches.
 
     Examples
     --------
@@ -241,21 +258,26 @@ def estimate_fundamental(
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
         the thesis) or "least-median". For matches without outliers: "gold-standard" (least reprojection
         error, HZ 11.4.1), "eight-point" (normalised) or "seven-point" (up to three solutions).
-    threshold_px, seed : float or None, int or numpy.random.Generator
-        Largest Sampson distance of an inlier during the search of the first two methods (None: no outliers,
-        "gold-standard" is used instead of these two); the random seed.
+    threshold_px : float or None
+        Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
+        "gold-standard" is used instead of these two.
+    seed : int or numpy.random.Generator
+        Random seed, or the generator to draw from; the same seed gives the same result.
 
     Returns
     -------
     FundamentalEstimate
-        F with x2' F x1 = 0, inliers, noise, and the covariance of the minimum of the Sampson distances.
-        ``determined``: no other F explains the matches as well; otherwise ``reasons`` says why. For
-        "seven-point" noise and covariance are NaN, and ``competing_models`` are the other solutions.
+        F with x2' F x1 = 0, inliers, noise and covariance. ``determined``: no other F explains the matches as
+        well; otherwise ``reasons`` says why. The covariance is that of the minimum of the Sampson distances,
+        a lower bound for the linear methods. For "seven-point" noise and covariance are NaN (there are no
+        residuals), and ``competing_models`` are the other solutions.
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if there are too few or collinear matches, or no F has 8 inliers.
+    ValueError
+        If the method is unknown, the shapes differ or coordinates are not finite.
+    StageFailure
+        If there are too few or collinear matches, or no F has 8 matches within the threshold.
 
     Examples
     --------
@@ -271,6 +293,9 @@ def estimate_fundamental(
     >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
     >>> thesisrecon.estimate_fundamental(xy1, plane).determined
     False
+    >>> linear = thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point")
+    >>> linear.covariance.shape
+    (9, 9)
     """
     rng = np.random.default_rng(seed)
     if threshold_px is None:

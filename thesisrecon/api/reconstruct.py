@@ -46,11 +46,14 @@ def reconstruct(
         A folder, or the images; with ``every`` a video (extra ``video``) or a folder of frames.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
-    config, preset : PipelineConfig or str or path, {"default", "thesis"}
-        Settings, the name of a preset, or a TOML file (None: ``default``); the pipeline to start from.
-    max_size, cameras : int, {"shared", "per-image"}
-        Long side (px) to which larger images are reduced (1600); one camera per image size (default), or one
-        per image.
+    config : PipelineConfig, str or path, optional
+        Settings, the name of a preset, or a TOML file; None: the preset ``default``.
+    preset : {"default", "thesis"}, optional
+        Pipeline to start from.
+    max_size : int, optional
+        Long side (px) to which larger images are reduced (1600).
+    cameras : {"shared", "per-image"}, optional
+        One camera per image size (default), or one per image.
     pairs : str, path or list of (str, str), optional
         "all", "overlap", "window:N", a file of pairs, or pairs of file names.
     set : mapping or list of str
@@ -60,9 +63,11 @@ def reconstruct(
         no features, no depth and no texture; transparent pixels of images give none either.
     every : int, optional
         Take the sharpest of each ``every`` frames; those of a video are written to ``out/00-frames``.
-    seed, progress : int, callable
-        Random seed, at least 0 (the same images, settings and seed give the same bytes for any number of
-        workers); called with (stage, done, total).
+    seed : int
+        Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
+        workers.
+    progress : callable, optional
+        Called with (stage, done, total).
     **options
         ``until``: last stage, "features", "matches", "projective", "metric", "dense" or "model" (by default
         "model", where a surface that fails is only a warning); ``threads``: number of workers;

@@ -46,9 +46,10 @@ def rectify(
     ----------
     image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         Files, read at full size, or images.
-    F, xy1, xy2, planar : ndarray (3, 3), (N, 2) and (N, 2), bool
-        Fundamental matrix and N >= 8 of its inliers in pixels of these images; whether only homographies are
-        allowed, which need epipoles outside the images.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and N >= 8 of its inliers in pixels of these images.
+    planar : bool
+        Allow homographies only, which need epipoles outside the images.
 
     Returns
     -------
@@ -57,8 +58,10 @@ def rectify(
 
     Raises
     ------
-    ValueError, StageFailure
-        If a shape is wrong; if the pair has no parallax, too few matches, or with ``planar`` inner epipoles.
+    ValueError
+        If an array has the wrong shape.
+    StageFailure
+        If the pair has no parallax or too few matches, or with ``planar`` an epipole lies inside an image.
 
     Examples
     --------
@@ -90,8 +93,10 @@ def match_rectified(
     left, right : path or ndarray (H, W), (H, W, 3) or (H, W, 4)
         Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
         cannot be read), or levels 0 to 255 with NaN for missing pixels; transparent pixels are missing.
-    max_disparity_px, config : float, PipelineConfig or str or path
-        Largest disparity d, x_right = x_left - d; the matcher is ``config.dense.pairs``.
+    max_disparity_px : float
+        Largest disparity; x_right = x_left - d with d from 0 to this.
+    config : PipelineConfig, str or path, optional
+        The matcher is ``config.dense.pairs``; None: the preset ``default``.
 
     Returns
     -------
@@ -134,14 +139,16 @@ def depth_maps(
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
     cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
         Their cameras in pixels of the images (arrays with ``sizes``), after EXIF rotation unless they are
-        ``as_stored``. The observed points of a reconstruction give the depth range and the neighbours. Of a
-        run from COLMAP's matches or tracks give ``result.cameras``.
-    sizes, depth_range : array_like (V, 2) or (2,), optional
-        Image width and height, for plain arrays; nearest and farthest depth. Without points and range, a pair
-        is searched where both images contain a point and its rays meet at 0.5 to 40 degrees.
-    max_size, config, threads : int, PipelineConfig or str or Path, int
-        Larger images are reduced to this long side (None: ``config.images``); ``config.dense`` is the method;
-        number of threads, on which the result does not depend.
+        ``as_stored``. If a reconstruction has points with observations, these give the depth range and the
+        neighbours. Of a run from COLMAP's matches or tracks give ``result.cameras``.
+    sizes : array_like (V, 2) or (2,), optional
+        Image width and height, for plain arrays.
+    depth_range : array_like (2,) or (V, 2), optional
+        Nearest and farthest depth. None: from the cameras, see Notes.
+    max_size : int, optional
+        Larger images are reduced to this long side; None: ``config.images``.
+    config, threads : PipelineConfig, str or Path, int
+        ``config.dense`` is the method; number of threads, on which the result does not depend.
 
     Returns
     -------
@@ -151,9 +158,16 @@ def depth_maps(
 
     Raises
     ------
-    ValueError, StageFailure
-        If a camera is missing or not of its image's size, or the range is not 0 < nearest < farthest; if no
-        two images see common space, or no depth is found.
+    ValueError
+        If a camera is missing or is not of its image's size, or the range is not 0 < nearest < farthest.
+    StageFailure
+        If no two images see common space, or no depth is found.
+
+    Notes
+    -----
+    Without points and range, a pair is searched at the depths at which both images contain a point and its
+    rays meet at 0.5 to 40 degrees. The neighbours of a view are those that share the most space with it at
+    angles of about 10 degrees. A known range saves time and avoids errors.
 
     Examples
     --------
@@ -272,7 +286,8 @@ def texture(
     Raises
     ------
     ValueError, StageFailure
-        If an argument is invalid; if no view shows a face completely.
+        If the mesh is invalid; if a camera is missing or is not of its image's size; if no view shows a face
+        completely.
 
     Examples
     --------
@@ -282,8 +297,8 @@ def texture(
     >>> mesh = TexturedMesh(square, np.array([[0, 2, 1], [0, 3, 2]]))
     >>> K = np.array([[100.0, 0, 49.5], [0, 100, 49.5], [0, 0, 1]])
     >>> camera = Camera(K, np.eye(3), np.zeros(3), (100, 100))
-    >>> image = np.full((100, 100, 3), 200, np.uint8)
-    >>> image[50:] = 0
+    >>> image = np.zeros((100, 100, 3), np.uint8)
+    >>> image[:50], image[50:] = (200, 0, 0), (0, 0, 200)
     >>> texture(mesh, [image], [camera]).texture.dtype
     dtype('uint8')
     """

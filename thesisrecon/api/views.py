@@ -47,15 +47,17 @@ def interpolate_view(
 ) -> U8:  # fmt: skip
     """Interpolate the view between two rectified images (thesis, section 1.2; Seitz and Dyer 1995).
 
-    For many views of one pair call :func:`prepare_rectified_pair` once.
-
     Parameters
     ----------
-    left, right, s : str, Path or ndarray (H, W, 3) uint8, float
-        Images of parallel cameras with corresponding rows; position on the baseline, 0 (left) to 1 (right).
-    disparity, config : ndarray (H, W), DisparityMap or tuple of both sides, PipelineConfig or str or path
+    left, right : str, Path or ndarray (H, W, 3) uint8
+        Images of parallel cameras with corresponding rows.
+    s : float
+        Position on the baseline, from 0 (left image) to 1 (right image).
+    disparity : ndarray (H, W), DisparityMap or tuple of both sides, optional
         Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add the
         regions that only it shows. None: matched by ``config.dense``.
+    config : PipelineConfig, str or path, optional
+        The default configuration if None.
 
     Returns
     -------
@@ -67,6 +69,10 @@ def interpolate_view(
     ------
     ValueError, UsageError, StageFailure
         If ``s`` is outside [0, 1], shapes differ, or a file does not exist or cannot be read.
+
+    Notes
+    -----
+    For many views of one pair call :func:`prepare_rectified_pair` once.
 
     Examples
     --------
@@ -241,8 +247,6 @@ def synthesize_view(
 ) -> U8:  # fmt: skip
     """Compute the view of a virtual camera from two images by the trilinear tensor (section 1.3).
 
-    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
-
     Parameters
     ----------
     image1, image2 : str, Path or ndarray (H, W, 3) uint8
@@ -250,8 +254,10 @@ def synthesize_view(
     rotation, translation : array_like (3, 3) and (3,)
         Motion from the second camera to the virtual one, X_new = R X_2 + t (x right, y down, z forwards), in
         units of the distance between the two cameras. R = I and t = 0 reproduce the second image.
-    K, config, seed : array_like (3, 3) or (2, 3, 3), PipelineConfig or str or path, int
-        Intrinsics as in :func:`prepare_trilinear_views`; configuration and random seed of the matching.
+    K : array_like (3, 3) or (2, 3, 3), optional
+        Intrinsics, as in :func:`prepare_trilinear_views`.
+    config, seed : PipelineConfig or str or path, int
+        Configuration (None: the default) and random seed of the matching.
 
     Returns
     -------
@@ -260,9 +266,14 @@ def synthesize_view(
 
     Raises
     ------
-    ValueError, StageFailure
-        If an argument is invalid; if the images cannot be read, do not match or show no parallax, or the
-        camera does not see the scene.
+    ValueError
+        If the rotation, translation, K or seed is invalid.
+    StageFailure
+        If the images cannot be read, do not match or show no parallax, or the camera does not see the scene.
+
+    Notes
+    -----
+    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
 
     Examples
     --------
@@ -321,11 +332,14 @@ def render(
     ----------
     mesh, camera : TexturedMesh, Camera
         Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
-    shading, background : Shading, tuple of int
-        Lighting (None shows the texture as photographed) and colour of empty pixels.
-    samples, threads : int
-        Samples per pixel side, averaged (depth and validity refer to the pixel centre); number of threads,
-        on which the image does not depend.
+    shading : Shading, optional
+        Lighting. None shows the texture as photographed.
+    background : tuple of int
+        Colour of empty pixels.
+    samples : int
+        Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
+    threads : int
+        Number of threads; the image does not depend on it.
 
     Returns
     -------
