@@ -365,8 +365,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     Raises
     ------
     ValueError, UsageError, OutputError
-        If the mesh is invalid; the name does not end in .glb or ``mesh`` is not a TexturedMesh; the file
-        cannot be written.
+        If the mesh is invalid or no TexturedMesh; the name does not end in .glb; the file cannot be written.
 
     Examples
     --------
