@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon._numba import ThreadPool
-from thesisrecon.api.cameras import CameraInput, as_cameras, radial_coefficients, reconstruction_from_cameras
+from thesisrecon.api.cameras import CameraInput, as_cameras, radial_coefficients
 from thesisrecon.arrays import F32, F64, I64, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
@@ -356,9 +356,14 @@ def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
 
 def _model(views: Sequence[Camera]) -> Reconstruction:
     """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
-    lenses = radial_coefficients("depth of known cameras", views)
-    K, R, t, sizes = (np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t", "size"))
-    return replace(reconstruction_from_cameras(K, R, t, sizes=sizes), distortion=lenses)
+    n, lenses = len(views), radial_coefficients("depth of known cameras", views)
+    none = np.zeros(0, dtype=np.int64)
+    K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
+    return Reconstruction(
+        "metric", P, np.zeros((0, 4)), np.ones(n, dtype=bool), np.zeros(0, dtype=bool),
+        np.zeros(0, dtype=bool), Tracks(none, none, np.zeros((0, 2)), n, 0),
+        np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, lenses,
+    )  # fmt: skip
 
 
 def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:

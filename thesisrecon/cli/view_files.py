@@ -41,7 +41,9 @@ from thesisrecon.views.render import Light, Shading
 from thesisrecon.views.tensor import camera_at
 
 MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-_OWN = re.compile(r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.webp")
+_OWN = re.compile(
+    r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)"
+)
 """Names of the files of these commands."""
 _MIDWAY = 0.5
 

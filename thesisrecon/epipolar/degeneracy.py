@@ -1,4 +1,4 @@
-"""Section 5.5: do the matches determine F, or does another F explain them as well?
+"""Degenerate planes (section 5.5; DEGENSAC): do the matches determine F, or does another F explain them too?
 
 If most matches lie on one plane with homography H, every [e]x H explains them: the epipole depends on the few
 matches off the plane, and a wrong F has as many inliers as the right one.

@@ -167,7 +167,8 @@ def plane_covariance(H: F64, points: F64, sigma: float) -> F64:
 def fundamentals_of_plane(H: F64, points: F64, weights: F64, pairs: I64, gate: float) -> tuple[F64, F64, F64]:
     """[e]x H of pairs off the plane: F (S, 9), inliers (S, N) as 0 or 1, sums (S, M) of their weights.
 
-    The epipole e is where the lines x2 x H x1 through the two matches and their positions on the plane meet.
+    Plane and parallax (Chum, Werner and Matas, CVPR 2005): the epipole e is where the lines x2 x H x1 through
+    the two matches and their positions on the plane meet.
     """
     x1, x2 = homogenize(points[:, :2]), homogenize(points[:, 2:])
     parallax = np.cross(x2, x1 @ H.T)

@@ -1,4 +1,4 @@
-"""Sections 5.2 and 5.4: F from linear equations, by RANSAC (Algorithm 2) and by least median of squares."""
+"""Sections 5.2 and 5.4: F from linear equations, RANSAC (Algorithm 2), least median of squares (LMedS)."""
 
 from __future__ import annotations
 

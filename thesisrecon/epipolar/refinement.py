@@ -1,4 +1,4 @@
-"""Sections 5.3 and 5.5: criteria of F, their minimisation over matrices of rank 2, the covariance of F.
+"""Sections 5.3 and 5.5: criteria of F (gold standard, Sampson, ...), minimised over rank 2, covariance of F.
 
 The criteria are the Sampson distance (5.4), which the thesis calls the gradient criterion, the distances to
 the epipolar lines (5.6) and the reprojection error (HZ, algorithm 11.3). F = U diag(cos phi, sin phi, 0) V'

@@ -1,4 +1,4 @@
-"""Windows and pyramids of an image prepared for matching, and helpers of all matching variants.
+"""Windows for normalised cross-correlation (4.2.2), and pyramids of an image prepared for matching.
 
 A pyramid is stored as ``pixels``, all levels one after the other, and ``levels`` (L, 3): offset, height and
 width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
@@ -80,9 +80,9 @@ def sample_window(
 
 @kernel(fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
-    """Subtract the mean and divide by the norm in place; return the norm.
+    """Subtract the mean and divide by the norm in place: products are normalised cross-correlations (4.2.2).
 
-    Samples and norm are 0 if the contrast is below half a grey level.
+    Returns the norm; samples and norm are 0 if the contrast is below half a grey level.
     """
     total = np.float32(0.0)
     for n in range(len(window)):

@@ -282,8 +282,10 @@ def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResu
         elsewhere = {i: Notice("other-group", name) for i, name in places.items()}
         return replace(found, reasons=tuple(elsewhere.get(i, why) for i, why in enumerate(found.reasons)))
 
-    projective, metric = result.projective and named(result.projective), result.metric
-    metric = metric and replace(metric, reconstruction=named(metric.reconstruction))
+    projective = None if result.projective is None else named(result.projective)
+    metric = result.metric
+    if metric is not None:
+        metric = replace(metric, reconstruction=named(metric.reconstruction))
     return replace(result, projective=projective, metric=metric)
 
 

@@ -278,8 +278,8 @@ class RunDirectory:
         difference = difference or next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
             advice = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
-            there = f"the output folder {self.path} holds another run ({difference})"
-            raise UsageError(f"{there}; choose another folder, or {advice}")
+            held = f"the output folder {self.path} holds another run ({difference})"
+            raise UsageError(f"{held}; choose another folder, or {advice}")
         return bool(difference)
 
     def _identity(self) -> tuple[Any, str]:

@@ -232,7 +232,10 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
 
 
 def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Planes (2 B, 3) from focals (B,) of the reference and of another camera, for both of its signs."""
+    """Planes (2 B, 3) from focals (B,) of the reference and of another camera, for both of its signs.
+
+    Gherardi and Fusiello, ECCV 2010: two calibrated views determine the plane at infinity.
+    """
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
     t = frame.a[other] / K2

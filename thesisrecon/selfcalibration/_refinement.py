@@ -180,10 +180,9 @@ def minimize_batch(
 
 
 def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
-    """Return the derivatives (B, M, D) at x (B, D) by central differences, all steps in one batch."""
-    steps = 1e-6 * (1.0 + np.abs(x))
-    shifts = steps[:, None] * np.eye(x.shape[1])
-    moved = ((x[:, None] + side * shifts).reshape(x.size, x.shape[1]) for side in (1.0, -1.0))
-    after, before = map(residuals, moved)
-    slopes = (after - before).reshape(*x.shape, after.shape[1]) / (2.0 * steps[..., None])
-    return np.asarray(slopes.swapaxes(1, 2))
+    """Return the derivatives (B, M, D) at x (B, D) by central differences, one unknown after the other."""
+    steps, columns = 1e-6 * (1.0 + np.abs(x)), []
+    for k in range(x.shape[1]):
+        shift = steps * (np.arange(x.shape[1]) == k)
+        columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
+    return np.stack(columns, axis=-1)

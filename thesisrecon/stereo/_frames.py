@@ -168,7 +168,7 @@ def loop_zhang(pair: EpipolarPair) -> PlanarRectification:
 
 
 def minimum_distortion(pair: EpipolarPair) -> PlanarRectification:
-    """Rectify with the least distortion (`thesisrecon.stereo._rectification_quality.RectificationQuality`).
+    """Rectify with the least distortion (`thesisrecon.stereo.rectification.RectificationQuality`).
 
     Least squares over the line at infinity and the scale and shear of both first rows (5 parameters), from
     the solution of :func:`loop_zhang`: the variance of the log singular values of both homographies,

@@ -1,4 +1,4 @@
-"""Fusion of depth maps to one surface (thesis, section 2.6): volumetric, or as a union of sheets.
+"""Fusion of depth maps to one surface (thesis, 2.6): volumetric (TSDF), or as a union of sheets.
 
 :class:`VolumetricFusion` averages signed distances in a sparse voxel grid (Curless and Levoy 1996), measured
 across the surface instead of along the rays, and extracts the zero level as a surface net (Gibson 1998): one

@@ -1,4 +1,4 @@
-"""View interpolation between two images (thesis, section 1.2; Seitz and Dyer 1995)."""
+"""View interpolation (view morphing) between two images (thesis, section 1.2; Seitz and Dyer 1995)."""
 
 from __future__ import annotations
 
