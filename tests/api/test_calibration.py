@@ -180,3 +180,13 @@ def test_the_way_out_of_a_wrong_call_is_named():
     refuses(ValueError, "stratum='projective'", thesisrecon.upgrade_affine, scene.P)
     words = "unknown method 'kruppa-equation'; did you mean kruppa-equations"
     refuses(ValueError, words, thesisrecon.self_calibrate, scene.P, scene.sizes, method="kruppa-equation")
+
+
+def test_kruppa_under_noise_is_close():
+    scene = make_scene(sigma_px=0.3, seed=2)
+    xy = pixels(scene)
+    F = []
+    for i, j in combinations(range(8), 2):
+        both = np.isfinite(xy[i] + xy[j]).all(axis=1)
+        F.append(thesisrecon.estimate_fundamental(xy[i, both], xy[j, both], method="gold-standard").F)
+    assert abs(thesisrecon.kruppa(np.stack(F), scene.sizes)[0, 0] / 1500.0 - 1.0) < 0.03

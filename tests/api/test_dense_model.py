@@ -16,7 +16,6 @@ from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
 from thesisrecon import (
     Camera,
     PipelineConfig,
-    StageFailure,
     TexturedMesh,
     depth_maps,
     fuse_depth_maps,
@@ -25,9 +24,11 @@ from thesisrecon import (
 )
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.camera import decompose_camera
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import StageFailure, UsageError
+from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.io._images import read_pixels
 from thesisrecon.results import SparseModel, SparseView
+from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 from thesisrecon.surface.model import SurfaceModel
 from validation.scenes.real import load_fixture_depth
@@ -138,6 +139,31 @@ def given(monkeypatch):
 
     monkeypatch.setattr(SurfaceModel, "color", color)
     return found
+
+
+def test_observations_are_in_the_pixels_of_the_reduced_images(monkeypatch, walled):
+    """A depth estimator of your own may use them."""
+    seen = []
+
+    def prepare(*given, **_):
+        seen.append(given[2])
+        raise StageFailure("seen")
+
+    monkeypatch.setattr(MultiViewStereo, "prepare", prepare)
+    cameras = _cameras()
+    X = np.column_stack([*np.random.default_rng(0).uniform(-0.8, 0.8, (2, 60)), np.full(60, 6.0)])
+    xy = np.stack([camera.project(X) for camera in cameras])
+    xy[~((xy >= 0.0) & (xy <= np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
+    arrays = (np.stack([getattr(camera, name) for camera in cameras]) for name in ("K", "R", "t"))
+    given = reconstruction_from_cameras(*arrays, sizes=SIZE, X=X, xy=xy)
+    refuses(StageFailure, "seen", depth_maps, [image.rgb for image in walled.images], given, max_size=120)
+    (reduced,) = seen
+    tracks = reduced.tracks
+    assert len(tracks.xy) > 100
+    for i, P in enumerate(reduced.P):
+        here = tracks.view_index == i
+        off = project(P, reduced.X[tracks.point_index[here]]) - tracks.xy[here]
+        np.testing.assert_allclose(off, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("max_size", "side"), [(None, 1600), (1700, 1700), (400, 400)])

@@ -238,3 +238,18 @@ def test_the_record_lists_the_files_of_a_run(tmp_path):
     results = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
     assert names == {name for name in results if not name.startswith("0")} - {LOCK_FILE}
     assert Path("sparse/0/images.bin").as_posix() in names
+
+
+def test_only_own_files_and_clear_folders_are_removed(tmp_path):
+    write(tmp_path, name="a/b/x.txt")
+    write(tmp_path, name="a/y.txt")
+    (tmp_path / "a" / "b" / "z.txt").write_bytes(b"of the user")
+    (tmp_path / "a" / "y.txt").write_bytes(b"of the user")
+    (tmp_path / "empty").mkdir()
+    with claim_folder(tmp_path) as outputs:
+        outputs.remove(["a/b/*.txt", "a/y.txt", "empty/none.txt"])
+    assert sorted(content(tmp_path)) == [LOCK_FILE, "a/b/z.txt", "a/y.txt"]
+    assert (tmp_path / "empty").is_dir()
+    with claim_folder(tmp_path, overwrite=True) as outputs:
+        outputs.remove(["a/y.txt"])
+    assert sorted(content(tmp_path)) == [LOCK_FILE, "a/b/z.txt"]

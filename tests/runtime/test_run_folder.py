@@ -314,3 +314,12 @@ def test_records_of_a_replaced_run_are_not_counted(tmp_path, monkeypatch):
     assert run_position(tmp_path) == "interrupted: matches, 2 of 10 done; repeat the command to resume"
     refuses(KeyboardInterrupt, None, again, 5, seed=1, progress=interrupt_at("matches", 3))
     assert run_position(tmp_path) == "interrupted: matches, 3 of 10 done; repeat the command to resume"
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    words = r"holds 'letter\.txt', which thesisrecon did not create"
+    directory = RunDirectory(tmp_path)
+    with pytest.raises(UsageError, match=words), directory.claim(IDENTITY, overwrite=True):
+        pass
+    assert not (tmp_path / "run.json").exists()
