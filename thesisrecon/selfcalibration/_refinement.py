@@ -181,8 +181,9 @@ def minimize_batch(
 
 def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
     """Return the derivatives (B, M, D) at x (B, D) by central differences, one unknown after the other."""
-    steps, columns = 1e-6 * (1.0 + np.abs(x)), []
+    steps = 1e-6 * (1.0 + np.abs(x))
+    J = np.empty((*residuals(x).shape, x.shape[1]))
     for k in range(x.shape[1]):
         shift = steps * (np.arange(x.shape[1]) == k)
-        columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
-    return np.stack(columns, axis=-1)
+        J[:, :, k] = (residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None])
+    return J
