@@ -275,7 +275,8 @@ def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, 
     """K of the same focal lengths, without skew, and size of the largest pinhole image in the original."""
     original, sides, distortion = view.intrinsics
     x, y = (np.arange(float(side)) for side in sides)
-    borders = [(0.0 * y, y), (0.0 * y + x[-1], y), (x, 0.0 * x), (x, 0.0 * x + y[-1])]
+    borders = [(np.full_like(y, side), y) for side in (0.0, x[-1])]
+    borders += [(x, np.full_like(x, side)) for side in (0.0, y[-1])]
     left, right, top, bottom = (_normalized(view, np.column_stack(border)) for border in borders)
     focal = np.array([original[0, 0], original[0, 0] if centred else original[1, 1]])
     low, high = focal * [left[:, 0].max(), top[:, 1].max()], focal * [right[:, 0].min(), bottom[:, 1].min()]

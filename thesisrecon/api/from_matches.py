@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
@@ -245,8 +244,9 @@ def _reconstruct(
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
                 inputs, warnings = views.read(run, digests), list[str]()
                 if masks is not None:
-                    masked = partial(add_masks, as_stored=views.as_stored, map_all=run.workers.map_all)
-                    inputs, warnings = masked(inputs, Path(masks))
+                    inputs, warnings = add_masks(
+                        inputs, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
+                    )
                     if all(image.mask is None for image in inputs.images):
                         warnings.append(USELESS_MASKS)
                 given = outside_masks(at_working_size(given, inputs.images), inputs.images)

@@ -142,8 +142,9 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     counts: dict[str, int] = {}
     with run.clock("images"):
         if isinstance(images, FrameSource):
-            given = run.directory.path, run.workers.threads, run.workers.map_all, run.progress
-            images, counts["frames"], warnings = images.choose(*given)
+            images, counts["frames"], warnings = images.choose(
+                run.directory.path, run.workers.threads, run.workers.map_all, run.progress
+            )
         size = run.config.images.max_size_px
         inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
         unused: list[str] = []

@@ -255,10 +255,13 @@ def reconstruct_part(
     model is returned without the observations, which the caller has: the result of a task is small.
     """
     tracks, prior = given.tracks, given.prior
-    none, nowhere = np.zeros(len(given.sizes), dtype=bool), np.zeros((tracks.n_points, 4))
-    P, K, inlier = np.zeros((len(none), 3, 4)), np.zeros((len(none), 3, 3)), none[tracks.view_index]
-    seen = (none, nowhere[:, 0] > 0.0, inlier, tracks, given.sizes, 1.0, ("",) * len(none), K, K[:, 0])
-    model = Reconstruction("metric", P, nowhere, *seen)
+    n, N = len(given.sizes), tracks.n_points
+    model = Reconstruction(
+        "metric", np.zeros((n, 3, 4)), np.zeros((N, 4)), registered=np.zeros(n, dtype=bool),
+        valid=np.zeros(N, dtype=bool), inlier=np.zeros(len(tracks.xy), dtype=bool), tracks=tracks,
+        sizes=given.sizes, sigma_px=1.0, reasons=("",) * n, K=np.zeros((n, 3, 3)),
+        distortion=np.zeros((n, 3)),
+    )  # fmt: skip
     for attempt in range(attempts):
         rng = stream(seed, "part", number, attempt)
         try:

@@ -52,16 +52,28 @@ def check_identifiability(
     lengths under the prior; a second covariance, with free aspect ratio and principal point, shows the effect
     of the prior of these.
     """
-    problem = _bundle_problem(reconstruction, upgrade, prior) if reconstruction.inlier.any() else None
-    # Without points the world may be mirrored: the optical axes then meet behind the cameras.
-    for side in () if reconstruction.inlier.any() else (1.0, -1.0):
-        metric = np.diag([1.0, 1.0, 1.0, side]) @ upgrade.metric_from_projective
-        one = replace(upgrade, metric_from_projective=metric)
-        problem = problem or _bundle_problem(_with_virtual_points(reconstruction, one), one, prior)
+    if reconstruction.inlier.any():
+        problem = _bundle_problem(reconstruction, upgrade, prior)
+    else:
+        problem = _virtual_problem(reconstruction, upgrade, prior)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
     excess = excess_equations(prior, reconstruction.registered)
     return identifiability_report(problem, excess, iterations=_MAX_ITERATIONS)
+
+
+def _virtual_problem(
+    reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
+) -> CalibrationProblem | None:
+    """The problem of cameras without points, with virtual ones; None if their optical axes do not meet."""
+    # The world may be mirrored: the optical axes then meet behind the cameras.
+    for side in (1.0, -1.0):
+        metric = np.diag([1.0, 1.0, 1.0, side]) @ upgrade.metric_from_projective
+        one = replace(upgrade, metric_from_projective=metric)
+        problem = _bundle_problem(_with_virtual_points(reconstruction, one), one, prior)
+        if problem is not None:
+            return problem
+    return None
 
 
 def identifiability_without_calibration(

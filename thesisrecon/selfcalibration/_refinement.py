@@ -83,8 +83,7 @@ class RotationCriterion:
         root_weights = (1.0 + norm2 / self.scale**2) ** -0.25
 
         def residuals(x: F64) -> F64:
-            weights = np.repeat(root_weights, len(x) // len(theta), axis=0)
-            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * weights[..., None]
+            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * root_weights[..., None]
             priors = self._focal_prior_residuals(frame, x[:, 3:])
             return np.concatenate([cameras.reshape(len(x), -1), priors], axis=1)
 
@@ -181,9 +180,10 @@ def minimize_batch(
 
 def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
     """Return the derivatives (B, M, D) at x (B, D) by central differences, one unknown after the other."""
-    steps = 1e-6 * (1.0 + np.abs(x))
-    J = np.empty((*residuals(x).shape, x.shape[1]))
+    if x.shape[1] == 0:
+        return np.empty((*residuals(x).shape, 0))
+    steps, columns = 1e-6 * (1.0 + np.abs(x)), []
     for k in range(x.shape[1]):
         shift = steps * (np.arange(x.shape[1]) == k)
-        J[:, :, k] = (residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None])
-    return J
+        columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
+    return np.stack(columns, axis=-1)
