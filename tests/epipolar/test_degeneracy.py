@@ -21,7 +21,7 @@ from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.camera import compose_camera
 from thesisrecon.epipolar import degeneracy as assessment
 from thesisrecon.epipolar import homography
-from thesisrecon.epipolar._matches import PairFrame, log10_false_alarms, multiplicity_weights
+from thesisrecon.epipolar._matches import PairFrame, multiplicity_weights
 from thesisrecon.epipolar.degeneracy import _contradicted_fraction, assess_degeneracy
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
@@ -34,6 +34,7 @@ from thesisrecon.geometry.two_view import (
     sampson_residuals,
     symmetric_residuals,
 )
+from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import FundamentalFit
 
 DISTANCE = 10.0

@@ -16,6 +16,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.optimize.ransac import Budget
 from thesisrecon.optimize.robust_resection import resect_calibrated
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
@@ -113,7 +114,7 @@ def test_calibrated_resection_survives_half_wrong_points():
     xy = dehomogenize(scene.X @ scene.R[0].T + scene.t[0])
     wrong = np.arange(len(xy)) % 2 == 0
     xy[wrong] += rng.uniform(0.1, 0.4, (int(wrong.sum()), 2))
-    pose, inliers = resect_calibrated(scene.X, xy, threshold=1e-3, rng=rng)
+    pose, inliers, _ = resect_calibrated(scene.X, xy, threshold=1e-3, budget=Budget(), rng=rng)
     np.testing.assert_allclose(pose[:, :3], scene.R[0], atol=1e-6)
     np.testing.assert_allclose(pose[:, 3], scene.t[0], atol=1e-5)
     np.testing.assert_array_equal(inliers, ~wrong)

@@ -16,6 +16,7 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.conditioning import pixel_from_unit
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.optimize.ransac import Budget
 from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import (
     ProjectiveModel,
@@ -137,7 +138,7 @@ def test_resection_among_wrong_points_and_the_spread_of_the_gate():
     xy = project(scene.P[1], Xh)
     wrong = np.arange(len(xy)) < 90
     xy[wrong] += rng.uniform(30, 300, (90, 2))
-    P, inlier = resect_projective(Xh, xy, threshold_px=2.0, rng=rng)
+    P, inlier, _ = resect_projective(Xh, xy, threshold_px=2.0, budget=Budget(), rng=rng)
     np.testing.assert_array_equal(inlier, ~wrong)
     np.testing.assert_allclose(project(P, Xh[~wrong]), xy[~wrong], atol=1e-3)
     scene, rng = make_scene(), np.random.default_rng(0)

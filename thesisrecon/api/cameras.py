@@ -26,6 +26,7 @@ from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOpti
 from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
 from thesisrecon.optimize.bundle.observations import Observations, sort_observations
 from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate_points
+from thesisrecon.optimize.ransac import Budget
 from thesisrecon.optimize.robust_resection import Resection, resect_robust
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 
@@ -310,7 +311,14 @@ def cheirality(P: F64, X: F64) -> F64:
 
 
 def resect(
-    X: F64, xy: F64, K: F64 | None = None, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+    X: F64,
+    xy: F64,
+    K: F64 | None = None,
+    *,
+    threshold_px: float | None = 1.0,
+    confidence: float = 0.9999,
+    max_samples: int = 100_000,
+    seed: int | Generator = 0,
 ) -> Resection:
     """Estimate a camera from space points and their pixels, some of them wrong (section 6.4).
 
@@ -325,6 +333,8 @@ def resect(
         Calibration matrix; None: estimated, which needs points off one plane.
     threshold_px : float or None
         Reprojection error of an inlier during the search; None: all points are inliers.
+    confidence, max_samples : float, int
+        Probability of a sample without outliers at which the search ends, and the largest number of samples.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from.
 
@@ -339,8 +349,8 @@ def resect(
         If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
         lengths and K33 = 1.
     StageFailure
-        If there are too few points or inliers, all points lie in one plane and K is not given, or points are
-        behind the camera that fits them, as in left-handed coordinates.
+        If there are too few points, no more inliers than chance explains, all points lie in one plane and K
+        is not given, or points are behind the camera that fits them, as in left-handed coordinates.
 
     Examples
     --------
@@ -359,10 +369,9 @@ def resect(
         K = np.asarray(K, dtype=np.float64)
         require_calibration("resect", K)
     require_finite("resect", X, xy)
-    if threshold_px is not None and not 0.0 < threshold_px < np.inf:
-        rule = "threshold_px must be positive and finite, or None for no search"
-        raise ValueError(f"{rule}; got {threshold_px}")
-    return resect_robust(X, xy, K, threshold_px, np.random.default_rng(seed))
+    require_threshold(threshold_px, xy)
+    budget = search_budget(confidence, max_samples)
+    return resect_robust(X, xy, K, threshold_px, budget, np.random.default_rng(seed))
 
 
 def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
@@ -525,6 +534,31 @@ def _checked_points(
         near = np.abs(X[:, 3:]) > 1e-12 * np.linalg.norm(X, axis=1, keepdims=True)
         X = np.where(near, X / np.where(near, X[:, 3:], 1.0), 0.0)
     return X, views, point, xy[views, point]
+
+
+def require_threshold(threshold_px: float | None, *points: F64) -> None:
+    """Raise ``ValueError`` unless a threshold is None, or positive and smaller than the extents of points."""
+    if threshold_px is None:
+        return
+    if not 0.0 < threshold_px < np.inf:
+        raise ValueError(
+            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
+        )
+    extents = [float(np.ptp(xy, axis=0).max()) for xy in points if len(xy)]
+    if extents and 0.0 < (extent := min(extents)) <= threshold_px:
+        raise ValueError(
+            f"threshold_px must be smaller than the extent of the points, {extent:.3g}, which it cannot tell "
+            f"from wrong ones otherwise; got {threshold_px:g}"
+        )
+
+
+def search_budget(confidence: float, max_samples: int) -> Budget:
+    """The budget of a search, checked."""
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
+    if isinstance(max_samples, bool) or not int(max_samples) == max_samples or max_samples < 1:
+        raise ValueError(f"max_samples must be a whole number of at least 1; got {max_samples}")
+    return Budget(confidence, int(max_samples))
 
 
 def as_cameras(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from thesisrecon.api.cameras import require_threshold, search_budget
 from thesisrecon.arrays import F64, U8, require_finite, require_shapes
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
@@ -132,7 +133,13 @@ def draw_epipolar_lines(
 
 
 def estimate_homography(
-    xy1: F64, xy2: F64, *, threshold_px: float | None = 1.0, seed: int | Generator = 0
+    xy1: F64,
+    xy2: F64,
+    *,
+    threshold_px: float | None = 1.0,
+    confidence: float = 0.9999,
+    max_samples: int = 100_000,
+    seed: int | Generator = 0,
 ) -> HomographyFit:
     """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4).
 
@@ -145,6 +152,8 @@ def estimate_homography(
         Matched points, N >= 4, px.
     threshold_px : float or None
         Distance of an inlier during the search; None: all matches are inliers.
+    confidence, max_samples : float, int
+        Probability of a sample without outliers at which the search ends, and the largest number of samples.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from.
 
@@ -158,7 +167,8 @@ def estimate_homography(
     ValueError
         If the shapes differ or coordinates are not finite.
     StageFailure
-        If there are too few matches or inliers, or they do not determine H (collinear points, for example).
+        If there are too few matches, no more inliers than chance explains, or they do not determine H
+        (collinear points, for example).
 
     Examples
     --------
@@ -174,9 +184,9 @@ def estimate_homography(
     xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
     require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("estimate_homography", xy1, xy2)
-    if threshold_px is not None and not threshold_px > 0.0:
-        raise ValueError(f"threshold_px must be positive, or None for no search; got {threshold_px}")
-    return fit_homography(xy1, xy2, threshold_px, np.random.default_rng(seed))
+    require_threshold(threshold_px, xy1, xy2)
+    budget = search_budget(confidence, max_samples)
+    return fit_homography(xy1, xy2, threshold_px, budget, np.random.default_rng(seed))
 
 
 def estimate_trifocal(
@@ -298,6 +308,7 @@ def estimate_fundamental(
     (9, 9)
     """
     rng = np.random.default_rng(seed)
+    require_threshold(threshold_px, np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64))
     if threshold_px is None:
         threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
     if method == "locally-optimised":
@@ -318,7 +329,7 @@ def estimate_fundamental(
             fit = fit_all(xy1, xy2, refined=method == "gold-standard")
     # Copies: the test is made later.
     xy1, xy2 = np.array(xy1, dtype=np.float64), np.array(xy2, dtype=np.float64)
-    return FundamentalEstimate(**vars(fit), xy1=xy1, xy2=xy2)
+    return FundamentalEstimate(**vars(fit), xy1=xy1, xy2=xy2, unit_px=threshold_px)
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:

@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
@@ -260,25 +259,6 @@ def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
         count = np.searchsorted(ordered, cell, "right") - np.searchsorted(ordered, cell, "left")
         numbers = np.maximum(numbers, count)
     return np.asarray(1.0 / numbers)
-
-
-def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: int) -> float:
-    """log10 of the expected number of models with as many inliers among wrong matches, sums of weights.
-
-    A-contrario bound (tried - free) C(tried, free) P(Binomial >= agreeing - free): the model passes through
-    ``free`` matches, the rest agree with probability ``chance`` (Moisan and Stival, IJCV 57, 2004).
-    """
-    rest, hits = tried - free, agreeing - free
-    if hits <= 0.0 or rest <= 0.0:
-        return 0.0
-    tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
-    ways = (
-        scipy.special.gammaln(tried + 1.0)
-        - scipy.special.gammaln(free + 1.0)
-        - scipy.special.gammaln(rest + 1.0)
-        + np.log(max(rest, 1.0))
-    )
-    return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
 
 
 def chance_of_agreement(xy1: F64, xy2: F64, band_px: float) -> float:

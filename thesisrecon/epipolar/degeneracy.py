@@ -19,7 +19,6 @@ from thesisrecon.epipolar._matches import (
     PairFrame,
     chance_of_agreement,
     check_matches,
-    log10_false_alarms,
     multiplicity_weights,
 )
 from thesisrecon.epipolar._sampling import sampson_distances
@@ -28,6 +27,7 @@ from thesisrecon.epipolar.refinement import SAMPSON, refine
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.optimize.noise import student_factor
+from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
 Method = Literal[
@@ -126,13 +126,15 @@ def _competing_model(start: F64, f: F64, points: F64, weights: F64, band: float)
     return _CompetingModel(other, lost, gained, error, min(error, back))
 
 
-def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator) -> DegeneracyReport:
+def assess_degeneracy(
+    fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator, unit_px: float = 1.0
+) -> DegeneracyReport:
     """Test whether the matches determine the fundamental matrix of a fit.
 
     F is undetermined if the inliers off the dominant plane are no more than expected by chance, if another F
     of that plane or of another search explains about as many matches (McNemar's test) at a relevant distance,
     if more than a fifth of the inliers off the plane are contradicted by neighbours on it (as matches between
-    repeated windows are), or if the covariance allows errors of the epipolar lines above a pixel. Wrong
+    repeated windows are), or if the covariance allows errors of the epipolar lines above ``unit_px``. Wrong
     matches as coherent as a surface cannot be detected.
     """
     xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
@@ -140,14 +142,14 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
         raise ValueError(f"the fit has {fit.inliers.shape} inlier flags for {len(xy1)} matches")
     frame = PairFrame.of(xy1, xy2)
     points, f = frame.points(xy1, xy2), frame.matrix_in_frame(fit.F)
-    sigma_px = max(fit.sigma_px, 0.1)
-    band_px = max(2.5 * fit.sigma_px, 0.3)
+    sigma_px = max(fit.sigma_px, 0.1 * unit_px)
+    band_px = max(2.5 * fit.sigma_px, 0.3 * unit_px)
     plane = find_dominant_plane(f, points, fit.inliers, sigma=sigma_px * frame.scale, rng=rng)
     error_px = _expected_error(fit, xy1, xy2)
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
     H, off_plane = plane[0], plane[1] > OFF_PLANE
-    weights, band = multiplicity_weights(xy1, xy2), band_px * frame.scale
+    weights, band = multiplicity_weights(xy1 / unit_px, xy2 / unit_px), band_px * frame.scale
     of_plane, chance_of_model = _competing_starts(f, points, weights, H, off_plane, band=band, rng=rng)
     starts = [*of_plane, *(frame.matrix_in_frame(F) for F in fit.competing_models)]
     models = [_competing_model(start, f, points, weights, band) for start in starts]
@@ -158,7 +160,7 @@ def assess_degeneracy(fit: FundamentalFit, xy1: F64, xy2: F64, *, rng: Generator
     chance_of_match = chance_of_agreement(xy1, xy2, band_px)
     chance = max(chance_of_model, chance_of_match)
     false_alarms = log10_false_alarms(agreeing - contradicted, tried, chance=chance, free=2)
-    relevant_px = max(1.0, 2.0 * fit.sigma_px)
+    relevant_px = max(unit_px, 2.0 * fit.sigma_px)
     # A competing model must gain more than wrong matches agree by chance, and 5 % of the inliers off it.
     expected = 2.0 * chance_of_match * (tried - agreeing)
     least = max(0.05 * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
@@ -234,17 +236,20 @@ class FundamentalEstimate(FundamentalFit):
     ----------
     xy1, xy2 : ndarray (M, 2)
         The matches, px.
+    unit_px : float
+        Error of epipolar lines that matters: the threshold of the search.
     """
 
     xy1: F64 = field(kw_only=True, repr=False)
     xy2: F64 = field(kw_only=True, repr=False)
+    unit_px: float = field(default=1.0, kw_only=True, repr=False)
 
     @cached_property
     def degeneracy(self) -> DegeneracyReport:
         """The test of section 5.5 with its evidence; the same for the same matches and F."""
         if len(self.xy1) < MINIMUM:
             return DegeneracyReport(False, (f"{len(self.xy1)} matches are too few to test F",))
-        return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0))
+        return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0), unit_px=self.unit_px)
 
     @property
     def determined(self) -> bool:

@@ -17,14 +17,9 @@ from thesisrecon.epipolar._matches import PairFrame, noise_width
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
-from thesisrecon.geometry.two_view import (
-    homography_linear,
-    homography_residuals,
-    homography_sampson_residuals,
-)
-from thesisrecon.optimize.least_squares import minimize_residuals
+from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.optimize.ransac import search_models
+from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
@@ -221,7 +216,9 @@ class HomographyFit:
     covariance: F64
 
 
-def fit_homography(xy1: F64, xy2: F64, threshold_px: float | None, rng: Generator) -> HomographyFit:
+def fit_homography(
+    xy1: F64, xy2: F64, threshold_px: float | None, budget: Budget, rng: Generator
+) -> HomographyFit:
     """Fit a homography; arguments as for :func:`thesisrecon.estimate_homography`."""
     if len(xy1) < _SAMPLE or min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) == 0.0:
         raise _undetermined(f"{counted(len(xy1), 'match')}, at least 4 different ones are needed")
@@ -231,18 +228,20 @@ def fit_homography(xy1: F64, xy2: F64, threshold_px: float | None, rng: Generato
         H, inverse = _refine(homography_linear(points[:, :2], points[:, 2:]), points)
     else:
         gate = threshold_px * frame.scale
-        H = _search(points, gate, rng)
+        H, samples = _search(points, gate, budget, rng)
+        _require_more_than_chance(H, points, gate, samples)
         for k in range(_ROUNDS):
             before = inliers
-            r = homography_sampson_residuals(H, points[:, :2], points[:, 2:])
-            distance = np.linalg.norm(r, axis=1)
+            distance = np.sqrt(squared_plane_distances(H, points))
             if k == 0:
-                limit = max(noise_width(np.abs(r[:, 0]), gate, parameters=_PARAMETERS), gate)
+                first = np.abs(homography_sampson_residuals(H, points[:, :2], points[:, 2:])[:, 0])
+                limit = max(noise_width(first, gate, parameters=_PARAMETERS), gate)
             else:
                 limit = next_inlier_limit(distance, inliers, limit, unknowns=_PARAMETERS)
             inliers = distance <= max(limit, _EXACT)
             if inliers.sum() < _SAMPLE:
-                raise _undetermined(f"{inliers.sum()} of {len(points)} are within {threshold_px:g} px")
+                within = f"{inliers.sum()} of {len(points)} matches within {threshold_px:g} px"
+                raise _undetermined(f"the best of {samples} samples has {within}")
             if k > 0 and np.array_equal(inliers, before):
                 break
             H, inverse = _refine(H, points[inliers])
@@ -264,47 +263,120 @@ def _undetermined(evidence: str) -> StageFailure:
     )
 
 
+def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
+    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers.
+
+    A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 in that of
+    the other image. Equal matches count once.
+    """
+    squared = squared_plane_distances(H, points)
+    near = squared <= gate**2
+    n, k = len(points), len(np.unique(points[near], axis=0))
+    if n == _SAMPLE:
+        return
+    limit = max(float(squared[near].max(initial=0.0)), _EXACT**2)
+    x1, x2 = homogenize(points[:, :2]), points[:, 2:]
+    w = x1 @ H[2]
+    A = H[:2, :2] - x2[:, :, None] * H[2, :2]
+    ellipse = np.sqrt(np.linalg.det(A @ A.swapaxes(1, 2) + (w**2)[:, None, None] * np.eye(2)))
+    sizes = np.prod(np.ptp(points, axis=0).reshape(2, 2), axis=1)
+    with np.errstate(divide="ignore"):
+        areas = np.pi * limit * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
+    share = float(np.minimum(areas, 1.0).max(axis=0).mean())
+    if log10_false_alarms(k, n, chance=share, free=_SAMPLE) > CHANCE:
+        raise _undetermined(
+            f"{k} of {n} different matches agree with the best of {samples} samples, which chance explains"
+        )
+
+
 def _through_four(samples: F64) -> F64:
-    """Homographies (B, 3, 3) of samples of four matches (B, 4, 4) in the frame."""
-    one = np.ones((*samples.shape[:2], 1))
-    x1, u, v = np.concatenate([samples[..., :2], one], axis=2), samples[..., 2:3], samples[..., 3:]
-    zero = np.zeros_like(x1)
-    rows = [np.concatenate([x1, zero, -u * x1], axis=2), np.concatenate([zero, x1, -v * x1], axis=2)]
-    return np.asarray(np.linalg.svd(np.concatenate(rows, axis=1))[2][:, -1].reshape(-1, 3, 3))
+    """Homographies (B', 3, 3) of samples of four matches (B, 4, 4) whose triangles keep their orientation.
+
+    With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
+    fourth, H = B diag(b / a) A^-1.
+    """
+    apart = samples[:, :3] - samples[:, 3:]
+    e, f = np.roll(apart, -1, axis=1), np.roll(apart, -2, axis=1)
+    a, b = (e[:, :, k] * f[:, :, k + 1] - e[:, :, k + 1] * f[:, :, k] for k in (0, 2))
+    same = a * b * (a.sum(axis=1) * b.sum(axis=1))[:, None]
+    # Points of a visible plane lie on one side of its horizon.
+    good = (same > 0.0).all(axis=1)
+    corners, ratio = samples[good, :3], b[good] / a[good]
+    x1 = homogenize(corners[:, :, :2])
+    dual = np.cross(np.roll(x1, -1, axis=1), np.roll(x1, -2, axis=1))
+    return unit_norm((homogenize(corners[:, :, 2:]) * ratio[:, :, None]).swapaxes(1, 2) @ dual)
 
 
-def _search(points: F64, gate: float, rng: Generator) -> F64:
-    """The homography of the samples with the least truncated squared distances in image 2."""
-    n = len(points)
-    scored = points[rng.choice(n, 1000, replace=False)] if n > 1000 else points
+def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int]:
+    """The homography with the least truncated squared distances, and the number of samples."""
 
-    def costs(H: F64) -> F64:
-        squared = np.stack([homography_residuals(h, scored[:, :2], scored[:, 2:]) for h in H]) ** 2
-        return np.asarray(np.minimum(squared / (2.0 * gate**2), 1.0).mean(axis=1))
+    def refit(H: F64, rows: I64) -> F64:
+        return refine_plane(H, points[rows[:500]], 1.5 * gate, 3) if len(rows) >= _SAMPLE else H
 
-    return search_models(
-        lambda samples: _through_four(points[samples]), costs, rng, n, _SAMPLE,
-        batch=128, batches=16, risk=1e-4,
+    found = search_models(
+        lambda samples: _through_four(points[samples]),
+        lambda H, rows: squared_plane_distances(H, points[rows]) / gate**2,
+        refit, rng, len(points), _SAMPLE, budget,
     )  # fmt: skip
+    if found is None:
+        raise _undetermined("all samples of four matches have three on one line")
+    return found.model, found.samples
+
+
+@kernel
+def _gauss_newton(H: F64, points: F64, G: F64, g: F64) -> float:
+    """Sum of squared distances; adds to G (9, 9) and g (9,) the products of their derivatives by H.
+
+    With v = (J J')^-1 c, the nearest exact match is to first order x - J' v, and the gradient of c' v is
+    twice v' times the equations' coefficients at that match.
+    """
+    J, row, total = empty((2, 2)), zeros((2, 9)), 0.0
+    for k in range(len(points)):
+        c0, c1, w = _equations(H, points[k], J)
+        a, b = J[0, 0] ** 2 + J[0, 1] ** 2 + w * w, J[0, 0] * J[1, 0] + J[0, 1] * J[1, 1]
+        determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2
+        determinant += w * w * (a + J[1, 0] ** 2 + J[1, 1] ** 2)
+        l11, l22 = np.sqrt(a), np.sqrt(determinant / a)
+        r0 = c0 / l11
+        r1 = (c1 - b / l11 * r0) / l22
+        v1 = r1 / l22
+        v0 = (r0 - b / l11 * v1) / l11
+        x1 = points[k, 0] - J[0, 0] * v0 - J[1, 0] * v1
+        y1 = points[k, 1] - J[0, 1] * v0 - J[1, 1] * v1
+        x2, y2 = points[k, 2] + w * v0, points[k, 3] + w * v1
+        total += r0 * r0 + r1 * r1
+        for j in range(3):
+            x = x1 if j == 0 else (y1 if j == 1 else 1.0)
+            row[0, j], row[0, 6 + j] = x / l11, -x2 * x / l11
+            row[1, j], row[1, 3 + j] = -b / a * x / l22, x / l22
+            row[1, 6 + j] = -(y2 - b / a * x2) * x / l22
+        for i in range(9):
+            g[i] += row[0, i] * r0 + row[1, i] * r1
+            for j in range(i, 9):
+                G[i, j] += row[0, i] * row[0, j] + row[1, i] * row[1, j]
+    return total
 
 
 def _refine(H: F64, points: F64) -> tuple[F64, F64]:
     """H of least Sampson distances of matches (n, 4), and the inverse (9, 9) of its information."""
-    start = H.ravel() / np.linalg.norm(H)
-    tangent = np.linalg.svd(start[None])[2][1:]
-
-    def residuals(x: F64) -> F64:
-        moved = (start + x @ tangent).reshape(3, 3)
-        return homography_sampson_residuals(moved, points[:, :2], points[:, 2:]).ravel()
-
-    # Steps that send points to infinity are rejected.
-    with np.errstate(all="ignore"):
-        found = minimize_residuals(residuals, np.zeros(_PARAMETERS))
-        steps = 1e-6 * np.eye(_PARAMETERS)
-        J = np.stack([residuals(found.x + e) - residuals(found.x - e) for e in steps], axis=1) / 2e-6
-    end = start + found.x @ tangent
-    s, Vt = np.linalg.svd(np.nan_to_num(J), full_matrices=False)[1:]
-    if not s[-1] > _DEPENDENT * s[0]:
-        raise _undetermined(f"the equations of {counted(len(points), 'match')} have rank below 8")
-    half = tangent.T @ (Vt.T / s)
-    return end.reshape(3, 3), half @ half.T
+    h, damping, cost = H.ravel() / np.linalg.norm(H), 0.0, np.inf
+    for _ in range(50):
+        G, g = np.zeros((9, 9)), np.zeros(9)
+        now = _gauss_newton(h.reshape(3, 3), points, G, g)
+        if now <= cost:
+            tangent = np.linalg.svd(h[None])[2][1:]
+            information = tangent @ (G + np.triu(G, 1).T) @ tangent.T
+            kept, cost, gradient = h, now, tangent @ g
+            damping = 0.1 * damping if damping > 1e-12 else 0.0
+        else:
+            damping = max(10.0 * damping, 1e-6)
+        values, vectors = np.linalg.eigh(information)
+        if not values[0] > _DEPENDENT**2 * values[-1]:
+            raise _undetermined(f"the equations of {counted(len(points), 'match')} have rank below 8")
+        step = -vectors @ (vectors.T @ gradient / (values + damping * values[-1]))
+        h = kept + step @ tangent
+        h /= np.linalg.norm(h)
+        if now <= cost and step @ information @ step < 1e-16 * max(cost, 1e-300):
+            break
+    half = tangent.T @ (vectors / np.sqrt(values))
+    return kept.reshape(3, 3), half @ half.T

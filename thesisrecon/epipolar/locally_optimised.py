@@ -66,8 +66,8 @@ class LocallyOptimisedRansac:
     min_samples, max_samples = 4000, 60000
     # Residual limits of the successive refinements, in units of ``threshold_px``.
     gates = (2.0, 1.5, 1.0)
-    # Residual up to which a match is always an inlier.
-    inlier_floor_px = 0.3
+    # Residual up to which a match is always an inlier, in units of ``threshold_px``.
+    inlier_floor = 0.3
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
@@ -165,8 +165,10 @@ class LocallyOptimisedRansac:
                 f"{self.threshold_px:g} px; at least {MINIMUM} are needed",
                 "check that the images overlap and that the matches are correct",
             )
-        limit = min(noise.limit, self.inlier_sigmas * noise.sigma)
-        inliers = r < max(limit, self.inlier_floor_px * frame.scale)
+        # The tail of the noise ends at twice the threshold.
+        widest = max(noise.core_limit, 2.0 * self.threshold_px * frame.scale)
+        limit = min(noise.limit, self.inlier_sigmas * noise.sigma, widest)
+        inliers = r < max(limit, self.inlier_floor * self.threshold_px * frame.scale)
         fitted = r < found.loss[0]
         effective = effective_noise(r[fitted], found.loss[1], parameters=PARAMETERS)
         covariance = fundamental_covariance(frame, found.f, points[fitted], effective)

@@ -19,7 +19,6 @@ from thesisrecon.epipolar._matches import (
     chance_of_agreement,
     check_matches,
     check_start,
-    log10_false_alarms,
     multiplicity_weights,
     noise_scale,
 )
@@ -47,6 +46,7 @@ from thesisrecon.geometry.two_view import (
 )
 from thesisrecon.optimize.least_squares import minimize_residuals
 from thesisrecon.optimize.noise import trimmed_noise_scale
+from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 MINIMUM = 12

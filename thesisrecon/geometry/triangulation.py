@@ -14,7 +14,7 @@ import numpy as np
 from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.conditioning import normalizing_transform
+from thesisrecon.geometry.conditioning import normalizing_transform, unit_norm
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.small_matrices import orthogonalize_columns
 
@@ -228,24 +228,31 @@ def triangulate_midpoint(P: F64, listed: SortedPixels) -> F64:
 
 
 def resect_linear(X: F64, xy: F64) -> F64:
-    """Unit cameras of least algebraic residual (DLT) of points X (..., M, 4) and xy (..., M, 2), M >= 6.
+    """Unit camera of least algebraic residual (DLT) of points X (M, 4) and xy (M, 2), M >= 6.
 
     Best with whitened unit vectors X; coplanar points do not determine the camera.
     """
-    if X.shape[-2] < 6:
-        raise ValueError(f"resect_linear needs at least 6 points; got {X.shape[-2]}")
+    if len(X) < 6:
+        raise ValueError(f"resect_linear needs at least 6 points; got {len(X)}")
     require_finite("resect_linear", X, xy)
-    flat = xy.reshape(-1, 2)
-    T = normalizing_transform(flat)
-    conditioned = xy * T[0, 0] + T[:2, 2]
-    # Rows u p3'X - p1'X and v p3'X - p2'X.
-    zero = np.zeros_like(X)
+    A, T = _camera_equations(X, xy)
+    return unit_norm(np.linalg.inv(T) @ np.linalg.eigh(A.T @ A)[1][:, 0].reshape(3, 4))
+
+
+def resect_six(X: F64, xy: F64) -> F64:
+    """Unit cameras (B, 3, 4) by 11 of the 12 equations of six points X (B, 6, 4) and xy (B, 6, 2)."""
+    A, T = _camera_equations(X, xy)
+    p = np.linalg.qr(A[:, :11].swapaxes(1, 2), mode="complete")[0][:, :, 11]
+    return unit_norm(np.linalg.inv(T) @ p.reshape(-1, 3, 4))
+
+
+def _camera_equations(X: F64, xy: F64) -> tuple[F64, F64]:
+    """Rows u p3'X - p1'X, then v p3'X - p2'X, (..., 2 M, 12) in conditioned pixels T (u, v, 1)."""
+    T = normalizing_transform(xy.reshape(-1, 2))
+    conditioned, zero = xy * T[0, 0] + T[:2, 2], np.zeros_like(X)
     first = np.concatenate([-X, zero, conditioned[..., :1] * X], axis=-1)
     second = np.concatenate([zero, -X, conditioned[..., 1:] * X], axis=-1)
-    A = np.concatenate([first, second], axis=-2)
-    p = np.linalg.eigh(A.swapaxes(-1, -2) @ A)[1][..., 0]
-    P = np.linalg.inv(T) @ p.reshape(*p.shape[:-1], 3, 4)
-    return np.asarray(P / np.linalg.norm(P, axis=(-2, -1), keepdims=True))
+    return np.concatenate([first, second], axis=-2), T
 
 
 def pose_from_three_points(X: F64, rays: F64) -> F64:

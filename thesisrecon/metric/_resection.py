@@ -29,7 +29,7 @@ from thesisrecon.metric._model import (
     seen_views,
 )
 from thesisrecon.optimize.bundle.partial import refine_pose
-from thesisrecon.optimize.ransac import draw_samples
+from thesisrecon.optimize.ransac import Budget, draw_samples
 from thesisrecon.optimize.robust_resection import resect_calibrated
 
 WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
@@ -39,6 +39,8 @@ MIN_POINTS = 15
 FEWEST_POINTS, MIN_MATCHES, AGREEING = 5, 15, 0.5
 """Points, and other matches, that must agree with a confirmed pose, and the smallest share of either."""
 MIN_INLIER_RATIO = 0.5
+FEW_SAMPLES = Budget(confidence=0.9999, max_samples=2000)
+"""Half of the points of a view are right, or it is not registered."""
 
 
 def _pose_and_focal(
@@ -59,7 +61,9 @@ def _pose_and_focal(
         threshold = threshold_px / table[row, 0]
         # The nearest of the tried focals may be some per cent off: widen the gate.
         threshold = max(threshold, 0.01) if len(zooms) > 1 else threshold
-        pose, inlier = resect_calibrated(model.X[t.point_index[k]], normalized, threshold=threshold, rng=rng)
+        pose, inlier, _ = resect_calibrated(
+            model.X[t.point_index[k]], normalized, threshold=threshold, budget=FEW_SAMPLES, rng=rng
+        )
         if pose is not None and (best is None or inlier.sum() > best[3].sum()):
             best = pose[:, :3], pose[:, 3], table[row], inlier
     return best

@@ -13,10 +13,10 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import depth, project
 from thesisrecon.geometry.conditioning import whitened_frame
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear
+from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear, resect_six
 from thesisrecon.optimize.bundle.partial import refine_camera, refine_pose
 from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.optimize.ransac import draw_samples, search_models
+from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
 _SAMPLE = 6
 # Search threshold if all points are inliers.
@@ -53,7 +53,9 @@ class Resection:
     covariance: F64
 
 
-def resect_robust(X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rng: Generator) -> Resection:
+def resect_robust(
+    X: F64, xy: F64, K: F64 | None, threshold_px: float | None, budget: Budget, rng: Generator
+) -> Resection:
     """Resect a camera; arguments as for :func:`thesisrecon.resect`."""
     needed, unknown = (6, 11) if K is None else (4, 6)
     if len(X) < needed:
@@ -70,15 +72,22 @@ def resect_robust(X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rn
         raise _no_camera(f"all {len(xy)} pixels are equal")
     limit = threshold_px or _ANY_PX
     if K is None:
-        start, inliers = resect_projective(homogenize(X), xy, threshold_px=limit, rng=rng)
+        found = resect_projective(homogenize(X), xy, threshold_px=limit, budget=budget, rng=rng)
     else:
         rays = homogenize(xy) @ np.linalg.inv(K).T
-        start, inliers = resect_calibrated(X, rays[:, :2] / rays[:, 2:], threshold=limit / K[0, 0], rng=rng)
+        normalized = rays[:, :2] / rays[:, 2:]
+        found = resect_calibrated(X, normalized, threshold=limit / K[0, 0], budget=budget, rng=rng)
+    start, inliers, samples = found
     if inliers.any() and threshold_px is None:
         inliers[:] = True
+    elif start is not None:
+        P, size = (start, _SAMPLE) if K is None else (K @ start, 3)
+        _require_more_than_chance(X, xy, P, inliers, samples, size)
     for _ in range(_ROUNDS):
         if start is None or inliers.sum() < needed:
-            raise _no_camera(f"{inliers.sum()} of {len(X)} agree with one, {needed} are needed")
+            raise _no_camera(
+                f"{inliers.sum()} of {len(X)} agree with the best of {samples} samples, {needed} are needed"
+            )
         fit = _refine(start, K, X, xy, inliers)
         distance, front = np.linalg.norm(project(fit.P, X) - xy, axis=1), depth(fit.P, homogenize(X)) > 0.0
         distance[~front] = np.inf
@@ -94,6 +103,21 @@ def resect_robust(X: F64, xy: F64, K: F64 | None, threshold_px: float | None, rn
     left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(distance[fit.inliers] ** 2) / left)) if left > 0 else float("nan")
     return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
+
+
+def _require_more_than_chance(X: F64, xy: F64, P: F64, inliers: B8, samples: int, size: int) -> None:
+    """Raise ``StageFailure`` if some camera of wrong points would have as many inliers.
+
+    Equal observations count once.
+    """
+    n, k = len(X), len(np.unique(np.column_stack([X, xy])[inliers], axis=0))
+    if n <= max(size, 4):
+        return
+    distance = np.linalg.norm(project(P, X[inliers]) - xy[inliers], axis=1)
+    limit = max(float(distance.max(initial=0.0)), _EXACT_PX)
+    share = np.pi * limit**2 / max(float(np.prod(np.ptp(xy, axis=0))), limit**2)
+    if log10_false_alarms(k, n, chance=min(share, 1.0), free=size) > CHANCE:
+        raise _no_camera(f"{k} of {n} agree with the best of {samples} samples, which chance explains")
 
 
 def _no_camera(evidence: str) -> StageFailure:
@@ -116,48 +140,48 @@ def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resectio
     return Resection(P * scale, K, R, t, inliers, 1.0, covariance * scale**2)
 
 
-def resect_projective(X: F64, xy: F64, *, threshold_px: float, rng: Generator) -> tuple[F64 | None, B8]:
+def resect_projective(
+    X: F64, xy: F64, *, threshold_px: float, budget: Budget, rng: Generator
+) -> tuple[F64 | None, B8, int]:
     """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
 
     Points X (M, 4) are signed so that depths have one sign; those of the other sign are outliers. Returns the
-    camera of the inliers with positive depths, None below six of them, and the inliers (M,).
+    camera of the inliers with positive depths, None below six of them, the inliers (M,) and the number of
+    samples.
     """
+    none = np.zeros(len(X), dtype=bool)
     if len(X) < _SAMPLE:
-        return None, np.zeros(len(X), dtype=bool)
+        return None, none, 0
     # The points of one view may fill a corner of the frame: whitening keeps all digits.
     frame = whitened_frame(X)
     Y = frame.points(X)
     Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
-    scored = rng.choice(len(Y), 1000, replace=False) if len(Y) > 1000 else np.arange(len(Y))
     # Few samples of six determine the camera if most points are on a line or plane.
     of_all = resect_linear(Y, xy)[None]
 
     def cameras(samples: I64) -> F64:
-        P = np.append(resect_linear(Y[samples], xy[samples]), of_all, axis=0)
-        return np.concatenate([P, -P])
+        P = resect_six(Y[samples], xy[samples])
+        signs = np.sign(np.einsum("bmi,bi->bm", Y[samples], P[:, 2]))
+        # The points of a sample are in front.
+        P = (P * signs[:, :1, None])[(signs == signs[:, :1]).all(axis=1)]
+        return np.concatenate([P, of_all, -of_all])
 
-    def costs(P: F64) -> F64:
-        squared = _squared_residuals(P, Y[scored], xy[scored]) / threshold_px**2
-        return np.asarray(np.minimum(squared, 1.0).mean(axis=1))
+    def squared(P: F64, rows: I64) -> F64:
+        return _squared_residuals(P, Y[rows], xy[rows]) / threshold_px**2
 
-    P = search_models(cameras, costs, rng, len(Y), _SAMPLE, batch=64, batches=12, risk=1e-3)
-    found, inlier = _refit(P, Y, xy, threshold_px)
-    return (None if found is None else frame.cameras_back(found)), inlier
+    def refit(P: F64, rows: I64) -> F64:
+        if len(rows) < _SAMPLE:
+            return P
+        camera = resect_linear(Y[rows], xy[rows])
+        return camera * (np.sign(np.median(Y[rows] @ camera[2])) or 1.0)
 
-
-def _refit(P: F64, X: F64, xy: F64, threshold_px: float) -> tuple[F64 | None, B8]:
-    """Estimate the camera again from its inliers, twice."""
-    inlier = _squared_residuals(P[None], X, xy)[0] < threshold_px**2
-    for _ in range(2):
-        if inlier.sum() < _SAMPLE:
-            return None, inlier
-        candidate = resect_linear(X[inlier], xy[inlier])
-        candidate *= np.sign(np.median(X[inlier] @ candidate[2])) or 1.0
-        support = _squared_residuals(candidate[None], X, xy)[0] < threshold_px**2
-        if support.sum() < inlier.sum():
-            break
-        P, inlier = candidate, support
-    return P, inlier
+    found = search_models(cameras, squared, refit, rng, len(Y), _SAMPLE, budget)
+    if found is None or len(found.inliers) < _SAMPLE:
+        return None, none, 0 if found is None else found.samples
+    P = refit(found.model, found.inliers)
+    if np.sum(squared(P[None], found.inliers) < 1.0) < len(found.inliers):
+        P = found.model
+    return frame.cameras_back(P), squared(P[None], np.arange(len(Y)))[0] < 1.0, found.samples
 
 
 def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
@@ -169,22 +193,43 @@ def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     return np.where((depths > 0) & np.isfinite(squared), squared, np.inf)
 
 
-def resect_calibrated(X: F64, normalized: F64, *, threshold: float, rng: Generator) -> tuple[F64 | None, B8]:
+def resect_calibrated(
+    X: F64, normalized: F64, *, threshold: float, budget: Budget, rng: Generator
+) -> tuple[F64 | None, B8, int]:
     """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score (6.4).
 
     ``normalized`` (M, 2) are the image points of ``X`` (M, 3), ``threshold`` is in their unit. Returns [R t],
-    None below four points or if no sample has a pose, and the inliers (M,).
+    None below four points or if no sample has a pose, the inliers (M,) and the number of samples.
     """
     Xh, none = homogenize(X), np.zeros(len(X), dtype=bool)
     if len(X) < 4:
-        return None, none
-    chosen = draw_samples(rng, 300, len(X), 3)
+        return None, none, 0
     rays = homogenize(normalized)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    poses = pose_from_three_points(X[chosen], rays[chosen])
-    if len(poses) == 0:
-        return None, none
-    scored = rng.choice(len(X), 500, replace=False) if len(X) > 500 else np.arange(len(X))
-    squared = _squared_residuals(poses, Xh[scored], normalized[scored])
-    pose = poses[np.minimum(squared / threshold**2, 1.0).sum(axis=1).argmin()]
-    return pose, _squared_residuals(pose[None], Xh, normalized)[0] < threshold**2
+    row = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+    def squared(poses: F64, rows: I64) -> F64:
+        return _squared_residuals(poses, Xh[rows], normalized[rows]) / threshold**2
+
+    def refit(pose: F64, rows: I64) -> F64:
+        some = rows[:300]
+        if len(some) < 4:
+            return pose
+        fit = refine_pose(
+            pose[:, :3], pose[:, 3], row, X[some], normalized[some], free=np.zeros(6, bool), loss_px=np.inf,
+            iterations=5,
+        )  # fmt: skip
+        return np.column_stack([fit.R, fit.t])
+
+    found = search_models(
+        lambda samples: pose_from_three_points(X[samples], rays[samples]),
+        squared,
+        refit,
+        rng,
+        len(X),
+        3,
+        budget,
+    )
+    if found is None:
+        return None, none, budget.max_samples
+    return found.model, squared(found.model[None], np.arange(len(X)))[0] < 1.0, found.samples

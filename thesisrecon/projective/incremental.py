@@ -18,6 +18,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.optimize.bundle.partial import refine_camera
+from thesisrecon.optimize.ransac import Budget
 from thesisrecon.optimize.robust_resection import resect_projective
 from thesisrecon.projective._model import (
     LOSS_SIGMAS,
@@ -213,7 +214,9 @@ class IncrementalProjective:
         t, early = model.tracks, self.outlier_sigmas[0]
         k = np.flatnonzero((t.view_index == view) & model.valid[t.point_index])
         X, xy = model.X[t.point_index[k]], t.xy[k]
-        P, inlier = resect_projective(X, xy, threshold_px=early * model.sigma_px, rng=rng)
+        P, inlier, _ = resect_projective(
+            X, xy, threshold_px=early * model.sigma_px, budget=Budget(0.999, 1000), rng=rng
+        )
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = Notice("resection-inliers", int(inlier.sum()), counted(len(k), "point"))
             return False
