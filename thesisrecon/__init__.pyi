@@ -27,8 +27,8 @@ from thesisrecon.camera import Camera as Camera
 from thesisrecon.api.cameras import triangulate as triangulate
 from thesisrecon.api.cameras import resect as resect
 from thesisrecon.api.cameras import cheirality as cheirality
-from thesisrecon.api.cameras import bundle_adjust as bundle_adjust
-from thesisrecon.api.cameras import BundleAdjustment as BundleAdjustment
+from thesisrecon.api.bundle import bundle_adjust as bundle_adjust
+from thesisrecon.api.bundle import BundleAdjustment as BundleAdjustment
 from thesisrecon.records import Reconstruction as Reconstruction
 from thesisrecon.api.cameras import reconstruction_from_cameras as reconstruction_from_cameras
 from thesisrecon.records import Tracks as Tracks
