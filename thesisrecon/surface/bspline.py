@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64, I32, I64
 from thesisrecon.optimize.noise import MAD_FACTOR
 from thesisrecon.records import DepthMap
@@ -37,61 +36,12 @@ def _energies() -> tuple[F64, F64]:
     return bending, np.kron(M1, M0) + np.kron(M0, M1)
 
 
-@kernel
-def _sum_squares(
-    piece: I64, value: F64, weight: F64, basis: F64, cell: int, matrix: F64, right_side: F64
-) -> None:
-    """Accumulate the upper triangles (N, 16, 16) and right sides (N, 16) of the normal equations."""
-    height, width = piece.shape
-    b = empty(16)
-    for y in range(height):
-        for x in range(width):
-            k = piece[y, x]
-            w = weight[y, x]
-            if k < 0 or w <= 0.0:
-                continue
-            for i in range(4):
-                for j in range(4):
-                    b[4 * i + j] = basis[y % cell, i] * basis[x % cell, j]
-            for m in range(16):
-                wb = w * b[m]
-                right_side[k, m] += wb * value[y, x]
-                for n in range(m, 16):
-                    matrix[k, m, n] += wb * b[n]
-
-
-@kernel
-def _evaluate_pixels(piece: I64, coefficient: I64, c: F64, basis: F64, cell: int, value: F64) -> None:
-    """Evaluate the spline at all pixels, NaN for pixels without a piece."""
-    height, width = piece.shape
-    for y in range(height):
-        for x in range(width):
-            k = piece[y, x]
-            total = np.nan
-            if k >= 0:
-                total = 0.0
-                for i in range(4):
-                    for j in range(4):
-                        total += basis[y % cell, i] * basis[x % cell, j] * c[coefficient[k, 4 * i + j]]
-            value[y, x] = total
-
-
 class Domain(NamedTuple):
     """Pixels with a surface and with used depths; ``joined`` to the pixel below and to the right."""
 
     covered: B8
     reliable: B8
     joined: tuple[B8, B8]
-
-
-class SplinePieces(NamedTuple):
-    """The connected parts of a depth map in the cells between knots, numbered cell by cell."""
-
-    piece: I64  #: (H, W) of each pixel, -1 for none
-    coefficient: I64  #: (N, 16) numbers of the coefficients of each piece
-    total: int  #: number of coefficients
-    cell: I64  #: (N,) of each piece, row by row
-    shape: tuple[int, int]  #: rows and columns of cells
 
 
 def _domain_of(depth_map: DepthMap, *, least: int, reach: float) -> Domain:
@@ -149,27 +99,18 @@ def _steps(rho: F64, deviation: F64, axis: int) -> B8:
 
 def _sizes(joined: Sequence[B8], counted: B8) -> I64:
     """(H, W) number of ``counted`` pixels in the connected region of each pixel."""
-    number = np.arange(counted.size).reshape(counted.shape)
-    label = _components(number, joined, counted.size)
+    label = components(*_edges(np.arange(counted.size).reshape(counted.shape), joined), counted.size)
     return np.asarray(np.bincount(label, counted.ravel())[label].reshape(counted.shape), dtype=np.int64)
 
 
-def _pieces_of(domain: Domain, cell: int) -> SplinePieces:
-    """Divide a domain into pieces, its connected parts in each cell, and number their coefficients.
-
-    A node has one coefficient for every connected part of the surface within its sixteen cells, so that both
-    sides of a cut are separate and the surface is smooth around the end of a cut.
-    """
-    height, width = domain.covered.shape
-    shape = (-(-height // cell), -(-width // cell))
-    piece, cells = _label_pieces(domain, cell, shape[1])
-    sides = [[part[joined] for part in _pairs(piece, axis)] for axis, joined in enumerate(domain.joined)]
-    linked = np.unique(np.concatenate(sides, axis=1), axis=1)
-    return SplinePieces(piece, *_number_coefficients(cells, shape[1], linked), cells, shape)
+def _edges(number: I64, joined: Sequence[B8]) -> I64:
+    """Numbers (2, M) of the neighbouring pixels that are ``joined`` along either axis."""
+    ends = [np.stack(_pairs(number, axis))[:, joined[axis]] for axis in (0, 1)]
+    return np.concatenate(ends, axis=1)
 
 
-def _number_coefficients(cells: I64, columns: int, linked: I64) -> tuple[I64, int]:
-    """Numbers (N, 16) of the coefficients of pieces in ``cells`` (N,), ``linked`` (2, M), and their count."""
+def _number_coefficients(cells: I64, columns: int, linked: I64) -> I64:
+    """Numbers (N, 16) of the coefficients of pieces in ``cells`` (N,), ``linked`` (2, M)."""
     i, j = np.divmod(np.arange(16), 4)
     row, column = np.divmod(cells, columns)
     node = ((row[:, None] + i) * (columns + 3) + column[:, None] + j).ravel()
@@ -180,88 +121,69 @@ def _number_coefficients(cells: I64, columns: int, linked: I64) -> tuple[I64, in
     i, j = i + (row[a] - row[b])[:, None], j + (column[a] - column[b])[:, None]
     shared = (i >= 0) & (i < 4) & (j >= 0) & (j < 4)
     start, stop = (16 * a[:, None] + np.arange(16))[shared], (16 * b[:, None] + 4 * i + j)[shared]
-    label = components(place[start], place[stop], len(node))
-    return label[place].reshape(-1, 16), int(label.max(initial=-1)) + 1
+    return components(place[start], place[stop], len(node))[place].reshape(-1, 16)
 
 
-def _label_pieces(domain: Domain, cell: int, columns: int) -> tuple[I64, I64]:
-    """Pieces (H, W), -1 for none, numbered cell by cell and by their first pixel; the cell (N,) of each."""
-    y, x = np.indices(domain.covered.shape) // cell
-    place = y * columns + x
-    pixels = np.flatnonzero(domain.covered)
-    pixels = pixels[np.argsort(place.ravel()[pixels], kind="stable")]
-    number = np.full(place.shape, -1, dtype=np.int64)
-    number.ravel()[pixels] = np.arange(len(pixels))
-    inside = [
-        joined & (np.diff(place, axis=axis) == 0) & _both(domain.covered, axis)
-        for axis, joined in enumerate(domain.joined)
-    ]
-    label = _components(number, inside, len(pixels))
-    piece = number.copy()
-    piece.ravel()[pixels] = label
-    return piece, place.ravel()[pixels[np.unique(label, return_index=True)[1]]]
+class _Spline(NamedTuple):
+    """A bicubic spline; its pieces are the connected parts of a domain in each cell between knots."""
 
-
-def _components(number: I64, joined: Sequence[B8], count: int) -> I64:
-    """Connected components (count,) of numbered pixels; ``joined`` with the next along either axis."""
-    start, stop = (
-        np.concatenate([_pairs(number, axis)[end][joined[axis]] for axis in (0, 1)]) for end in (0, 1)
-    )
-    return components(start, stop, count)
-
-
-@dataclass(frozen=True)
-class _NormalEquations:
-    """Normal equations of a spline in ``pieces`` with ``cell`` px between knots, and their pattern."""
-
-    pieces: SplinePieces
-    cell: int
-    pixel_basis: F64
-    energy: F64
-    rows: I32
-    starts: I32
-    place: I32
+    pixel: I64  #: (N,) numbers of the pixels, cell by cell
+    place: I64  #: (N,) of each pixel in its cell, row by row
+    piece: I64  #: (N,) of each pixel
+    cell: I64  #: (M,) of each piece, row by row
+    shape: tuple[int, int]  #: rows and columns of cells
+    coefficient: I64  #: (M, 16) numbers of the coefficients of each piece
+    basis: F64  #: (S, 16) at the places of a cell
+    energy: F64  #: (16, 16) of a piece
+    pattern: tuple[I32, I32, I32]  #: rows, starts of the columns, and (M, 256) places of the normal matrix
 
     @classmethod
-    def of(cls, pieces: SplinePieces, cell: int) -> _NormalEquations:
-        """The sparsity pattern."""
+    def over(cls, domain: Domain, knot_px: int) -> _Spline:
+        """Divide a domain into pieces and number their coefficients.
+
+        A node has one coefficient for every connected part of the surface within its sixteen cells, so that
+        both sides of a cut are separate and the surface is smooth around the end of a cut.
+        """
         # Weight of the gradient energy relative to the bending energy; it determines undetermined slopes.
         gradient_weight = 1e-7
-        own, count = pieces.coefficient, pieces.total
-        code = (own[:, None, :] * count + own[:, :, None]).reshape(-1)
-        places, place = np.unique(code, return_inverse=True)
-        starts = np.searchsorted(places, np.arange(count + 1) * count).astype(np.int32)
-        bending, gradient = _energies()
-        along = _basis((np.arange(cell) + 0.5) / cell)
-        rows, place = (places % count).astype(np.int32), place.astype(np.int32).reshape(-1, 256)
-        return cls(pieces, cell, along, bending + gradient_weight * gradient, rows, starts, place)
+        y, x = np.indices(domain.covered.shape)
+        rows, columns = (-(-side // knot_px) for side in domain.covered.shape)
+        cell = y // knot_px * columns + x // knot_px
+        pixel = np.flatnonzero(domain.covered)
+        pixel = pixel[np.argsort(cell.ravel()[pixel], kind="stable")]
+        number = np.full(cell.shape, -1, dtype=np.int64)
+        number.ravel()[pixel] = np.arange(len(pixel))
+        inside = [joined & (np.diff(cell, axis=axis) == 0) for axis, joined in enumerate(domain.joined)]
+        piece = components(*_edges(number, inside), len(pixel))
+        cells = cell.ravel()[pixel[np.unique(piece, return_index=True)[1]]]
+        own = _number_coefficients(cells, columns, np.unique(piece[_edges(number, domain.joined)], axis=1))
+        count = int(own.max()) + 1
+        places, entry = np.unique(own[:, None, :] * count + own[:, :, None], return_inverse=True)
+        starts = np.searchsorted(places, np.arange(count + 1) * count)
+        pattern = tuple(part.astype(np.int32) for part in (places % count, starts, entry.ravel()))
+        along, (bending, gradient) = _basis((np.arange(knot_px) + 0.5) / knot_px), _energies()
+        place = (y % knot_px * knot_px + x % knot_px).ravel()[pixel]
+        energy = bending + gradient_weight * gradient
+        return cls(pixel, place, piece, cells, (rows, columns), own, np.kron(along, along), energy, pattern)
 
-    def sums(self, value: F64, weight: F64) -> tuple[F64, F64]:
-        """Contributions of the depths (H, W) and weights to each piece: (N, 16, 16) and (N, 16)."""
-        n = len(self.pieces.coefficient)
-        matrix, right = np.zeros((n, 16, 16)), np.zeros((n, 16))
-        _sum_squares(self.pieces.piece, value, weight, self.pixel_basis, self.cell, matrix, right)
-        upper = np.triu_indices(16, 1)
-        matrix[:, upper[1], upper[0]] = matrix[:, upper[0], upper[1]]
-        return matrix, right
-
-    def solve(self, matrix: F64, right: F64, stiffness: F64) -> F64:
-        """Coefficients for the stiffness (N,) of each piece."""
-        entries = matrix + stiffness[:, None, None] * self.energy
-        data = np.bincount(self.place.ravel(), entries.ravel(), len(self.rows))
-        count = self.pieces.total
-        A = scipy.sparse.csc_array((data, self.rows, self.starts), shape=(count, count))
-        b = np.bincount(self.pieces.coefficient.ravel(), right.ravel(), count)
+    def fit(self, value: F64, weight: F64, stiffness: F64) -> F64:
+        """Coefficients for the values (N,) and weights of the pixels and the stiffness (M,) of the pieces."""
+        weights, weighted = np.zeros((2, len(self.cell), len(self.basis)))
+        weights[self.piece, self.place], weighted[self.piece, self.place] = weight, weight * value
+        products = (self.basis[:, :, None] * self.basis[:, None]).reshape(-1, 256)
+        entries = weights @ products + stiffness[:, None] * self.energy.ravel()
+        rows, starts, entry = self.pattern
+        data, count = np.bincount(entry, entries.ravel()), len(starts) - 1
+        A = scipy.sparse.csc_array((data, rows, starts), shape=(count, count))
         factor = scipy.sparse.linalg.splu(
             A, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
-        return np.asarray(factor.solve(b))
+        right = np.bincount(self.coefficient.ravel(), (weighted @ self.basis).ravel())
+        return np.asarray(factor.solve(right))
 
     def values(self, c: F64) -> F64:
-        """(H, W) values of the spline at the pixels."""
-        value = np.empty(self.pieces.piece.shape)
-        _evaluate_pixels(self.pieces.piece, self.pieces.coefficient, c, self.pixel_basis, self.cell, value)
-        return value
+        """(N,) values of the spline at the pixels."""
+        return np.asarray((c[self.coefficient] @ self.basis.T)[self.piece, self.place])
 
 
 @dataclass(frozen=True)
@@ -286,18 +208,16 @@ class BSplineSurface:
 
     def smooth(self, depth_map: DepthMap) -> DepthMap:
         """Return the depths of the fitted surface."""
-        cell = self.knot_px
-        domain = _domain_of(depth_map, least=cell * cell, reach=float(cell))
+        domain = _domain_of(depth_map, least=self.knot_px**2, reach=float(self.knot_px))
         inverse_depth = np.full(depth_map.depth.shape, np.nan)
         if domain.reliable.any():
-            pieces = _pieces_of(domain, cell)
-            reliable = domain.reliable
-            depth = np.where(reliable, depth_map.depth, 1.0).astype(np.float64)
-            std = np.where(reliable, depth_map.std, 1.0).astype(np.float64)
-            value = np.where(reliable, 1.0 / depth, 0.0)
-            equations = _NormalEquations.of(pieces, cell)
-            c = self._coefficients(equations, value, std / depth**2, reliable)
-            inverse_depth = equations.values(c)
+            spline = _Spline.over(domain, self.knot_px)
+            depth, std, reliable = (
+                part.ravel()[spline.pixel] for part in (depth_map.depth, depth_map.std, domain.reliable)
+            )
+            depth = depth.astype(np.float64)
+            c = self._coefficients(spline, 1.0 / depth, std / depth**2, reliable)
+            inverse_depth.ravel()[spline.pixel] = spline.values(c)
         with np.errstate(divide="ignore", invalid="ignore"):
             fitted = np.where(inverse_depth > 0.0, 1.0 / inverse_depth, np.nan).astype(np.float32)
         known = np.isfinite(fitted)
@@ -308,7 +228,8 @@ class BSplineSurface:
             views=np.where(known, depth_map.views, np.uint8(0)),
         )
 
-    def _coefficients(self, equations: _NormalEquations, value: F64, std: F64, reliable: B8) -> F64:
+    def _coefficients(self, spline: _Spline, value: F64, std: F64, reliable: B8) -> F64:
+        """Coefficients fitted to inverse depths (N,); those not reliable are not used."""
         # Rounds of reweighting; those with convex weights, and with the softest spline, which detect
         # outliers.
         rounds, huber_rounds, initial_rounds = 13, 2, 5
@@ -318,34 +239,33 @@ class BSplineSurface:
         first_step, step_decay = 1e3, 0.65
         unit = float(np.median(std[reliable]))
         value, std = value / unit, std / unit
-        cells = equations.pieces.cell
-        weight, stiffness = np.where(reliable, 1.0, 0.0), np.full(len(cells), min_stiffness)
+        weight, stiffness = reliable.astype(np.float64), np.full(len(spline.cell), min_stiffness)
         noise = np.zeros(0)
         # The n residuals of a window have n - p degrees of freedom with standard deviation sqrt(2 p) of the
         # fitted part: larger mean squares are incompatible with the softest spline.
         n, p = (self.knot_px * WINDOW) ** 2, WINDOW**2
         allowed = float(n / (n - p) * (1.0 + np.sqrt(2.0 * p) / n))
         for k in range(rounds):
-            c = equations.solve(*equations.sums(value, weight / std**2), stiffness)
-            residual = np.where(reliable, equations.values(c) - value, 0.0) / std
+            c = spline.fit(value, weight / std**2, stiffness)
+            residual = (spline.values(c) - value) / std
             weight = np.where(reliable, _weights(residual, reliable, redescending=k >= huber_rounds), 0.0)
-            found = self._mean_square(equations.pieces.shape, residual, weight)
+            found = _mean_square(spline, residual, weight)
             if k < initial_rounds:
                 noise = allowed * found
             else:
                 step = first_step ** (step_decay ** (k - initial_rounds))
-                stiffness *= np.where(found <= noise, step, 1.0 / step)[cells]
+                stiffness *= np.where(found <= noise, step, 1.0 / step)[spline.cell]
         return c * unit
 
-    def _mean_square(self, cells: tuple[int, int], residual: F64, weight: F64) -> F64:
-        """(rows x columns of cells,) weighted means of squared residuals in the window around each cell."""
-        y, x = np.indices(residual.shape) // self.knot_px
-        number, count = (y * cells[1] + x).ravel(), cells[0] * cells[1]
-        totals = (
-            np.bincount(number, part.ravel(), count).reshape(cells) for part in (weight * residual**2, weight)
-        )
-        above, below = (scipy.ndimage.uniform_filter(total, WINDOW, mode="constant") for total in totals)
-        return np.asarray(above / np.maximum(below, 1e-12)).ravel()
+
+def _mean_square(spline: _Spline, residual: F64, weight: F64) -> F64:
+    """(cells,) weighted means of squared residuals of pixels (N,) in the window around each cell."""
+    cell, shape = spline.cell[spline.piece], spline.shape
+    totals = (
+        np.bincount(cell, part, shape[0] * shape[1]).reshape(shape) for part in (weight * residual**2, weight)
+    )
+    above, below = (scipy.ndimage.uniform_filter(total, WINDOW, mode="constant") for total in totals)
+    return np.asarray(above / np.maximum(below, 1e-12)).ravel()
 
 
 def _weights(residual: F64, reliable: B8, *, redescending: bool) -> F64:
