@@ -2,6 +2,7 @@
 
 import json
 import struct
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
+from thesisrecon.api import export as export_module
 from thesisrecon.cli.main import run_command
+from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import SparseModel, SparseView
 
 SIZE = (160, 120)
@@ -464,6 +467,29 @@ def test_an_export_does_not_replace_its_input(tmp_path, images):
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     # Next to the model is no problem for formats without a sparse folder.
     export(tmp_path / "sparse" / "0", tmp_path, to="nerfstudio", images=images)
+
+
+@pytest.mark.parametrize(("total", "together"), [(1e6, 1), (1e9, 4)])
+def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monkeypatch, total, together):
+    """An image of 160 x 120 px takes 0.6 MB."""
+    working, most, gate = [], [], threading.Barrier(together)
+    read, write = export_module.read_image, export_module.write_image
+
+    def counted(*given, **options):
+        working.append(1)
+        most.append(len(working))
+        gate.wait(60)
+        return read(*given, **options)
+
+    def ended(*given):
+        write(*given)
+        working.pop()
+
+    monkeypatch.setattr(export_module, "_budget", MemoryBudget(int(total)))
+    monkeypatch.setattr(export_module, "read_image", counted)
+    monkeypatch.setattr(export_module, "write_image", ended)
+    export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
+    assert (len(most), max(most)) == (4, together)
 
 
 def test_an_image_ends_where_the_lens_model_folds_back(tmp_path, images):

@@ -68,10 +68,10 @@ def test_wrong_calls_of_the_front_door_are_refused(wall):
     left, right = wall
     d, small = np.zeros(left.shape[:2], np.float32), np.zeros((3, 4), np.float32)
     for error, words, *images, s, disparity in (
-        (ValueError, "between 0", left, right, 1.5, None),
-        (ValueError, "the same size", left, right[:-3], 0.5, None),
+        (ValueError, r"s must be between 0 \(left image\) and 1 .*; got 1\.5", left, right, 1.5, None),
+        (ValueError, r"same size; got \(90, 160\) and \(87, 160\)", left, right[:-3], 0.5, None),
         (ValueError, "uint8", left.astype(float), right, 0.5, None),
-        (ValueError, "shape of the images", left, right, 0.5, small),
+        (ValueError, r"shape of the images \(90, 160\); got \(3, 4\)", left, right, 0.5, small),
         (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, [d, d]),
         (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, d[..., None]),
         (UsageError, "no image file", Path("nowhere.png"), right, 0.5, None),
@@ -81,8 +81,12 @@ def test_wrong_calls_of_the_front_door_are_refused(wall):
 
 def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
     a, b = photograph(0), photograph(1)
-    refuses(UsageError, "same image", interpolated_sequence, [a, b, a], 3)
-    refuses(UsageError, "the same size", interpolated_sequence, [a, b, photograph(2, (40, 20))], 3)
+    copy, small = Image("copy.jpg", a.rgb.copy(), a.size), photograph(2, (40, 20))
+    sizes = r"the same size; 0\.jpg is 40 x 30 and 2\.jpg is 40 x 20 px"
+    refuses(UsageError, r"0\.jpg and copy\.jpg are the same image", between.prepare_pair, a, copy)
+    refuses(UsageError, sizes, between.prepare_pair, a, small)
+    refuses(UsageError, r"0\.jpg and copy\.jpg are the same", interpolated_sequence, [a, b, copy], 3)
+    refuses(UsageError, sizes, interpolated_sequence, [a, b, small], 3)
     # Forward motion: both epipoles at (21, 14).
     e, rng = np.array([21.0, 14.0]), np.random.default_rng(0)
     xy = rng.uniform((0.0, 0.0), (40.0, 30.0), (100, 2))
@@ -106,11 +110,15 @@ def sideways(monkeypatch, match_two_views):
 
 
 @pytest.mark.parametrize(
-    ("evidence", "words"), [("a number", "a number; take the images side"), ("", "too d")]
+    ("advice", "words"),
+    [
+        ("rectify in polar coordinates", r"^too distorted; a number; take the images side by side"),
+        ("take another image", r"^too distorted; a number; take another image\.$"),
+    ],
 )
-def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch, evidence, words):
+def test_pairs_that_cannot_be_rectified_are_reported(monkeypatch, advice, words):
     def match_two_views(*_, **__):
-        raise StageFailure("too distorted", evidence, "rectify in polar coordinates" if evidence else "")
+        raise StageFailure("too distorted", "a number", advice)
 
     sideways(monkeypatch, match_two_views)
     refuses(StageFailure, words, between.prepare_pair, photograph(0), photograph(1))

@@ -53,6 +53,15 @@ def chunk(kind, data):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
+def bomb():
+    """All 30,000 x 30,000 pixels of a black PNG, 2.7 GB, in 3 MB."""
+    packer, size = zlib.compressobj(9, zlib.DEFLATED, -15), 30_000 * (3 * 30_000 + 1)
+    block = packer.compress(bytes(size // 300)) + packer.flush(zlib.Z_FULL_FLUSH)
+    data = b"\x78\xda" + 300 * block + packer.flush() + struct.pack(">I", size % 65_521 << 16 | 1)
+    whole = png(30_000, 30_000)
+    return whole[:33] + chunk(b"IDAT", data) + whole[-12:]
+
+
 def large_palette():
     """10,000 x 8000 pixels of one transparent colour of a palette, in 80 kB."""
     header = struct.pack(">IIBBBBB", 10_000, 8000, 8, 3, 0, 0, 0)

@@ -13,6 +13,7 @@ from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point
 from thesisrecon.epipolar.verification import (
     Configuration,
     PairVerification,
+    _refine_translation,
     _rotation_homography,
     _rotation_test,
     classify_configuration,
@@ -20,7 +21,7 @@ from thesisrecon.epipolar.verification import (
 )
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
 from thesisrecon.geometry.two_view import (
     fundamental_from_cameras,
     homography_residuals,
@@ -160,6 +161,27 @@ def noisy_matches(kind, n, sigma, rng, *, wrong=0.0):
     replaced = rng.random(n) < wrong
     xy2[replaced] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(replaced.sum()), 2))
     return xy1, xy2
+
+
+@pytest.mark.parametrize("gate", [np.inf, 0.3])
+def test_the_translation_is_where_no_other_epipole_has_less_error(gate):
+    rng = np.random.default_rng(2)
+    e = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
+    f, x1 = (cross_matrix(e) / np.sqrt(2.0)).ravel(), rng.normal(size=(60, 2))
+    x2 = x1 + rng.uniform(0.05, 0.3, (60, 1)) * (e[:2] / e[2] - x1)
+    x1, x2 = (x + rng.normal(0.0, 0.03, (60, 2)) for x in (x1, x2))
+    x2[::20] += 2.0 if np.isfinite(gate) else 0.0
+    _refine_translation(f, np.column_stack([x1, x2]), gate)
+    kept = np.abs(sampson_residuals(cross_matrix(e), x1, x2)) < gate
+
+    def cost(e):
+        return float(np.sum(sampson_residuals(cross_matrix(e), x1[kept], x2[kept]) ** 2))
+
+    best = np.array([f[7], f[2], f[3]])
+    assert kept.sum() == (57 if np.isfinite(gate) else 60)
+    assert np.linalg.norm(f) == pytest.approx(1.0)
+    for d in np.eye(3):
+        assert min(cost(best + 1e-3 * d), cost(best - 1e-3 * d)) > cost(best)
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,16 @@ def test_6_3_3_matches_on_epipoles_are_exact():
         np.testing.assert_allclose(correct_matches(np.cross(np.eye(3), [0.0, 0.0, 1.0]), a, b), (a, b))
 
 
+@holds_for_every(st.sampled_from(["general", "forward", "near the epipoles", "rectified"]))
+def test_6_3_optimal_methods_do_not_depend_on_the_frame_of_space(rng, kind):
+    P, X = two_views(kind, rng)
+    xy = images(P, X) + rng.normal(size=(2, 40, 2))
+    G = np.eye(4) + 0.2 * rng.normal(size=(4, 4))
+    moved = P @ np.linalg.inv(G) * rng.uniform(-3.0, 3.0, (2, 1, 1))
+    a, b = (twins.reprojection_costs(p, triangulate_polynomial(p, xy), xy) for p in (P, moved))
+    np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-11)
+
+
 def several_views(rng, sigma_px, n=12):
     """Five cameras about the origin and noisy pixels (5, n, 2), a third of them not seen."""
     P = np.stack([random_camera(rng)[0] for _ in range(5)]) * rng.uniform(0.2, 5.0, (5, 1, 1))

@@ -58,6 +58,29 @@ def test_json_has_no_nan(tmp_path):
     assert partial == [True, False, False]
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("größe 写真 \U0001f4f7 e\u0301 <b>&\"'", "größe 写真 \U0001f4f7 e\u0301 <b>&\"'"),
+        ("a\nb\t\x1b[31m\x7f\x85", "a\\x0ab\\x09\\x1b[31m\\x7f\\x85"),
+        ("a\u2028b\u2029c\u202egpj.exe\u2066", "a\\u2028b\\u2029c\\u202egpj.exe\\u2066"),
+        (os.fsdecode(b"gr\xfc\xdfe"), "gr\\xfc\\xdfe"), ("half \ud800", "half \\ud800"),
+        ("both \ud800\udcff", "both \\ud800\\udcff"),
+    ],
+)  # fmt: skip
+def test_names_are_shown_in_one_line_and_in_their_order(name, shown):
+    assert files.printable(name) == shown
+    shown.encode("utf-8")
+
+
+def test_a_long_sentence_keeps_its_beginning_and_its_end():
+    said = f"'--seed': '{'9' * 50}' is no integer"
+    assert files.shorten_middle(said, len(said)) == said
+    assert files.shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
+    assert files.shortened("x" * 60) == "x" * 60
+    assert files.shortened("x" * 61) == "x" * 57 + "..."
+
+
 def test_only_regular_files_of_a_size_are_read(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"\xef\xbb\xbfgr\xc3\xb6\xc3\x9fe")

@@ -11,7 +11,7 @@ from tests.synthetic import disparity, one_by_one, photograph, sideways_fundamen
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._prepared import _corner_patches, prepare_image
-from thesisrecon.matching.growth import SeedsAndGrowth, _fit_local_affines
+from thesisrecon.matching.growth import SeedsAndGrowth, _fit_local_affines, _match_guided
 from thesisrecon.matching.strength import (
     _displacement_weight,
     _relative_difference_weight,
@@ -92,6 +92,32 @@ def test_corner_patches_equal_their_numpy_twin_at_every_level():
         assert np.abs(found[n] - twin).max() < 1e-4
     # The third window leaves the image.
     assert not found[2].any()
+
+
+def test_guided_matches_are_the_most_alike_of_all_that_are_allowed():
+    one, two = (prepared(image) for image in stereo_scene(200, 260))
+    xy1, xy2 = one.features.xy, two.features.xy
+    predicted = np.tile(np.eye(2), (len(xy1), 1, 1)), xy1 - (14.0, 0.0), np.full(len(xy1), 12.0)
+    F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    index, score, second_best = _match_guided(
+        one.pyramid, (xy1, one.features.scale), predicted, (xy2, two.features.scale, two.patches),
+        two.cells, (F, np.full(len(xy1), 1.5), 0.7),
+    )  # fmt: skip
+    correlation = one.patches @ two.patches.T
+    found = 0
+    # A window that touches the border may be inside for one and outside for the other.
+    for n in np.flatnonzero((np.minimum(xy1, np.array(one.size) - 1 - xy1) > 9).all(axis=1)):
+        near = np.linalg.norm(predicted[1][n] - xy2, axis=1) <= 12.0
+        alike = np.where(near & (np.abs(xy1[n, 1] - xy2[:, 1]) <= 1.5), correlation[n], -1.0)
+        best = int(alike.argmax())
+        if alike[best] <= 0.7:
+            assert (index[n], score[n], second_best[n]) == (-1, 0.0, -1.0)
+            continue
+        found += 1
+        assert index[n] == best
+        elsewhere = np.where(np.linalg.norm(xy2[best] - xy2, axis=1) > 3.0, alike, -1.0).max()
+        assert (score[n], second_best[n]) == pytest.approx((alike[best], elsewhere), abs=1e-4)
+    assert found > 50
 
 
 def test_alignment_recovers_an_affine_map_or_gives_up():

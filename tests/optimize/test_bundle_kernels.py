@@ -11,7 +11,7 @@ from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.geometry.small_matrices import floored_diagonal
 from thesisrecon.optimize.bundle import covariance as bundle_covariance
-from thesisrecon.optimize.bundle import metric_kernels, scatter, schur
+from thesisrecon.optimize.bundle import metric_kernels, projective, scatter, schur
 from thesisrecon.optimize.bundle.covariance import robust_sigma
 from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points, sum_leverages
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
@@ -75,6 +75,39 @@ def test_poses_move_by_the_exponential_map(size):
     turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
     np.testing.assert_allclose(R_out, turn @ R, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], rtol=1e-14, atol=2e-15)
+
+
+@pytest.mark.parametrize("delta", [1e6, 1.0])
+def test_projective_jacobians_match_finite_differences(delta):
+    rng = np.random.default_rng(4)
+    P, X = rng.normal(size=(3, 12)), rng.normal(size=(7, 4))
+    P, X = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (P, X))
+    view, point = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(7)))
+    xy, J, state = rng.normal(size=(21, 2)), Jacobians.empty(21, 11, 0), projective.UnitState.at(P, X)
+    given = state, Observations(view, point, xy), Weighting(1.0, delta)
+    cost = projective.linearize_projective(*given, J)
+    assert projective.projective_cost(*given) == pytest.approx(cost, rel=1e-12)
+
+    def residuals(steps):
+        moved = np.empty_like(P), np.empty_like(X)
+        projective.tangent_step(P, state.vP, state.bP, steps[0], moved[0])
+        projective.tangent_step(X, state.vX, state.bX, steps[1], moved[1])
+        u = np.einsum("kab,kb->ka", moved[0].reshape(3, 3, 4)[view], moved[1][point])
+        return u[:, :2] / u[:, 2:] - xy
+
+    r = residuals((np.zeros((3, 11)), np.zeros((7, 3))))
+    rho, weight = huber(np.sum(r**2, axis=1), delta)
+    assert cost == pytest.approx(0.5 * rho.sum())
+    np.testing.assert_allclose(J.residual, np.sqrt(weight)[:, None] * r, rtol=1e-12)
+    for kind, found in enumerate((J.A, J.B)):
+        for c in range(found.shape[2]):
+            ends = []
+            for h in (1e-7, -1e-7):
+                steps = np.zeros((3, 11)), np.zeros((7, 3))
+                steps[kind][:, c] = h
+                ends.append(residuals(steps))
+            slope = np.sqrt(weight)[:, None] * (ends[0] - ends[1]) / 2e-7
+            np.testing.assert_allclose(found[:, :, c], slope, rtol=1e-4, atol=1e-5 * np.abs(found).max())
 
 
 def test_the_loss_of_the_kernels_is_that_of_numpy():

@@ -23,6 +23,7 @@ from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import UsageError, WorkersLost
 from thesisrecon.io._files import read_json
+from thesisrecon.pipeline import matching
 from thesisrecon.runtime import _executors as workers
 from thesisrecon.runtime._executors import Workers
 
@@ -196,6 +197,52 @@ def test_workers_of_other_code_unknown_tasks_and_invalid_executors_are_refused()
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
         workers._answer(workers.package_key(), missing)
     refuses(UsageError, "or a concurrent", Workers, 1, 3)
+
+
+def test_an_executor_is_given_few_tasks_at_a_time():
+    """Large sets must not lie in memory as tasks."""
+    asked, done = [], []
+
+    def tasks():
+        for n in range(50):
+            asked.append(n)
+            assert len(asked) - len(done) <= 2 * workers.AHEAD + 2
+            yield (n,)
+
+    with futures.ThreadPoolExecutor(2) as pool:
+        Workers(2, pool).run(abs, tasks(), lambda n, _: done.append(n))
+    assert sorted(done) == asked == list(range(50))
+
+
+def test_prepared_views_stay_within_their_memory_bound(monkeypatch):
+    made = []
+
+    def prepare(_, features):
+        made.append(features)
+        return np.zeros(100)
+
+    monkeypatch.setattr(matching, "CACHE_BYTES", 4 * 800)
+    views = matching.PreparedViews(prepare, {i: (None, i) for i in range(6)})
+    assert [len(views[k]) for k in (0, 1, 2, 3, 4, 5, 5, 2, 0)] == [100] * 9
+    assert made == [0, 1, 2, 3, 4, 5, 0]
+    assert (len(views.subset([4, 5])), len(views.prepared_by(prepare)[0])) == (2, 100)
+    assert made[7:] == [0]
+    refuses(IndexError, "view 0 is not among", views.subset([4, 5]).__getitem__, 0)
+
+
+@pytest.mark.parametrize(("views", "workers_there"), [(14, 2), (5, 4), (80, 2)])
+def test_batches_hold_every_pair_once_and_few_views(views, workers_there):
+    every = [(i, j) for i in range(views) for j in range(i + 1, views)]
+    numbers = list(range(0, len(every), 2))
+    dealt = matching.batch_pairs(every, numbers, workers_there, [3000] * views)
+    assert sorted(n for batch in dealt for n in batch) == numbers
+    assert len(dealt) >= min(len(numbers), 8 * workers_there)
+    assert len({len(batch) for batch in dealt[:-1]}) == 1
+    for batch in dealt:
+        assert len(batch) <= matching.MAX_BATCH
+        assert len({view for n in batch for view in every[n]}) <= 6 * len(batch) ** 0.5
+    corners = int(matching.MAX_RESULT_BYTES / matching.MATCH_BYTES)
+    assert {len(batch) for batch in matching.batch_pairs(every, numbers, 1, [corners] * views)} == {1}
 
 
 def refuse(*_):

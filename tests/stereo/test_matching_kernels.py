@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.stereo import _postprocessing
-from thesisrecon.stereo._cost import census, split_channels
+from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
 from thesisrecon.stereo._depth_fusion import (
     InverseDepth,
     fit_planes,
@@ -48,6 +48,49 @@ def test_census():
     assert (bits == darker @ (1 << np.arange(24)[::-1])).all()
 
 
+@pytest.mark.parametrize(("first", "n"), [(0, 6), (-4, 9), (15, 12), (30, 3), (-40, 3)])
+def test_costs_and_their_means_over_supports_equal_plain_loops(first, n):
+    rng = np.random.default_rng(2)
+    left, right = random_side(rng), random_side(rng)
+    left[1][:] //= 8
+    (bits, levels, valid), (bits2, levels2, valid2) = left, right
+    height, width = bits.shape
+    found, costs = np.empty((height, n, width), np.uint8), np.full((height, n, width), 33)
+    for y, q, x in np.ndindex(costs.shape):
+        u = x - first - q
+        if 0 <= u < width and valid[y, x] and valid2[y, u]:
+            apart = np.abs(levels[:, y, x].astype(int) - levels2[:, y, u]).sum()
+            ones = int(bits[y, x] ^ bits2[y, u]).bit_count()
+            costs[y, q, x] = (400 * ones + 9 * min(apart, 300)) >> 8
+    given = left, right, np.empty((4, 0, height, width), np.uint8), first, np.array([400, 9, 300], np.int16)
+    cost_volume(*given, np.uint8(33), found)
+    assert (found == costs).all()
+
+    def arm(y, x, dy, dx):
+        for s in (1, 2):
+            v, u = y + s * dy, x + s * dx
+            if not (0 <= v < height and 0 <= u < width and valid[v, u]):
+                return s - 1
+            if (np.abs(levels[:, v, u] - levels[:, y, x]) > 12).any():
+                return s - 1
+        return 2
+
+    masks = np.empty((4, 2, height, width), np.uint8)
+    support_masks(levels, valid, np.int16(12), masks)
+    steps = ((0, -1), (0, 1), (-1, 0), (1, 0))
+    arms = np.array([[[arm(y, x, *step) for x in range(width)] for y in range(height)] for step in steps])
+    assert (masks == np.where(arms[:, None] > np.arange(2)[:, None, None], 255, 0)).all()
+    assert set(np.unique(arms)) == {0, 1, 2}
+    cost_volume(left, right, masks, *given[3:], np.uint8(33), found)
+    for y, x in np.ndindex(height, width):
+        north, south = arms[2:, y, x]
+        rows = [
+            costs[v, :, x - arms[0, v, x] : x + arms[1, v, x] + 1] for v in range(y - north, y + south + 1)
+        ]
+        mean = np.concatenate(rows, axis=1).mean(axis=1)
+        assert np.abs(found[y, :, x] - mean).max() < 0.501
+
+
 @pytest.mark.parametrize("pairs", [2, 4])
 @pytest.mark.parametrize("shape", [(11, 6, 14), (200, 1, 9), (1, 5, 8), (6, 4, 1)])
 def test_sums_of_paths(shape, pairs):
@@ -66,6 +109,22 @@ def test_sums_of_paths(shape, pairs):
     for found, (dy, dx) in zip(total, [(0, 1), (1, 0), (1, 1), (1, -1)], strict=False):
         there, back = (path_sum(costs, penalty, 20, (s * dy, s * dx)) for s in (1, -1))
         assert (found == there + back).all()
+
+
+def test_best_disparities_of_both_sides_equal_plain_loops():
+    sums = np.random.default_rng(6).integers(0, 250, (2, 5, 7, 15)).astype(np.uint8)
+    left, right, confidence = (np.empty((3, 15), np.float32) for _ in range(3))
+    _postprocessing.best_disparities(sums, 1, -2, (left, right, confidence), 40.0)
+    total = sums.sum(axis=0, dtype=int)[1:4]
+    for y, x in np.ndindex(3, 15):
+        mine = total[y, :, x]
+        best = int(mine.argmin())
+        a, b = (mine[best - 1] - mine[best], mine[best + 1] - mine[best]) if 0 < best < 6 else (1, 1)
+        assert left[y, x] == pytest.approx(best - 2 + 0.5 * (a - b) / max(a, b))
+        margin = min(value for q, value in enumerate(mine) if abs(q - best) > 1) - mine[best]
+        assert confidence[y, x] == pytest.approx(margin / (margin + 40.0))
+        seen = {q: total[y, q, x + q - 2] for q in range(7) if 0 <= x + q - 2 < 15}
+        assert right[y, x] == min(seen, key=lambda q: (seen[q], q)) - 2
 
 
 def test_contradictions_and_peaks_go_and_pinholes_are_filled():
