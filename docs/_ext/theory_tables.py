@@ -27,10 +27,10 @@ def plain_code(_app, _env, node, contnode):
 class TheoryTable(SphinxDirective):
     """The table of a chapter: where in the thesis, which code, what it does, which tests show it.
 
-    Two columns, so that it fits a narrow page.
+    Two columns, so that it fits a narrow page. The content is for readers of the file alone: it is not shown.
     """
 
-    required_arguments = 1
+    required_arguments, has_content = 1, True
 
     def run(self):
         lines = ["| thesis | code, and the tests that show it |", "| --- | --- |"]

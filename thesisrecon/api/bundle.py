@@ -30,7 +30,8 @@ class BundleAdjustment:
     """Refined cameras and points with their uncertainty.
 
     All covariances are those of the inner gauge (free network adjustment): among the solutions that differ by
-    a similarity, the one that moves the cameras least. They contain the uncertainty of all other unknowns.
+    a similarity, the one that moves the cameras least (Triggs et al., "Bundle adjustment - a modern
+    synthesis", 2000, section 9). They contain the uncertainty of all other unknowns.
     """
 
     cameras: tuple[Camera, ...]  #: with ``std`` of their intrinsics (0: not free)

@@ -66,6 +66,11 @@ def self_calibrate(
         If the reconstruction is not projective, the method is unknown or the seed is invalid; if no
         calibration is determined.
 
+    Notes
+    -----
+    The methods solve P Q P' ~ K K' (HZ 19.3; Pollefeys, Koch and Van Gool, IJCV 32, 1999), Kruppa's equations
+    (HZ 19.4), or first the plane at infinity (HZ 19.5).
+
     Examples
     --------
     Six views of a cloud of points by one camera of unknown focal length:
@@ -137,7 +142,7 @@ def plane_at_infinity(
     xy: F64 | None = None, config: Config | None = None, images: Sequence[Image] = (), seed: int = 0,
     vanishing_points: F64 | None = None, method: str | SelfCalibrator | None = None,
 ) -> F64:  # fmt: skip
-    """Locate the plane at infinity of a projective frame (chapter 7, stratified).
+    """Locate the plane at infinity of a projective frame (chapter 7, stratified; HZ 10.4.1 and 19.5).
 
     Parameters
     ----------
@@ -189,7 +194,7 @@ def upgrade_affine(
     reconstruction: Reconstruction, plane: F64 | None = None, *, config: Config | None = None,
     images: Sequence[Image] = (), seed: int = 0,
 ) -> Reconstruction:  # fmt: skip
-    """Upgrade a projective reconstruction to an affine one (3.4.3, chapter 7).
+    """Upgrade a projective reconstruction to an affine one: P G^-1, G X (3.4.3, chapter 7; HZ 10.4.1).
 
     Parallel lines and ratios of lengths along them are then those of the scene.
 

@@ -168,7 +168,7 @@ def reconstruction_from_cameras(
     *cameras: F64, sizes: I64, X: F64 | None = None, xy: F64 | None = None,
     stratum: Stratum = "metric", sigma_px: float = 1.0,
 ) -> Reconstruction:  # fmt: skip
-    """Return the reconstruction of plain arrays.
+    """Return the reconstruction of plain arrays, with cameras P = K [R t] (section 3.5; HZ 6.1).
 
     Parameters
     ----------

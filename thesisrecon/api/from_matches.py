@@ -119,7 +119,7 @@ def reconstruct_from_tracks(
     names: Sequence[str] | None = None, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
 ) -> RunResult:  # fmt: skip
-    """Reconstruct metric cameras and points from tracks of any program.
+    """Reconstruct metric cameras and points from tracks of any program (chapters 6 and 7; HZ 10, 19).
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def reconstruct_from_colmap(
 ) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras and points from a COLMAP database or sparse model.
 
-    Nothing of COLMAP's calibration and poses is used.
+    Nothing of its calibration and poses is used (COLMAP: Schönberger and Frahm, CVPR 2016).
 
     Parameters
     ----------

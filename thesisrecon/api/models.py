@@ -237,7 +237,7 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
 def scaled(
     model: SparseModel | RunResult | str | Path, name1: str, name2: str, distance: float
 ) -> SparseModel:
-    """Scale a model so that two camera centres have a known distance.
+    """Scale a model so that two camera centres have a known distance (section 3.4.4; HZ 10.2).
 
     Parameters
     ----------
@@ -400,7 +400,7 @@ Model = str | Path | SparseModel | RunResult | Mapping[str, Camera]
 
 
 def compare_models(a: Model, b: Model) -> ModelComparison:
-    """Compare two metric models of the same images after the similarity that takes a to b.
+    """Compare two metric models of the same images after the similarity (Umeyama 1991) from a to b.
 
     Parameters
     ----------

@@ -88,6 +88,11 @@ def reconstruct(
     StageFailure
         If the images cannot be reconstructed; intermediate results, summary and report are in ``out``.
 
+    Notes
+    -----
+    The steps of Algorithm 1 of the thesis (section 1.4) stand in order in
+    ``thesisrecon.pipeline.algorithm1``.
+
     Examples
     --------
     >>> from tempfile import TemporaryDirectory

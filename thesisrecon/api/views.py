@@ -326,7 +326,7 @@ def render(
     mesh: TexturedMesh, camera: Camera, *, shading: Shading | None = None,
     background: tuple[int, int, int] = (0, 0, 0), samples: int = 2, threads: int = 1,
 ) -> RenderedView:  # fmt: skip
-    """Render a mesh.
+    """Render a mesh with a z-buffer, exact in perspective (section 2.6).
 
     Parameters
     ----------
