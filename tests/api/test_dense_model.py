@@ -13,15 +13,7 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from tests.stereo.depth_scenes import RADIAL, SIZE, make_walled, on_arc
-from thesisrecon import (
-    Camera,
-    PipelineConfig,
-    TexturedMesh,
-    depth_maps,
-    fuse_depth_maps,
-    texture,
-    write_mesh,
-)
+from thesisrecon import Camera, PipelineConfig, TexturedMesh, depth_maps, fuse_depth_maps, texture, write_mesh
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import StageFailure, UsageError

@@ -33,12 +33,7 @@ from thesisrecon.geometry.conditioning import unit_norm
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_distance_std, epipoles, plane_homography
 from thesisrecon.records import FundamentalFit
-from validation.metrics.fundamental_precision import (
-    _ellipse_95,
-    _student_95,
-    epipoles_of,
-    fundamental_bound,
-)
+from validation.metrics.fundamental_precision import _ellipse_95, _student_95, epipoles_of, fundamental_bound
 from validation.scenes.two_views import make_two_views
 from validation.studies.epipolar_methods import DEFAULT, LEAST, check_precision
 

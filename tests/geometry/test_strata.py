@@ -120,7 +120,8 @@ def test_3_4_special_transforms_and_cross_ratios():
     assert strata.cross_ratio(x[[0, 1, 2, 0]]) == np.inf
     refuses(ValueError, "three of the four", strata.cross_ratio, x[[0, 0, 0, 1]])
     refuses(ValueError, "collinear", strata.cross_ratio, np.eye(4))
-    refuses(ValueError, "four finite points", strata.cross_ratio, np.eye(3))
+    for wrong in (np.eye(3), np.where(np.arange(4)[:, None] == 1, np.nan, x)):
+        refuses(ValueError, "four finite points", strata.cross_ratio, wrong)
     assert strata.group_of(np.diag([1.0, 1.0, -1.0, 1.0])) == "affine"
     assert strata.group_of(np.eye(4)) == "euclidean"
     for wrong in (np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 1.0, 0.0])):

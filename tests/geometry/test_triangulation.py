@@ -14,10 +14,7 @@ from thesisrecon.camera import compose_camera, distort, undistort
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs, project
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
-from thesisrecon.geometry.polynomial_triangulation import (
-    correct_matches,
-    triangulate_polynomial,
-)
+from thesisrecon.geometry.polynomial_triangulation import correct_matches, triangulate_polynomial
 from thesisrecon.geometry.triangulation import (
     _least_singular_vector,
     pose_from_three_points,

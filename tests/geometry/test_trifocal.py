@@ -61,13 +61,9 @@ def test_tensor_of_cameras_in_any_frame_of_one_centre_and_of_canonical_ones(rng)
 def test_trifocal_constraints_of_points_and_lines(rng):
     P = three_cameras(rng)
     T = three_view.tensor_from_cameras(*P)
-    x, l = (
-        a / np.linalg.norm(a, axis=-1, keepdims=True)
-        for a in (
-            np.einsum("vab,nb->vna", P, homogenize(rng.uniform(-1.5, 1.5, (6, 3)))),
-            lines_of(seen_segments(P, rng, 6)),
-        )
-    )
+    x = np.einsum("vab,nb->vna", P, homogenize(rng.uniform(-1.5, 1.5, (6, 3))))
+    l = lines_of(seen_segments(P, rng, 6))
+    x, l = (a / np.linalg.norm(a, axis=-1, keepdims=True) for a in (x, l))
     # Two lines through each point span all others: four independent equations; two points span a line.
     on_first, l2, l3 = (np.linalg.svd(a[:, None])[2][:, 1:] for a in (l[0], x[1], x[2]))
     for first, second, third in (

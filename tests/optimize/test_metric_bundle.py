@@ -69,7 +69,7 @@ def test_cost_does_not_depend_on_the_frame():
     np.testing.assert_allclose(second.cameras.intrinsics, first.cameras.intrinsics, rtol=1e-4)
 
 
-def test_a_tight_prior_holds_a_loose_one_yields_and_outliers_hardly_move_the_focal():
+def test_a_tight_prior_holds_and_a_loose_one_yields():
     block = make_block()
     mean, std = block.cameras.intrinsics * [1.1, 1, 1, 1, 1, 1], np.full((1, 6), np.inf)
     for std_rel, focal in ((1e-7, 1320.0), (1.0, 1200.0)):
@@ -77,13 +77,6 @@ def test_a_tight_prior_holds_a_loose_one_yields_and_outliers_hardly_move_the_foc
         options = {"prior": IntrinsicsPrior.unshared(mean, std), "sigma_px": 0.3, "max_iterations": 50}
         fit = _refine(block.cameras, block.X, block.seen(), free=FOCAL, **options)
         assert fit.cameras.intrinsics[0, 0] == pytest.approx(focal, rel=1e-3)
-    block, rng = make_block(points=150), np.random.default_rng(9)
-    xy = block.xy + 0.2 * rng.normal(size=block.xy.shape)
-    wrong = rng.choice(len(xy), 20, replace=False)
-    xy[wrong] += rng.uniform(15.0, 40.0, size=(20, 2))
-    result = _refine(block.cameras, block.X, block.seen(xy), free=FOCAL, loss_px=0.5, max_iterations=60)
-    assert result.cameras.intrinsics[0, 0] == pytest.approx(1200.0, rel=5e-3)
-    assert result.sigma_px < 0.35
 
 
 def test_unseen_parts_come_back_untouched():

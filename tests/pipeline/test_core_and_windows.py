@@ -14,12 +14,7 @@ from thesisrecon.metric import _model, _resection, _shared_camera, refinement
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
-from thesisrecon.pipeline.large_sets import (
-    CORE_VIEWS,
-    MAX_CORES,
-    calibrate_with_core,
-    calibrated_part,
-)
+from thesisrecon.pipeline.large_sets import CORE_VIEWS, MAX_CORES, calibrate_with_core, calibrated_part
 from thesisrecon.projective._model import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
 from thesisrecon.records import SelfCalibration, Tracks

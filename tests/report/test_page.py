@@ -13,11 +13,7 @@ from tests.report import synthetic
 from thesisrecon.errors import StageFailure
 from thesisrecon.records import IntrinsicInterval, TexturedMesh
 from thesisrecon.report import _assessment
-from thesisrecon.report._data import (
-    ResidualSummary,
-    reprojection_distances,
-    summarize_distances,
-)
+from thesisrecon.report._data import ResidualSummary, reprojection_distances, summarize_distances
 from thesisrecon.report._page import render_report
 
 

@@ -177,23 +177,16 @@ def drawn_segments(scene, *, sigma_px, stray, seed):
     return found
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("views", [[0, 1], [2, 5, 7]])
-def test_three_given_directions_fix_the_plane(seed, views):
-    scene = make_scene(seed=seed)
-    found, plane = scenes.setup(scene, seed=seed)
-    way = ParallelLines(vanishing_points(scene, TURN, views))
-    located = way.locate(found, np.random.default_rng(0))
-    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
-
-
 def test_more_directions_and_points_at_infinity_do_no_harm():
     scene = make_scene(seed=1)
     given = vanishing_points(scene, np.vstack([scene.R[0], [0.3, -0.2, 0.9]]), [0, 3, 6])
     assert abs(given[0, 0, 2]) < 1e-12
     found, plane = scenes.setup(scene, seed=1)
-    located = ParallelLines(given).locate(found, np.random.default_rng(0))
-    np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
+    # A direction along the baseline has epipoles for vanishing points, which determine nothing.
+    baseline = np.vstack([TURN, scene.centres[1] - scene.centres[0]])
+    for vanishing in (given, vanishing_points(scene, baseline, [0, 1])):
+        located = ParallelLines(vanishing).locate(found, np.random.default_rng(0))
+        np.testing.assert_allclose(located.planes[0], plane, atol=1e-8)
 
 
 def test_directions_at_right_angles_give_the_calibration_too():
@@ -203,25 +196,6 @@ def test_directions_at_right_angles_give_the_calibration_too():
     prior = scenes.prior_for(scene, scenes.NOTHING_BUT_CONSTANT)
     answer = scenes.calibrated(Stratified(way, refine=False), scene, prior, seed=2)
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
-
-
-def test_directions_that_do_not_fix_the_plane_are_refused():
-    scene = make_scene(seed=3)
-    found, plane = scenes.setup(scene, seed=3)
-    every, rng = vanishing_points(scene, TURN, [0, 1]), np.random.default_rng(0)
-    flat = vanishing_points(scene, np.array([TURN[0], TURN[1], TURN[0] + TURN[1]]), [0, 1])
-    two = every.copy()
-    two[1, 2] = np.nan
-    baseline = np.array([*TURN[:2], scene.centres[1] - scene.centres[0]])
-    along = vanishing_points(scene, baseline, [0, 1])
-    for words, given in (
-        ("lie in one plane", flat),
-        (r"three directions.*2 have", two),
-        (r"2 have vanishing points .*not parallel to the baseline", along),
-    ):
-        refuses(StageFailure, words, ParallelLines(given).locate, found, rng)
-    given = vanishing_points(scene, np.vstack([baseline, TURN[2]]), [0, 1])
-    np.testing.assert_allclose(ParallelLines(given).locate(found, rng).planes[0], plane, atol=1e-8)
 
 
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])

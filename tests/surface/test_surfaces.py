@@ -26,11 +26,7 @@ from thesisrecon.surface._mesh import (
     surface_from_depth,
 )
 from thesisrecon.surface._simplification import _merge_in_cells, reduce_faces, simplify_surface
-from thesisrecon.surface.bspline import (
-    BSplineSurface,
-    _basis,
-    _energies,
-)
+from thesisrecon.surface.bspline import BSplineSurface, _basis, _energies
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, _incidence_cosines
 from thesisrecon.surface.model import LinearSurface, SurfaceModel
 

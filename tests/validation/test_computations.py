@@ -15,7 +15,7 @@ from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.rigs import cube_rig, make_cloud, noisy_tracks, projective_from_truth
 from validation.scenes.stereo import StereoPair, seen_by_both
 from validation.studies import subsets
-from validation.studies.cluster_efficiency import Task, TaskMeter, critical_path, efficiency_table
+from validation.studies.cluster_efficiency import TaskMeter, efficiency_table
 from validation.studies.dinosaur import compare, to_metrics
 
 
@@ -86,35 +86,6 @@ def comparison():
 def test_all_cameras_are_found_and_explain_the_tracks_as_well_as_the_published_ones(comparison):
     missed = [row for row in to_metrics(comparison) if row.verdict == "missed"]
     assert not missed, missed
-
-
-def tasks_of(*seconds, sent=0, received=0):
-    return [Task(s, sent, received) for s in seconds]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "workers", "expected"),
-    [
-        ((1.0, 2.0, 3.0), 1, 6.0),
-        ((1.0,) * 8, 4, 2.0),
-        # Graham (1969): the long task is submitted last.
-        ((1.0, 1.0, 1.0, 1.0, 2.0), 2, 4.0),
-        ((2.0, 1.0, 1.0, 1.0, 1.0), 2, 3.0),
-        # The second worker is free first and takes the third and the fourth task.
-        ((4.0, 1.0, 1.0, 1.0, 3.0), 2, 6.0),
-    ],
-)
-def test_a_task_goes_to_the_first_free_worker(seconds, workers, expected):
-    assert critical_path(tasks_of(*seconds), workers) == expected
-
-
-def test_arguments_and_results_share_one_line_each_way():
-    # Arguments leave at 2, 4, 6 and 8 s, and all workers wait for them.
-    assert critical_path(tasks_of(1, 1, 1, 1, sent=20), 4, 10.0) == 9.0
-    # Results of 2 s each queue behind the first, which is there at 1 s.
-    assert critical_path(tasks_of(1, 1, 1, 1, received=20), 4, 10.0) == 9.0
-    # One worker: the next arguments travel during the calculation.
-    assert critical_path(tasks_of(3, 3, 3, sent=10), 1, 10.0) == 10.0
 
 
 def test_a_toy_run_is_measured_task_by_task_and_its_result_is_the_same(tmp_path):

@@ -146,13 +146,10 @@ def test_rows_hold_both_methods_and_a_failure_misses_its_targets():
     model = _reconstruction(_truth())
     ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
     failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
-    rows, missed = (
-        {
-            row.name: row
-            for row in check_reconstruction("fountain-P11", V, _truth(), {OURS: one, COLMAP: colmap})
-        }
-        for one in (ours, failed)
-    )
+    checked = [
+        check_reconstruction("fountain-P11", V, _truth(), {OURS: o, COLMAP: colmap}) for o in (ours, failed)
+    ]
+    rows, missed = ({row.name: row for row in found} for found in checked)
     assert rows["wall time"].target == 10.0
     # The residuals here are zero, so a claim of one pixel is far off.
     verdicts = {f"cameras registered of {V}": "reached", "focal error": "reached", "wall time": "reached"}

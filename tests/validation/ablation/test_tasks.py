@@ -128,13 +128,8 @@ def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path
 
 def test_a_reconstruction_in_a_study_is_the_one_outside(yard, tmp_path):
     config = replace(preset("thesis"), images=replace(CONFIG.images, max_size_px=400))
-    study = Study(
-        {"selfcalibration": ["nonlinear-quadric"]},
-        [str(yard)],
-        seeds=[3],
-        config=config,
-        metrics=["focal_error_pct", "points", "verified"],
-    )
+    given = {"seeds": [3], "config": config, "metrics": ["focal_error_pct", "points", "verified"]}
+    study = Study({"selfcalibration": ["nonlinear-quadric"]}, [str(yard)], **given)
     rows = ablate(study, tmp_path / "study", executor="local", threads=1)
     assert [r.variant for r in rows] == ["unchanged", "nonlinear-quadric"]
     assert not any(r.failure for r in rows)
