@@ -64,7 +64,7 @@ def resect(
     max_samples: int = 100_000,
     seed: int | Generator = 0,
 ) -> Resection:
-    """Estimate a camera from space points and their pixels, some of them wrong (section 6.4).
+    """Estimate a camera from space points and their pixels, some of them wrong (section 6.4; HZ 7).
 
     RANSAC over samples of six points (DLT), or with K of three (P3P), then the least reprojection error of
     the inliers.

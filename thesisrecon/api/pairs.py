@@ -141,7 +141,7 @@ def estimate_homography(
     max_samples: int = 100_000,
     seed: int | Generator = 0,
 ) -> HomographyFit:
-    """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4).
+    """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4; HZ 4.8).
 
     RANSAC over samples of four, then the least Sampson distance of the inliers, which is to first order the
     maximum likelihood for Gaussian noise in both images.

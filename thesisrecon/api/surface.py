@@ -40,7 +40,7 @@ ImagesInput = str | Path | Sequence[ImageInput]
 def rectify(
     image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
 ) -> RectifiedImages:
-    """Rectify two images by their fundamental matrix: epipolar lines become common rows (2.5).
+    """Rectify two images by their fundamental matrix: epipolar lines become common rows (2.5; HZ 11.12).
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def rectify(
 def match_rectified(
     left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: Config | None = None
 ) -> DisparityMap:
-    """Compute the disparity map of a rectified pair (2.5).
+    """Compute the disparity map of a rectified pair (2.5; semi-global matching: Hirschmüller, PAMI 2008).
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def fuse_depth_maps(
     depth_maps: Sequence[DepthMap] | Sequence[F32 | F64], cameras: CameraInput | None = None, *,
     sizes: I64 | None = None, config: Config | None = None, threads: int = 1,
 ) -> TexturedMesh:  # fmt: skip
-    """Fuse depth maps to one surface (2.6).
+    """Fuse depth maps to one surface (2.6; Curless and Levoy, SIGGRAPH 1996).
 
     Parameters
     ----------

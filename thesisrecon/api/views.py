@@ -150,10 +150,10 @@ def prepare_pair(
 ) -> InterpolatedPair:
     """Match and rectify two images of any pose for views between them: ``view(s)`` interpolates.
 
-    Sparse matching, F, rectification by homographies and dense matching in both directions. A
-    ``StageFailure`` if the images do not match, show no parallax, are rolled against each other by more than
-    90 degrees, or the camera moved forwards (an epipole lies inside an image: its epipolar lines cannot
-    become rows).
+    Sparse matching, F, rectification by homographies and dense matching in both directions (section 1.2;
+    Seitz and Dyer, "View morphing", SIGGRAPH 1996). A ``StageFailure`` if the images do not match, show no
+    parallax, are rolled against each other by more than 90 degrees, or the camera moved forwards (an epipole
+    lies inside an image: its epipolar lines cannot become rows).
     """
     config = as_config(config)
     first, second = (
