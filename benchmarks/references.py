@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.records import Similarity, TexturedMesh
-from thesisrecon.stereo._frames import PlanarRectification
+from thesisrecon.stereo.rectification import PlanarRectification
 from validation.references.libraries import cv2, open3d, poselib, pycolmap
 
 

@@ -17,8 +17,7 @@ from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
 from thesisrecon.pipeline.image_pair import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
-from thesisrecon.stereo._frames import PlanarRectification, hartley
-from thesisrecon.stereo.rectification import rectify
+from thesisrecon.stereo.rectification import PlanarRectification, hartley, rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
 from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
 from validation.references.opencv import OpenCVSemiGlobal, harris_corners

@@ -18,8 +18,8 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
-from thesisrecon.stereo._frames import PlanarRectification
 from thesisrecon.stereo.depth import MultiViewStereo
+from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views.interpolation import InterpolatedPair
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"

@@ -19,7 +19,6 @@ from thesisrecon.records import DepthMap, DisparityMap, Image
 from thesisrecon.stereo import correspondence, depth
 from thesisrecon.stereo._depth_fusion import _concatenated, inverse_depths
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
-from thesisrecon.stereo._frames import common_orientation, polar
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import (
     MultiViewStereo,
@@ -30,6 +29,7 @@ from thesisrecon.stereo.depth import (
     _sparse_points,
     _without_small_regions,
 )
+from thesisrecon.stereo.rectification import common_orientation, polar
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 

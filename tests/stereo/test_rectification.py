@@ -15,7 +15,6 @@ from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_c
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.imaging.resampling import STRIP_ROWS, _sample_image, warp_image
-from thesisrecon.stereo import _frames as planar
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_GROWTH,
@@ -24,12 +23,14 @@ from thesisrecon.stereo._epipolar_pair import (
     pair_of_cameras,
     pair_of_fundamental,
 )
-from thesisrecon.stereo._frames import PolarRectification, matches_in_frame, polar
 from thesisrecon.stereo.rectification import (
+    PolarRectification,
     RectifiedImages,
     disparity_range,
     jacobians,
+    matches_in_frame,
     measure_quality,
+    polar,
     rectify,
 )
 
@@ -78,7 +79,12 @@ def make_pair(motion, rng, *, noise_px=0.0, points=300):
     return PairOfCameras(P, X[seen], *xy, sizes)
 
 
-PLANAR_METHODS = (planar.hartley, planar.loop_zhang, planar.minimum_distortion, planar.common_orientation)
+PLANAR_METHODS = (
+    rectification.hartley,
+    rectification.loop_zhang,
+    rectification.minimum_distortion,
+    rectification.common_orientation,
+)
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
 CASES += [(polar, motion) for motion in MOTIONS]
 
@@ -104,7 +110,7 @@ def matched(rectified, pair):
 @pytest.mark.parametrize(("method", "motion"), CASES, ids=named)
 def test_exact_matches_share_their_row_and_nearer_ones_are_farther_left_on_the_right(method, motion):
     scene = make_pair(motion, np.random.default_rng(0))
-    for pair in both_pairs(scene)[method is planar.common_orientation :]:
+    for pair in both_pairs(scene)[method is rectification.common_orientation :]:
         rectified = method(pair)
         left = rectified.rectified_from_original(0, scene.xy1)
         right = rectified.rectified_from_original(1, scene.xy2)
@@ -152,7 +158,7 @@ def test_the_maps_are_inverse_to_each_other(rng, case):
 
 
 @pytest.mark.parametrize(
-    ("method", "motion"), [(planar.loop_zhang, "toed in"), (polar, "forward")], ids=named
+    ("method", "motion"), [(rectification.loop_zhang, "toed in"), (polar, "forward")], ids=named
 )
 def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
     rectified = method(both_pairs(make_pair(motion, np.random.default_rng(2)))[0])
@@ -166,19 +172,23 @@ def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
 
 def test_a_parallel_pair_stays_as_it_is():
     scene = make_pair("parallel", np.random.default_rng(3))
-    for method in (planar.loop_zhang, planar.minimum_distortion, planar.common_orientation):
+    for method in (
+        rectification.loop_zhang,
+        rectification.minimum_distortion,
+        rectification.common_orientation,
+    ):
         for H in method(both_pairs(scene)[1]).H:
             expected = np.eye(3)
             expected[:2, 2] = (H / H[2, 2])[:2, 2]
             # The disparities of any scene slope a little; a shear takes part of that.
-            atol = 0.1 if method is planar.minimum_distortion else 1e-6
+            atol = 0.1 if method is rectification.minimum_distortion else 1e-6
             np.testing.assert_allclose(H / H[2, 2], expected, atol=atol)
 
 
 def test_disparities_of_a_common_orientation_are_inverse_depths():
     scene = make_pair("toed in", np.random.default_rng(4))
     pair = both_pairs(scene)[1]
-    rectified = planar.common_orientation(pair)
+    rectified = rectification.common_orientation(pair)
     d = matched(rectified, pair)[:, 0]
     # The third coordinate of the new orientation is that of H1 M1 over its scale.
     M = rectified.H[0] @ scene.P[0, :, :3]
@@ -192,7 +202,7 @@ def test_each_planar_method_is_best_at_what_it_minimises():
     scene = make_pair("beside", np.random.default_rng(5))
     pair = both_pairs(scene)[0]
     centre = (np.array(scene.sizes[1]) - 1.0) / 2.0
-    J = jacobians(planar.hartley(pair), 1, centre[None])[0]
+    J = jacobians(rectification.hartley(pair), 1, centre[None])[0]
     s = np.linalg.svd(J, compute_uv=False)
     assert s[0] / s[1] == pytest.approx(1.0, abs=1e-5)
     spread = [np.ptp(np.quantile(matched(m(pair), pair)[:, 0], [0.01, 0.99])) for m in PLANAR_METHODS[:3]]
@@ -200,11 +210,11 @@ def test_each_planar_method_is_best_at_what_it_minimises():
     for motion in ("beside", "toed in", "rolled", "behind"):
         pair = both_pairs(make_pair(motion, np.random.default_rng(6), noise_px=0.1))[0]
         found = {m: measure_quality(m(pair), pair) for m in PLANAR_METHODS[:3]}
-        assert np.abs(np.array(found[planar.loop_zhang].orthogonality_deg) - 90.0).max() < 5.0
-        assert np.abs(np.array(found[planar.loop_zhang].aspect) - 1.0).max() < 0.1
+        assert np.abs(np.array(found[rectification.loop_zhang].orthogonality_deg) - 90.0).max() < 5.0
+        assert np.abs(np.array(found[rectification.loop_zhang].aspect) - 1.0).max() < 0.1
         least = min(quality.distortion for quality in found.values())
         # The crop, which the measure heeds, depends on the result.
-        assert found[planar.minimum_distortion].distortion < least + 0.01
+        assert found[rectification.minimum_distortion].distortion < least + 0.01
 
 
 @pytest.mark.parametrize("motion", ["forward", "diagonal", "half forward"])
@@ -227,15 +237,15 @@ def test_epipoles_inside_are_for_polar_frames_alone(motion):
 def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch(monkeypatch):
     scene = make_pair("beside", np.random.default_rng(9))
     best = rectify(pair_of_fundamental(scene.F, scene.xy1, scene.xy2, *scene.sizes))
-    assert isinstance(best, planar.PlanarRectification)
+    assert isinstance(best, rectification.PlanarRectification)
     wide = both_pairs(make_pair("toed in", np.random.default_rng(9)))[0]
     monkeypatch.setattr(rectification, "BENDING", -1.0)
-    assert isinstance(rectify(wide, (planar.minimum_distortion, polar)), PolarRectification)
+    assert isinstance(rectify(wide, (rectification.minimum_distortion, polar)), PolarRectification)
 
 
 def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
     scene = make_pair("beside", np.random.default_rng(10))
-    rectified = planar.common_orientation(pair_of_cameras(*scene.P, *scene.sizes))
+    rectified = rectification.common_orientation(pair_of_cameras(*scene.P, *scene.sizes))
     low, high = disparity_range(rectified, scene.xy1, scene.xy2)
     left = rectified.rectified_from_original(0, scene.xy1)
     d = left[:, 0] - rectified.rectified_from_original(1, scene.xy2)[:, 0]
@@ -295,7 +305,7 @@ def test_pairs_that_cannot_be_rectified_are_refused_with_a_reason():
 
 def planar_frame(H, size):
     """Both images mapped by one homography."""
-    return planar.PlanarRectification(np.stack([H, H]), size)
+    return rectification.PlanarRectification(np.stack([H, H]), size)
 
 
 def test_strips_do_not_show_and_grey_is_one_channel():

@@ -22,9 +22,9 @@ from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io._images import read_image, read_levels, read_pixels
 from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, require_mesh
-from thesisrecon.stereo._frames import PlanarRectification
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
+from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 from thesisrecon.views.render import Shading, render_mesh
 from thesisrecon.views.tensor import (

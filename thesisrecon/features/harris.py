@@ -20,10 +20,9 @@ from thesisrecon.records import Features, Image
 def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
     """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
 
-    M holds the products of the gradients of ``channels`` (C, H, W), summed over them and smoothed by
-    ``taps``; the gradient at x is sum_k derivative[k] I(x + k), k from the middle. ``trace_weight`` is 0 for
-    det M / trace M, else k of det M - k (trace M)^2. One sweep down the image keeps only the last 2 r + 1
-    rows of products, which stay in the cache.
+    M holds the products of the gradients sum_k derivative[k] I(x + k) of ``channels`` (C, H, W), summed and
+    smoothed by ``taps``; ``trace_weight``: 0 for det M / trace M, else k of det M - k (trace M)^2. Only the
+    last rows are kept.
     """
     count, height, width = channels.shape
     reach, size = derivative.size // 2, taps.size
@@ -280,9 +279,9 @@ class HarrisCorners:
 def select_spread(xy: F64, response: F32, count: int) -> I64:
     """Indices (M,), strongest first, of ``count`` corners that cover the image (M. Brown et al., CVPR 2005).
 
-    ``xy`` (N, 2) are strongest first. Adaptive non-maximal suppression: among the 1.7 ``count`` strongest
-    corners those farthest from any clearly stronger one. A cell of a sixth of the long side contributes at
-    most 1.5 times as many of these candidates as in an even distribution, so that dark parts get corners too.
+    Of corners (N, 2), strongest first: among the 1.7 ``count`` strongest those farthest from any clearly
+    stronger one. A cell of a sixth of the long side gives at most 1.5 times as many of these as in an even
+    distribution.
     """
     pool, members = int(1.7 * count), np.arange(len(xy), dtype=np.int64)
     if len(xy) > pool:

@@ -65,9 +65,8 @@ def _rasterize_rows(
 ) -> None:
     """Draw triangles ``corners`` (M, 3, 3) into a z-buffer of some rows; the first of equal depths stays.
 
-    With the image points of a face as the columns of M, the barycentric coordinates of the point seen at (x,
-    y), each over its depth, are M^-1 (x, y, 1): linear in the pixel, exact in perspective, without clipping
-    at the near plane (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997).
+    With the image points of a face as columns of M, M^-1 (x, y, 1) are its barycentric coordinates, each over
+    the depth: no clipping at the near plane (Olano and Greer, "2D homogeneous coordinates", 1997).
     """
     width = depth.shape[1]
     inverse = empty((3, 3))

@@ -168,10 +168,8 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
 def _sample_image(image: F32, xy: F64, out: F32) -> None:
     """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C).
 
-    ``xy`` are the positions of adjacent output pixels and may have one row more than ``out``. The kernel is
-    widened along each axis of the image where they are more than a pixel apart, which prevents aliasing. NaN
-    where the position is NaN or outside the pixel centres, or one of the four pixels around is NaN; other NaN
-    pixels are left out.
+    The kernel is widened along each axis of the image where adjacent positions are more than a pixel apart.
+    NaN outside the pixel centres, or beside a NaN pixel; other NaN pixels are left out.
     """
     height, width, channels = image.shape
     wx, wy = empty(MAX_TAPS), empty(MAX_TAPS)

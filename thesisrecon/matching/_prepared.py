@@ -47,8 +47,8 @@ def sample_window(
 ) -> bool:
     """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image.
 
-    The sample at column a and row b of the ``raster`` is at ``xy + step @ (a, b)``; ``to_level`` = level
-    pixels per image pixel. Places are computed first, in vectors, and then the pixels are read.
+    Column a and row b of the ``raster`` is at ``xy + step @ (a, b)``; ``to_level`` = level pixels per image
+    pixel.
     """
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
@@ -80,10 +80,7 @@ def sample_window(
 
 @kernel(fastmath=FAST, forceinline=True)
 def normalize_window(window: F32) -> float:
-    """Subtract the mean and divide by the norm in place: products are normalised cross-correlations (4.2.2).
-
-    Returns the norm; samples and norm are 0 if the contrast is below half a grey level.
-    """
+    """Normalise to mean 0 and norm 1 in place (4.2.2) and return the norm, 0 below half a grey level."""
     total = np.float32(0.0)
     for n in range(len(window)):
         total += window[n]
@@ -172,10 +169,9 @@ class PreparedImage:
 def prepare_image(
     image: Image, features: Features, *, window: int = SIDE, colour: bool = False
 ) -> PreparedImage:
-    """Compute the grey pyramid and the corner cells of an image, for corner windows of the side ``window``.
+    """Compute the grey pyramid and the corner cells of an image, for corner windows of side ``window``.
 
-    The pyramid starts at twice the image size if corners were found there (scale below 1). With ``colour``
-    the windows are those of the three colours.
+    It starts at twice the image size with corners of scale below 1. ``colour``: windows of the three colours.
     """
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
@@ -183,7 +179,7 @@ def prepare_image(
     grays = [image.rgb[:, :, c].astype(np.float32) for c in range(3)] if colour else []
     channels = tuple(_pyramid(gray, doubled)[0] for gray in grays) or (pixels,)
     cell_px = max(4.0, 0.01 * max(image.size))
-    cells = (cell_px, *_cells(features.xy, image.size, cell_px))
+    cells = (cell_px, *cells_of(features.xy, image.size, cell_px))
     return PreparedImage(image.size, features, (pixels, levels, base), cells, window, channels)
 
 
@@ -198,7 +194,7 @@ def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
     return np.concatenate([g.ravel() for g in grays]), levels
 
 
-def _cells(xy: F64, size: tuple[int, int], cell_px: float) -> tuple[I64, I64, I64]:
+def cells_of(xy: F64, size: tuple[float, float], cell_px: float) -> tuple[I64, I64, I64]:
     """Sort corners into square cells, row by row: those of cell c are ``order[start[c]:start[c + 1]]``."""
     shape = np.array([int(size[1] / cell_px) + 1, int(size[0] / cell_px) + 1], dtype=np.int64)
     column, row = (np.clip((xy[:, a] / cell_px).astype(np.int64), 0, shape[1 - a] - 1) for a in (0, 1))

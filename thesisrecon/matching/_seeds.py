@@ -1,7 +1,4 @@
-"""First matches without a search radius: mutual nearest patches that pass the ratio test.
-
-Nearest neighbours in an image are found by a grid of cells, faster than a tree for this many queries.
-"""
+"""First matches without a search radius: mutual nearest patches that pass the ratio test."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._prepared import empty_matches, join_matches, select_found
+from thesisrecon.matching._prepared import cells_of, empty_matches, join_matches, select_found
 from thesisrecon.matching.track_alignment import strongest_distinct
 from thesisrecon.records import Features, Matches, Seeds
 
@@ -30,10 +27,10 @@ SeedSet = tuple[Matches, Callable[[Matches], F64]]
 
 @kernel(fastmath={"nnan", "nsz"})
 def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
-    """Best column (B,) of each row of correlations (B, N), its value (B,) and the second best (B,) elsewhere.
+    """Best column (B,) of each row of correlations (B, N), its value, and the second best elsewhere, or -1.
 
-    ``xy2`` (N, 2) px are the column positions; a column within the squared distance ``apart2`` (N,) of the
-    best is the same position. -1 without a second best.
+    A column, at ``xy2`` (N, 2) px, within the squared distance ``apart2`` (N,) of the best is the same
+    position.
     """
     rows, columns = correlation.shape
     index = zeros(rows, np.int64)
@@ -67,10 +64,7 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
 
 @kernel(fastmath={"nnan", "nsz"}, forceinline=True)
 def _largest_by_lane(row: F32, largest: F32) -> None:
-    """Write the largest of the values whose number has the remainder l modulo ``LANES`` to ``largest[l]``.
-
-    Four values of each lane at once; the processor compares many lanes together, but not neighbours.
-    """
+    """Write the largest of the values whose number is l modulo ``LANES`` to ``largest[l]``, four at once."""
     whole = len(row) // (4 * LANES) * (4 * LANES)
     for lane in range(LANES):
         largest[lane] = np.float32(-2.0)
@@ -106,12 +100,10 @@ def _update_largest_of_columns(correlation: F32, largest: F32) -> None:
 
 
 def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:
-    """Pairs of rows and columns that are each other's best correlation.
+    """Pairs of rows and columns, at ``xy2`` (N, 2), of the matrix in ``blocks`` that are each other's best.
 
-    ``blocks`` (B, N) are rows of the matrix; columns within the squared distance ``apart2`` (N,) of the best,
-    at ``xy2`` (N, 2), are the same position. Returns the column of each row (-1 if the best is not mutual;
-    of equal columns or rows the first counts), its correlation and the second best elsewhere (-1: none, or
-    not mutual).
+    The column of each row (-1: not mutual; of equals the first counts), its correlation, and the second best
+    beyond the squared distance ``apart2`` (N,), or -1.
     """
     largest, parts = np.full(len(xy2), -2.0, np.float32), []
     for correlation in blocks:
@@ -126,31 +118,38 @@ def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32,
     return np.where(mutual, index, -1), value, np.where(mutual, second_best, np.float32(-1.0))
 
 
+def nearest_seeds(seeds1: Seeds, seeds2: Seeds, ratio: float) -> tuple[I64, I64, F32]:
+    """Numbers (M,) of seeds of both images that are mutually nearest and distinct, and their correlation."""
+    if not (len(seeds1.xy) and len(seeds2.xy)):
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
+    patches2 = np.ascontiguousarray(seeds2.patches.T)
+    # A block of rows stays in the cache between the product and the scans.
+    blocks = (seeds1.patches[k : k + BLOCK] @ patches2 for k in range(0, len(seeds1.xy), BLOCK))
+    index, value, second_best = mutual_best(blocks, seeds2.xy.astype(np.float32), (8.0 * seeds2.scale) ** 2)
+    distinct = (1.0 - value) < ratio**2 * (1.0 - second_best)
+    rows = np.flatnonzero((index >= 0) & distinct & (value > 0.5))
+    return rows, index[rows], value[rows]
+
+
 def match_seeds(
     seeds1: Seeds, seeds2: Seeds, pair: tuple[int, int], *, rotated: bool, ratio: float
 ) -> Matches:
     """Match seeds that are mutually nearest and pass the ratio test; with their local maps.
 
-    The distance of unit patches is sqrt(2 - 2 correlation). Other seeds count as elsewhere beyond a quarter
-    of the patch (8 pixels of its level). ``rotated``: use the patches rotated to their dominant gradient.
+    Patch distances are sqrt(2 - 2 correlation); "elsewhere" begins at a quarter of the patch (8 pixels of its
+    level).
     """
     use1, use2 = (np.flatnonzero((s.angle != 0.0) == rotated) for s in (seeds1, seeds2))
-    if not (len(use1) and len(use2)):
+    rows, columns, score = nearest_seeds(select_found(seeds1, use1), select_found(seeds2, use2), ratio)
+    if not len(rows):
         return empty_matches(pair)
-    xy2, apart2 = seeds2.xy[use2].astype(np.float32), (8.0 * seeds2.scale[use2]) ** 2
-    patches1, patches2 = seeds1.patches[use1], np.ascontiguousarray(seeds2.patches[use2].T)
-    # A block of rows stays in the cache between the product and the scans.
-    blocks = (patches1[first : first + BLOCK] @ patches2 for first in range(0, len(use1), BLOCK))
-    index, value, second_best = mutual_best(blocks, xy2, apart2)
-    distinct = (1.0 - value) < ratio**2 * (1.0 - second_best)
-    rows = np.flatnonzero((index >= 0) & distinct & (value > 0.5))
-    one, two = use1[rows], use2[index[rows]]
+    one, two = use1[rows], use2[columns]
     if seeds1.frame is None and seeds2.frame is None:
         turn = (seeds2.angle[two] - seeds1.angle[one]).astype(np.float64)
         affine = _similarity((seeds2.scale[two] / seeds1.scale[one]).astype(np.float64), turn)
     else:
         affine = _frame(seeds2)[two] @ np.linalg.inv(_frame(seeds1)[one])
-    return Matches(*pair, one, two, seeds1.xy[one], seeds2.xy[two], value[rows], affine)
+    return Matches(*pair, one, two, seeds1.xy[one], seeds2.xy[two], score, affine)
 
 
 def _frame(seeds: Seeds) -> F64:
@@ -164,10 +163,10 @@ def seed_matches(
     features1: Features, features2: Features, pair: tuple[int, int], *,
     orientation: Literal["auto", "upright", "rotated"], ratio: float,
 ) -> Iterator[SeedSet]:  # fmt: skip
-    """Sets of matched seeds: one of each orientation, or one of all if there are simulated oblique views.
+    """Sets of matched seeds: one of each orientation, or one of all with simulated oblique views.
 
-    Simulated views of one image are matched with the other image itself: if one of two views of a plane is
-    compressed suitably, they differ only by a similarity.
+    These are matched with the other image itself: of two views of a plane, one suitably compressed, only a
+    similarity remains.
     """
     seeds1, seeds2 = features1.seeds, features2.seeds
     assert seeds1 is not None
@@ -211,10 +210,10 @@ def _common_similarity(matches: Matches) -> F64:
 
 
 def neighbour_support(matches: Matches) -> F64:
-    """Strength (M,) of each match: the number of neighbours with similar displacements ((4.1) with c = 1).
+    """Strength (M,) of each match: neighbours with similar displacements ((4.1) with c = 1), in both images.
 
-    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), with d the displacement
-    after removing the common rotation and scale; both images serve as the first in turn.
+    Neighbour m of match k counts exp(-1/2 (|d_m - d_k| / (TOLERANCE |u_m - u_k|))^2), without common rotation
+    and scale.
     """
     if len(matches.xy1) < 2:
         return np.zeros(len(matches.xy1))
@@ -255,27 +254,33 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
     return Matches(known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order])
 
 
-@kernel
 def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
-    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2).
+    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to positions ``of`` (N, 2), nearest first."""
+    low = xy.min(axis=0)
+    width, height = np.ptp(xy, axis=0)
+    # About two points in a cell.
+    cell = max(np.sqrt(2.0 * width * height / len(xy)), 2.0 * max(width, height) / len(xy), 1e-9)
+    return _nearest_in_cells(xy, of, count, low, (cell, *cells_of(xy - low, (width, height), cell)))
 
-    The nearest is first, of equally distant ones that with the smaller number.
-    """
-    low, cell, shape = _grid(xy)
-    start, order = _fill_cells(xy, low, cell, shape)
+
+@kernel
+def _nearest_in_cells(xy: F64, of: F64, count: int, low: F64, cells: tuple[float, I64, I64, I64]) -> I64:
+    """Search rings of cells around each position; of equally distant points the smaller number is first."""
+    cell, shape, start, order = cells
+    rows, columns = shape
     found, near = empty((len(of), count), np.int64), empty(count)
     for n in range(len(of)):
         x, y = of[n, 0] - low[0], of[n, 1] - low[1]
-        column = min(max(int(np.floor(x / cell)), 0), shape[0] - 1)
-        row = min(max(int(np.floor(y / cell)), 0), shape[1] - 1)
+        column = min(max(int(np.floor(x / cell)), 0), columns - 1)
+        row = min(max(int(np.floor(y / cell)), 0), rows - 1)
         held, best = 0, found[n]
-        for ring in range(max(shape[0], shape[1])):
-            for r in range(max(row - ring, 0), min(row + ring, shape[1] - 1) + 1):
+        for ring in range(max(rows, columns)):
+            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
                 inside = abs(r - row) < ring
                 for c in range(column - ring, column + ring + 1, 2 * ring if inside else 1):
-                    if c < 0 or c >= shape[0]:
+                    if c < 0 or c >= columns:
                         continue
-                    first = r * shape[0] + c
+                    first = r * columns + c
                     for at in range(start[first], start[first + 1]):
                         m = order[at]
                         dx, dy = xy[m, 0] - of[n, 0], xy[m, 1] - of[n, 1]
@@ -286,11 +291,11 @@ def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
             safe = np.inf
             if column - ring > 0:
                 safe = min(safe, x - (column - ring) * cell)
-            if column + ring < shape[0] - 1:
+            if column + ring < columns - 1:
                 safe = min(safe, (column + ring + 1) * cell - x)
             if row - ring > 0:
                 safe = min(safe, y - (row - ring) * cell)
-            if row + ring < shape[1] - 1:
+            if row + ring < rows - 1:
                 safe = min(safe, (row + ring + 1) * cell - y)
             if near[count - 1] < safe * abs(safe):
                 break
@@ -310,34 +315,3 @@ def _insert(m: int, distance2: float, found: I64, near: F64, held: int) -> int:
         at -= 1
     near[at], found[at] = distance2, m
     return min(held + 1, len(near))
-
-
-@kernel
-def _grid(xy: F64) -> tuple[F64, float, I64]:
-    """Lower corner (2,), side and numbers (2,) of square cells of about two points each."""
-    low, high, shape = empty(2), empty(2), empty(2, np.int64)
-    for a in range(2):
-        low[a] = high[a] = xy[0, a]
-        for n in range(len(xy)):
-            low[a], high[a] = min(low[a], xy[n, a]), max(high[a], xy[n, a])
-    width, height = high[0] - low[0], high[1] - low[1]
-    cell = max(np.sqrt(2.0 * width * height / len(xy)), 2.0 * max(width, height) / len(xy), 1e-9)
-    shape[0], shape[1] = int(width / cell) + 1, int(height / cell) + 1
-    return low, cell, shape
-
-
-@kernel
-def _fill_cells(xy: F64, low: F64, cell: float, shape: I64) -> tuple[I64, I64]:
-    """The points of cell c, row by row, are ``order[start[c]:start[c + 1]]``."""
-    place, start = empty(len(xy), np.int64), zeros(shape[0] * shape[1] + 1, np.int64)
-    for n in range(len(xy)):
-        column = min(int((xy[n, 0] - low[0]) / cell), shape[0] - 1)
-        place[n] = min(int((xy[n, 1] - low[1]) / cell), shape[1] - 1) * shape[0] + column
-        start[place[n] + 1] += 1
-    for c in range(len(start) - 1):
-        start[c + 1] += start[c]
-    order, fill = empty(len(xy), np.int64), start.copy()
-    for n in range(len(xy)):
-        order[fill[place[n]]] = n
-        fill[place[n]] += 1
-    return start, order

@@ -61,9 +61,9 @@ def _median(values: F64, ordered: F64) -> float:
 def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
     """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K).
 
-    Weighted least squares, weights 1 / (d^2 + d_mean^2), with Cauchy reweighting against neighbours on
-    another surface and a prior at the mean of the neighbours' maps ``prior`` (M, 2, 2), which matters if they
-    are collinear. Returns the map (N, 2, 2), the position in image 2 (N, 2) and its uncertainty (N,) px.
+    Weights 1 / (d^2 + d_mean^2), Cauchy reweighting against other surfaces, and the mean of the maps
+    ``prior`` (M, 2, 2) for collinear neighbours. Returns map (N, 2, 2), position (N, 2) and its uncertainty
+    (N,) px.
     """
     count, k = neighbours.shape
     affine, position, spread = empty((count, 2, 2)), empty((count, 2)), empty(count)
@@ -142,11 +142,10 @@ def _match_guided(
 ) -> tuple[I64, F32, F32]:  # fmt: skip
     """Most similar corner of image 2 near the predicted position and epipolar line of each corner.
 
-    ``view1`` = pixels, levels, base; ``corners1`` = xy (N, 2), scale (N,); ``predicted`` = affine (N, 2, 2),
-    position (N, 2), radius (N,) px; ``corners2`` = xy, scale, patches (C, 225); ``grid2`` = cell size, shape
-    (2,), start, order of the corners of image 2; ``gate`` = F, half widths (N,) of the epipolar bands px,
-    minimum correlation. Returns the corner of image 2 (-1: none), the correlation and the second best
-    correlation elsewhere (-1: none).
+    ``view1``: pixels, levels, base; ``corners1``: xy (N, 2), scale (N,); ``predicted``: affine (N, 2, 2),
+    position (N, 2), radius (N,) px; ``corners2``: xy, scale, patches (C, 225); ``grid2``: cell size, shape
+    (2,), start, order; ``gate``: F, half widths (N,) of the bands px, minimum correlation. Returns the corner
+    (-1: none), its correlation and the second best elsewhere (-1: none).
     """
     xy1, scale1 = corners1
     affine, position, radius = predicted
@@ -228,10 +227,7 @@ def _warp_windows(
     view1: tuple[F32, I64, float], corner: tuple[F64, float], local: tuple[F64, float], sizes: F64,
     out: tuple[F32, B8, F32],
 ) -> None:  # fmt: skip
-    """Sample the window of a corner of image 1 as seen in image 2, for each corner size there.
-
-    Not ready if the corner would have another size, or the window leaves the image or is blank.
-    """
+    """Sample the window of a corner of image 1 as seen in image 2, for each corner size; ready if usable."""
     pixels, levels, base = view1
     xy, scale = corner
     a, determinant = local

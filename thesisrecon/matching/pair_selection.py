@@ -1,8 +1,4 @@
-"""Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap.
-
-Overlap is estimated by a geometric test of small patch sets and by bag-of-words similarity, with a vocabulary
-made from the images themselves. Verified pairs that match repeated structure are rejected.
-"""
+"""Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ import scipy
 from thesisrecon.arrays import B8, F32, F64, I64, rows_of_views
 from thesisrecon.errors import UsageError, require_at_least
 from thesisrecon.matching._prepared import MapAll, select_found
-from thesisrecon.matching._seeds import mutual_best
+from thesisrecon.matching._seeds import nearest_seeds
 from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 
 # ruff: noqa: ARG002 (all selectors have the same arguments)
@@ -223,8 +219,8 @@ def _ranks(pairs: I64, value: F64, n: int) -> I64:
 def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sparse.csr_array) -> I64:
     """Pairs (M, 2) that connect the groups of the ``chosen``: of most evidence, else of most similar words.
 
-    They are the edges of a maximum spanning tree of the compared pairs that contains the chosen pairs first.
-    Groups without a compared pair are joined by their most similar images, the smallest group first.
+    Edges of a maximum spanning tree of the compared pairs, chosen ones first; then the smallest group joins
+    first.
     """
     n, m = words.shape[0], len(compared)
     cost = np.empty(m)
@@ -249,10 +245,9 @@ def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sp
 
 
 def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
-    """Largest number of other matches predicted by the similarity of one match.
+    """Largest number of other matches predicted by the similarity (scale, angle in rad) of one match.
 
-    Match m has positions ``xy1[m]``, ``xy2[m]``, ``scale[m]`` (image 2 per image 1) and ``angle[m]`` rad.
-    ``limits`` are the position error in px, the difference of log scales and the difference of angles.
+    ``limits``: position error in px, difference of log scales and of angles.
     """
     turn = scale * np.exp(1j * angle)
     z1, z2 = (xy @ [1.0, 1j] for xy in (xy1, xy2))
@@ -292,11 +287,12 @@ def _evidence(a: tuple[_Subset, _Subset], b: tuple[_Subset, _Subset]) -> float:
 def _overlap_evidence(a: _Subset, b: _Subset) -> float:
     """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms.
 
-    M B(M - 1, k, p) for M matches, k that agree with the best similarity and p the relative area around a
-    prediction, with B the tail of the binomial distribution (A. Desolneux, L. Moisan and J.-M. Morel,
-    "Meaningful alignments", IJCV 40, 2000). 0 means one false alarm is expected.
+    M B(M - 1, k, p) for M matches, k that agree with the best one and p the relative area around a
+    prediction, B the tail of the binomial distribution (Desolneux, Moisan and Morel, IJCV 40, 2000). 0: one
+    false alarm is expected.
     """
-    one, two = _match_subsets(a.seeds, b.seeds)
+    one, two, score = nearest_seeds(a.seeds, b.seeds, 0.8)
+    one, two = (rows[np.argsort(-score, kind="stable")[:150]] for rows in (one, two))
     if len(one) < 2:
         return -float(np.log10(max(len(one), 1)))
     # Position (wide because of parallax and perspective), log scale and angle, rad.
@@ -311,30 +307,13 @@ def _overlap_evidence(a: _Subset, b: _Subset) -> float:
     return -(float(np.log10(len(one))) + max(float(np.log10(max(tail, 1e-320))), -300.0))
 
 
-def _match_subsets(a: Seeds, b: Seeds) -> tuple[I64, I64]:
-    if not (len(a.xy) and len(b.xy)):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    correlation = a.patches @ b.patches.T
-    apart2 = (8.0 * b.scale) ** 2
-    index, value, second_best = mutual_best([correlation], b.xy.astype(np.float32), apart2)
-    one = np.flatnonzero(index >= 0)
-    value, second_best = value[one], second_best[one]
-    # The ratio of the distances, and half of the variance in common.
-    distinct = (value > 0.5) & ((1.0 - value) < 0.8**2 * (1.0 - second_best))
-    one, value = one[distinct], value[distinct]
-    one = one[np.argsort(-value, kind="stable")[:150]]
-    return one, index[one]
-
-
 def word_weights(
     patches: Sequence[F32], words: int, *, map_all: MapAll, rng: np.random.Generator
 ) -> scipy.sparse.csr_array:
     """Weighted word counts (N, W) of images with unit patches (S, D); products of the rows are cosines.
 
-    A word is weighted by how few images contain it, and square roots of the counts limit the effect of
-    repeated structure (J. Sivic and A. Zisserman, "Video Google", ICCV 2003). The vocabulary must be large:
-    if each image contains most words, all images are similar. The transpose is the inverted file: the images
-    of each word.
+    Weighted by rarity, square roots of counts against repeated structure (J. Sivic and A. Zisserman, "Video
+    Google", ICCV 2003). The vocabulary is large: if each image contains most words, all are similar.
     """
     everything = np.concatenate([np.empty((0, patches[0].shape[1]), np.float32), *patches])
     if not len(everything):
@@ -393,8 +372,7 @@ def _words_of(patches: F32, vocabulary: _Vocabulary) -> I64:
 def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[TwoView]:
     """Reject weak pairs whose views are connected only by long paths of strong pairs.
 
-    Views that overlap are connected by a short path of strong pairs through the views between them. Equal
-    windows of two houses give few matches between views that only a long path connects. Weak pairs between
+    Views that overlap are connected by a short path; equal windows of two houses are not. Weak pairs between
     groups that no strong pair connects stay, because nothing else relates these groups.
     """
     accepted = [pair for pair in pairs if pair.accepted]

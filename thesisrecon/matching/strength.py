@@ -26,11 +26,7 @@ TOLERANCE = 0.3  # tolerance of the relative difference of two displacements
 
 @kernel
 def _displacement_weight(a: F64, b: F64, closeness: float) -> float:
-    """Lambda of figure 4.4: direction x length x distance of two displacements (2,) px.
-
-    Displacements below one pixel have no direction and count as one pixel long; ``closeness`` is 1 for equal
-    positions.
-    """
+    """Lambda of figure 4.4: direction x length (at least 1 px) x distance of two displacements (2,) px."""
     na, nb = np.hypot(a[0], a[1]), np.hypot(b[0], b[1])
     cosine = 1.0
     if min(na, nb) >= 1.0:
@@ -53,8 +49,7 @@ def _strength_of_match(
 ) -> tuple[I64, F32]:  # fmt: skip
     """Corner of image 2 of largest strength SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1), and SM; -1: none.
 
-    ``correlation`` (N1, N2); ``near`` = neighbours (N1, M) and (N2, N) of each corner in its image, -1 for
-    none; ``search`` = radius px, number of candidates, correlation that a candidate must exceed;
+    ``near``: neighbours (N1, M), (N2, N) or -1; ``search``: radius px, candidates, least correlation;
     ``tolerance`` of the relative difference, 0: product of figure 4.4.
     """
     xy1, xy2 = xy

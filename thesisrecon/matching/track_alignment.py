@@ -1,7 +1,7 @@
 """Least-squares matching: sub-pixel alignment of windows by position and local affine map.
 
-Inverse compositional alignment (S. Baker and I. Matthews, "Lucas-Kanade 20 years on: a unifying framework",
-IJCV 56, 2004, section 3.2), at the scale of the corner and then at the finest scale.
+Inverse compositional (S. Baker and I. Matthews, IJCV 56, 2004, section 3.2), at the corner's, then the finest
+scale.
 """
 
 from __future__ import annotations
@@ -44,11 +44,10 @@ def _align_windows(
 ) -> tuple[F64, F64, F32]:  # fmt: skip
     """Align the window around each ``xy1`` with image 2, invariant to gain and bias.
 
-    ``view*`` = pixels, levels, base; ``matches`` = xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
-    ``limits`` = iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
-    shift and maximum expected error of the position, both in pixels of the corner's scale. The gradients of
-    the template, orthogonal to a constant (bias) and to the template (gain), serve every iteration. Returns
-    ``xy2`` (M, 2), affine (M, 2, 2) and the final correlation (M,), 0 for failures.
+    ``view*``: pixels, levels, base; ``matches``: xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
+    ``limits``: iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
+    shift and error in pixels of the corner's scale. Returns ``xy2`` (M, 2), affine (M, 2, 2) and the
+    correlation (M,), 0 for failures.
     """
     pixels1, levels1, base1 = view1
     pixels2, levels2, base2 = view2
@@ -96,12 +95,10 @@ def _read_template(
     pixels: F32, level: I64, to_level: float, place: tuple[F64, float], wide: tuple[F32, F32], inner: F32,
     out: tuple[F32, F32],
 ) -> bool:  # fmt: skip
-    """Sample the normalised window of image 1 and its derivatives by the unknowns.
+    """Sample the normalised window of image 1 and its derivatives; False if it leaves the image or is blank.
 
-    ``place`` = xy, sample spacing in px; ``wide`` = buffer and raster of a wider window, ``inner`` the raster
-    of this one. Unknowns: shift x, y in samples and, if ``gradient`` has six rows, the change of the map in
-    units of half the window, so that all six have equal size. False if the window leaves the image or is
-    blank.
+    ``place``: xy, sample spacing px; ``wide``: buffer and raster of a wider window, ``inner`` its own.
+    Unknowns: shift x, y in samples and, with six rows of ``gradient``, the change of the map in half windows.
     """
     xy, size = place
     template, gradient = out
@@ -166,9 +163,8 @@ def _iterate(
 ) -> float:  # fmt: skip
     """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
 
-    ``template`` = window of image 1, derivatives, normal matrix, buffer and raster of the window of image 2;
-    ``limits`` = iterations, prior standard deviation of an affine coefficient, maximum shift px, sample
-    spacing of image 1 px.
+    ``template``: window, derivatives, normal matrix, buffer and raster; ``limits``: iterations, prior
+    standard deviation, maximum shift px, sample spacing of image 1 px.
     """
     pixels, level, to_level = level2
     fixed, gradient, normal, window, raster = template
@@ -239,13 +235,10 @@ def align_corners(
     view1: PreparedImage, view2: PreparedImage, matches: tuple[F64, F32, F64, F64], *, affine_std: float,
     max_shift: float = 3.0,
 ) -> tuple[F64, F64, F32]:  # fmt: skip
-    """Align corners of image 1 with image 2 to sub-pixel positions.
+    """Align corners of image 1 with image 2 to sub-pixel positions, see `_align_windows`.
 
-    Minimises the squared difference of two 15 x 15 windows, invariant to gain and bias, over position and
-    affine map, the latter with a prior at its start. Corners of a coarser scale are aligned there (wide
-    convergence) and then at the finest scale (smaller noise), which is used if it fits better and stays near.
-    ``max_shift`` from the corner is in pixels of its scale. Arguments and results are those of
-    `_align_windows`.
+    Corners of a coarser scale are aligned there (wide convergence) and then at the finest scale (smaller
+    noise), which is used if it fits better and stays near. ``max_shift`` is in pixels of the scale.
     """
     xy1, scale1, _, _ = matches
     base = view1.pyramid[2]

@@ -26,8 +26,7 @@ Pair = TypeVar("Pair", Matches, TwoView)
 def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
     """First corner (N,) of the set of each corner after uniting along ``edges`` (E, 2) in their order.
 
-    An edge between two sets that share a view is rejected. ``view_of`` (N,) is the view of each corner. A set
-    has one corner per view at most, so that an edge costs no more than the length of a track.
+    An edge between two sets that share a view is rejected: a set has one corner per view at most.
     """
     count = len(view_of)
     # Sets are lists linked through ``following``; the smaller one joins the larger.
@@ -73,10 +72,10 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
 
 
 def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
-    """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the middle observations.
+    """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the ``middle`` observations (T,).
 
-    ``edges`` (E, 2) observations; ``middle`` (T,). Returns the position (K, 2) of the middle's point in the
-    view of every observation and the map (K, 2, 2) to it; an unreachable observation keeps its own corner.
+    ``edges`` (E, 2). Returns the middle's point (K, 2) in the view of each observation and the map (K, 2, 2)
+    to it.
     """
     position, maps = xy.copy(), np.tile(np.eye(2), (len(xy), 1, 1))
     order, reached = np.full(len(xy), -1), len(middle)
@@ -231,11 +230,10 @@ def corners_from_matches(
 ) -> tuple[list[F64], list[Pair]]:
     """Number the positions of matches that have no corners, as matchers without a detector give them.
 
-    Positions of one view that are equal or within ``merge_px`` of a common centre become one corner, at their
-    mean. Centres are at least ``merge_px`` apart and are chosen first where many matches have their position,
-    so that chains of close positions do not merge. Returns the corners (N_i, 2) of every view, whose order
-    does not depend on the order of the pairs, and the pairs with ``index1`` and ``index2``. A corner is at
-    most once in a pair: only its match with the least distances from the corners stays.
+    Positions of one view within ``merge_px`` of a common centre become one corner, at their mean; centres are
+    at least ``merge_px`` apart, the most frequent first. Returns the corners (N_i, 2) of every view, whatever
+    the order of pairs, and the pairs with ``index1`` and ``index2``: of matches of one corner the nearest one
+    stays.
     """
     ends: list[F64] = [xy for p in pairs for xy in (p.xy1, p.xy2)]
     lengths = [len(xy) for xy in ends]

@@ -1,7 +1,6 @@
-"""Integer images of rectified pairs, their noise, and matching costs of rows for all disparities.
+"""Integer images of rectified pairs, their noise, and matching costs of rows, strip by strip.
 
-Costs are computed strip by strip, which bounds the memory. The inner loops of the kernels run over the
-columns of row slices without index arithmetic, so that the compiler vectorises them.
+Inner loops run over row slices without index arithmetic, so that the compiler vectorises them.
 """
 
 from __future__ import annotations
@@ -81,8 +80,7 @@ def _side(image: NDArray[np.generic]) -> StereoImage:
 def estimate_noise(image: StereoImage) -> float:
     """Standard deviation in grey levels of the noise of one channel, 0 with fewer than 3 x 3 pixels.
 
-    The median absolute response to the difference of two Laplacians, which is insensitive to linear and
-    quadratic shading (Immerkaer 1996, with the median instead of the mean because texture is not noise).
+    The median absolute difference of two Laplacians (Immerkaer 1996 with the mean): shading does not count.
     """
     rows_for_noise = 24  # Number of evenly spaced rows used for the median
     if min(image.valid.shape) < 3:
@@ -194,10 +192,9 @@ def _both(a: U8, b: U8, out: U8) -> None:
 def _row_costs(
     y: int, left: CostFeatures, right: CostFeatures, first: int, weights: I16, outside: np.uint8, padded: U8
 ) -> None:
-    """Costs (D, W) of row y of the left image at the disparities first, first + 1, ...
+    """Costs (D, W), in the middle of ``padded``, of row y of the left image at the disparities from first on.
 
-    ``weights``: of a census bit, of a quarter level, and the truncation of the levels (sum over channels).
-    ``outside`` is the cost of a pair with a missing pixel. The costs are in the middle of ``padded``.
+    ``weights``: of a census bit, of a quarter level, and truncation; ``outside``: cost with a missing pixel.
     """
     bits_l, a, valid_l = left
     bits_r, b, valid_r = right
@@ -236,10 +233,10 @@ def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
 
 @kernel
 def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
-    """Cross-shaped support arms of all pixels (Zhang, Lu and Lafruit 2009).
+    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009).
 
-    ``tolerance`` is the largest difference to the centre in every channel. ``masks`` (4, ARM, H, W) receive
-    255 where the pixel s + 1 to the left, right, top or bottom belongs to the arm, else 0.
+    255 where the pixel s + 1 to the left, right, top or bottom is within ``tolerance`` in every channel, else
+    0.
     """
     height, width = valid.shape
     masks[:] = 0

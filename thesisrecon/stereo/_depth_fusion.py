@@ -29,10 +29,9 @@ GATE = 3.0  #: standard deviations within which estimates agree; limit of the in
 
 
 def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
-    """Inverse depths and standard deviations (H, W) from the correspondence with another camera.
+    """Inverse depths and standard deviations (H, W) from the correspondence with another camera, or NaN.
 
-    A pixel of inverse depth rho is at H (x, y, 1) + rho e in the other view; rho minimises the distance to
-    the correspondence. NaN if that is unknown or behind a camera.
+    A pixel is at H (x, y, 1) + rho e in the other view; rho minimises the distance to the correspondence.
     """
     H, e = pixel_transfer(P, P_other)
     v, u = np.nonzero(np.isfinite(pair.xy[..., 0]) & np.isfinite(pair.sigma))
@@ -50,10 +49,9 @@ def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32
 
 
 def fuse_inverse_depths(found: Sequence[tuple[F32, F32]], shape: tuple[int, ...]) -> InverseDepth:
-    """Fuse several inverse depths, with standard deviations, (H, W) per pixel into one.
+    """Fuse inverse depths and standard deviations, (H, W) each: the largest group that agrees is averaged.
 
-    The estimate that most others agree with is averaged with these, weighted by the inverse variances; among
-    equals the more certain one.
+    Weights are the inverse variances; among groups of equal size the more certain one is taken.
     """
     none = np.full(shape, np.nan, dtype=np.float32)
     rho, std = (np.stack(part) for part in zip(*(found or [(none, none)]), strict=True))
@@ -81,10 +79,10 @@ def _agree(a: F32, sa: F32, b: F32, sb: F32) -> B8:
 
 
 def update_kalman(state: InverseDepth, new: tuple[F32, F32], alive: B8) -> None:
-    """Update the one-dimensional Kalman filter of every pixel (H, W) in place.
+    """Update the one-dimensional Kalman filter of every pixel (H, W) in place; ``views`` are measurements.
 
-    The first measurement starts the chain of a pixel; a missing measurement, or one beyond ``GATE`` standard
-    deviations of the innovation, ends it: ``alive`` becomes False. ``state.views`` counts the measurements.
+    A missing measurement, or an innovation beyond ``GATE`` standard deviations, ends a chain: ``alive`` =
+    False.
     """
     first = np.isnan(state.value)
     alive &= np.isfinite(new[0]) & (first | _agree(state.value, state.std, *new))
@@ -109,13 +107,12 @@ def _projected(to: F64, u: float, v: float, z: float) -> tuple[float, float, flo
 def count_agreement(
     own: tuple[F32, F32], to: F64, other: tuple[F32, F32], back: F64, limits: F64, agree: U8, contradict: U8
 ) -> None:
-    """Count pixels that another depth map confirms or contradicts.
+    """Count pixels that another depth map confirms or contradicts, which sees through them.
 
-    ``own`` and ``other`` are depths and standard deviations (H, W), NaN = unknown.
-    A pixel is confirmed if the reprojection of the other map's depth returns within ``limits[0]`` pixels and
-    the depths differ by less than ``limits[1]`` of the depth plus ``limits[2]`` standard deviations; it is
-    contradicted if the other view sees through it. ``to`` (3, 4) transforms z (x, y, 1), 1 to z' (x', y', 1)
-    of the other view, ``back`` the other way.
+    ``own``, ``other``: depths and standard deviations (H, W), NaN = unknown. Confirmed: the other depth
+    returns within ``limits[0]`` px, and depths differ by less than ``limits[1]`` of the depth plus
+    ``limits[2]`` standard deviations. ``to``, ``back`` (3, 4): from z (x, y, 1), 1 to z' (x', y', 1) of the
+    other view and vice versa.
     """
     depth, std = own
     other_depth, other_std = other
@@ -147,10 +144,7 @@ def count_agreement(
 
 @kernel(error_model="numpy")
 def splat_depths(depth: F32, to: F64, out: F32) -> None:
-    """Project depths to the nearest pixels of another view, keeping the smaller depth.
-
-    ``to`` as in :func:`count_agreement`; ``out`` is updated, NaN = unknown.
-    """
+    """Project depths by ``to``, see :func:`count_agreement`, to pixels of ``out``; the nearest stays."""
     rows, columns = out.shape
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -171,8 +165,8 @@ def _window_plane(
 ) -> tuple[int, tuple[float, float, float], float, tuple[float, float], bool]:
     """Fit a plane to the inverse depths of a window that are ``used`` and similar to the centre's.
 
-    Returns the number of pixels, the means of x, y and inverse depth relative to the centre, the sum of the
-    variances of x and y, the gradient, and whether it is determined.
+    Returns the number of pixels, the means of x, y and inverse depth relative to the centre, sum of the
+    variances of x and y, gradient, and whether it is determined.
     """
     v, u = at
     here = np.float64(rho[at])
@@ -209,10 +203,9 @@ def fit_planes(rho: F32, radius: int) -> F32:
 
 @kernel
 def surface_continuation(rho: F32, std: F32, sure: B8, radius: int, gate: float) -> B8:
-    """Pixels (H, W) that continue the surface of ``sure`` neighbours.
+    """Pixels (H, W) within ``gate`` standard deviations of the plane of ``sure`` pixels around them.
 
-    A plane is fitted to the sure pixels of the window of similar inverse depth. They must be a quarter of the
-    window and surround the pixel, and the plane must pass within ``gate`` standard deviations.
+    These have similar inverse depth, are a quarter of the window and surround the pixel.
     """
     joins = zeros(rho.shape, np.bool_)
     for v in range(rho.shape[0]):
@@ -243,11 +236,7 @@ def fuse_neighbours(
     correspond: Correspond,
     pool: Executor | None = None,
 ) -> InverseDepth:
-    """Robust weighted mean of the inverse depths measured with all neighbours (2.5).
-
-    The largest group of estimates that agree is averaged, the more certain one among equals. A measurement
-    with a single neighbour is kept; the depth map of another view must confirm it.
-    """
+    """Robust weighted mean of the inverse depths measured with all neighbours (2.5)."""
     pairs = zip(neighbours, _with_idle_threads(pool, partial(correspond, view), neighbours), strict=True)
     found = [inverse_depths(views[view].P, views[j].P, pair) for j, pair in pairs if pair is not None]
     return fuse_inverse_depths(found, views[view].seen.shape)
@@ -267,11 +256,8 @@ def link_sequence(
 ) -> InverseDepth:
     """Link correspondences through the views in order of their numbers with a Kalman filter per pixel (2.5).
 
-    Koch, Pollefeys and Van Gool, "Multi viewpoint stereo from uncalibrated video sequences", ECCV 1998. The
-    disparities of consecutive pairs are chained up and down the sequence from the reference view, at most
-    ``links`` in each direction. Each view of the chain measures the depth with a longer baseline, and the
-    variances of the links add up. A pixel's chain ends at the first measurement outside the gate, where it is
-    taken as occluded. Both directions are filtered separately and fused where they agree.
+    Koch, Pollefeys and Van Gool, ECCV 1998: disparities of consecutive pairs are chained up and down from the
+    view, at most ``links`` each way; variances add up, and a chain ends where it is occluded.
     """
     order = sorted(views)
     place = order.index(view)

@@ -1,9 +1,8 @@
 """Epipolar pencils of image pairs and extent of rectified frames.
 
-An epipolar plane has an angle phi; p = (cos phi, sin phi) is imaged as the line L p with a 3 x 2 matrix L per
-view. A pixel lies in a half-plane bounded by the baseline, so phi covers the full circle: half epipolar lines
-(Pollefeys, Koch and Van Gool, ICCV 1999), also for epipoles at infinity. Normalised coordinates are
-z = (x - centre) / unit with a unit of about one focal length.
+p = (cos phi, sin phi) of an epipolar plane is imaged as the line L p with L (3, 2) per view. A pixel lies in
+a half-plane: phi covers the full circle (Pollefeys, Koch and Van Gool, ICCV 1999), for any epipole.
+Normalised coordinates are z = (x - centre) / unit with a unit of about one focal length.
 """
 
 from __future__ import annotations
@@ -125,8 +124,8 @@ class HalfLines:
     def sagitta(self) -> F64:
         """(...) distance of each foot from the circle about the epipole through the centre.
 
-        D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, without
-        cancellation for distant epipoles. It aligns columns of equal distance from the epipole.
+        D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, evaluated
+        without cancellation. It aligns columns of equal distance from the epipole.
         """
         e = self.epipole
         D_w = float(np.hypot(e[0], e[1]))

@@ -1,7 +1,4 @@
-"""Refinement of depth maps with slanted windows (PatchMatch multi-view stereo).
-
-A compiled search finds the plane of every pixel that maximises the correlation with neighbouring views.
-"""
+"""Refinement of depth maps with slanted windows: the plane of every pixel of largest correlation."""
 
 from __future__ import annotations
 
@@ -37,10 +34,9 @@ class PatchSearch(NamedTuple):
     """A reference view, its K neighbours, the transfer of pixels to them, and the matching window.
 
     A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k. ``gray``
-    (H, W) is NaN where there is no pixel; ``squares`` (S,) are the packed pixels of all neighbours, see
-    :func:`pack_squares`; ``layout`` (K, 3) has the offset into them, width and height of each neighbour.
-    ``offsets`` (2, S) of the samples are whole pixels, opposite corners of the window first and last, (0, 0)
-    among them; ``weights`` (256,) belong to absolute grey level differences to the centre.
+    (H, W): NaN without a pixel; ``squares`` (S,): of all neighbours, see :func:`pack_squares`; ``layout`` (K,
+    3): offset, width and height of each; ``offsets`` (2, S) of the samples: whole pixels, opposite corners
+    first and last; ``weights`` (256,) belong to absolute grey level differences to the centre.
     """
 
     gray: F32
@@ -65,11 +61,7 @@ def pack_squares(gray: F32) -> U32:
 
 @kernel(fastmath=SUMS, forceinline=True)
 def _window_samples(search: PatchSearch, u: int, v: int, samples: F32) -> float:
-    """Fill ``samples`` (2, S) with normalised weights and weighted, centred grey levels of the window.
-
-    Samples similar to the centre weigh more, missing pixels 0. Returns the weighted variance of the grey
-    levels.
-    """
+    """Fill ``samples`` (2, S) with normalised weights and weighted, centred grey levels; their variance."""
     gray, offsets, weights = search.gray, search.offsets, search.weights
     height, width = gray.shape
     centre = gray[v, u]
@@ -92,10 +84,9 @@ def _window_samples(search: PatchSearch, u: int, v: int, samples: F32) -> float:
 
 @kernel(fastmath=SUMS, forceinline=True)
 def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, warp: F64) -> bool:
-    """Fill ``warp`` (8,) with the homography of the plane from offsets (dx, dy) of pixel ``at`` to view k.
+    """Fill ``warp`` (8,) with the plane's map of offsets from pixel ``at`` to view k; False if it is behind.
 
     (warp[0] + dx warp[1] + dy warp[2], warp[3] + dx warp[4] + dy warp[5]) / (1 + dx warp[6] + dy warp[7]).
-    Returns False if the point is behind the camera.
     """
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + plane[0] * e[k, 2]
@@ -221,11 +212,10 @@ def _plane_cost(
     limit: float,
     work: tuple[F64, F64, I64],
 ) -> float:
-    """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first.
+    """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first (occlusion).
 
-    A neighbour in which the pixel is occluded has limited influence. ``work`` is work space (8,) and (K,),
-    and the order (K,) in which neighbours are tried. If the first two of it cost ``limit`` or more, the
-    others are not tried; else the two of smallest cost become the first two.
+    ``work``: work space (8,), (K,), and the order (K,) of the neighbours; the best two become its first two.
+    If these cost ``limit`` or more, the others are not tried.
     """
     _, squares, layout, H, e, offsets, _ = search
     warp, costs, order = work
@@ -293,11 +283,10 @@ def sweep_planes(
 ) -> None:
     """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo).
 
-    Each pixel tries the planes of the two neighbours visited before and perturbations of its own plane by
-    ``step_px`` in the neighbours: shifted, and tilted by as much at the border of the window. Planes of a
-    cost up to ``converged_cost`` are not changed, nor those that are not ``active`` (H, W) if neither
-    neighbour is. ``planes`` (inverse depth and its gradient) and ``cost`` are updated; pixels whose cost
-    falls by ``MIN_GAIN`` remain active.
+    Each pixel tries the planes of the two neighbours visited before, and its own shifted by ``step_px`` in
+    the neighbours and tilted by as much at the border of the window. Planes up to ``converged_cost`` stay, as
+    do those not ``active`` (H, W) beside no active one; a fall of the ``cost`` by ``MIN_GAIN`` keeps a pixel
+    active.
     """
     gray, H, e, offsets = search.gray, search.H, search.e, search.offsets
     height, width = gray.shape
@@ -352,11 +341,7 @@ def sweep_planes(
 
 @kernel(fastmath=SUMS)
 def rate_planes(search: PatchSearch, planes: F32, max_cost: float) -> tuple[F32, U8, F32]:
-    """Smallest cost of planes (H, W, 3), their support and standard deviation (H, W).
-
-    The support is the number of neighbours with a cost up to ``max_cost``; their pixels per unit of inverse
-    depth determine the standard deviation.
-    """
+    """Smallest cost of planes (H, W, 3), number of those up to ``max_cost``, and std."""
     gray, squares, layout, H, e, offsets, _ = search
     height, width = gray.shape
     samples, warp, plane = empty((2, offsets.shape[1]), np.float32), empty(8), empty(3)
@@ -401,14 +386,10 @@ def begin_planes(search: PatchSearch, planes: F32) -> F32:
 def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth) -> InverseDepth:
     """Refine and extend the inverse depths of a view by propagating and refining a plane per pixel (2.6).
 
-    Stereo matching of rectified images assumes fronto-parallel windows and loses slanted surfaces. A plane in
-    space is linear in inverse depth, so each pixel has an inverse depth and its gradient. Its window is
-    transferred to the neighbours by the plane's homography and compared by weighted normalised correlation
-    (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV 2016). The search is
-    deterministic: it starts from the fused correspondences. The cost is 1 - correlation.
-
-    A pixel is kept if two neighbours have at most ``MAX_COST``, one has at most half of it, or two of the
-    fused correspondences ``found`` agree.
+    A plane in space is linear in inverse depth; each window is transferred by its homography and compared by
+    weighted correlation (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV
+    2016), from the fused correspondences ``found`` on. A pixel is kept if two neighbours have at most
+    ``MAX_COST``, one has at most half of it, or two of the fused correspondences agree.
     """
     sweeps = 4  # Passes over the image, alternating in direction
     if not others or not np.isfinite(found.value).any():

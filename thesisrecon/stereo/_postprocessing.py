@@ -58,10 +58,9 @@ def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tupl
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
     """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on.
 
-    The sub-pixel position is the vertex of two lines of opposite slope through the best three totals; there
-    is none at the ends of the range. ``out`` (3 of (H, W)) receives the sub-pixel disparities of the left
-    image, the integer disparities of the right image (NaN if out of range) and the confidence m / (m +
-    ``half``), m the margin to the second best disparity.
+    ``out`` (3 of (H, W)): left disparities at the vertex of two lines of opposite slope through three totals,
+    whole right ones (NaN out of range), and the confidence m / (m + ``half``), m the margin to the second
+    best.
     """
     pairs, _, n, width = sums.shape
     left, right, confidence = out
@@ -103,10 +102,7 @@ def check_left_right(left: F32, right: F32, confidence: F32, largest_px: float, 
 
 
 def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F32) -> F32:
-    """Confidence (H, W), 0 where no disparity is known, halved where it was not known before filling.
-
-    It is reduced where ``texture`` of :func:`texture_of` is weak.
-    """
+    """Confidence (H, W): 0 for unknown disparities, halved for filled ones, less with weak ``texture``."""
     excess = np.maximum(texture - np.float32(1.0), np.float32(0.0))
     share = np.maximum(excess / (excess + np.float32(1.0)), np.float32(0.05))
     share[np.isnan(confirmed)] *= np.float32(0.5)
@@ -115,10 +111,9 @@ def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F
 
 @kernel
 def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
-    """Set connected regions to NaN that have fewer than ``smallest`` pixels, or too few ``textured`` ones.
+    """Set regions to NaN with fewer than ``smallest`` pixels, or with too few ``textured`` ones in or beside.
 
-    A region needs one textured pixel, in or next to it, in twenty. Neighbours are connected if their
-    disparities differ by at most ``step``.
+    Neighbours are connected if their disparities differ by at most ``step``.
     """
     min_textured = 20  # A region needs one textured pixel per this number of pixels
     height, width = disparity.shape

@@ -61,8 +61,8 @@ def _select_neighbours(
     """Select the neighbours of a view greedily, the most useful first.
 
     The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
-    observe count less, and so does a view whose baseline has the direction of an earlier one, because views
-    from other sides see surfaces that are occluded here.
+    observe count less, and so does a view in the direction of an earlier one: other sides see what is
+    occluded here.
     """
     # Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones.
     best_deg, sigma_below_deg, sigma_above_deg = 10.0, 3.0, 10.0
@@ -142,9 +142,9 @@ def keep_depths(depth_map: DepthMap, keep: B8) -> DepthMap:
 def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView]) -> DepthMap:
     """Complete a depth map with surfaces that only the depth maps of other views contain.
 
-    The depths of other views are projected into the view. Where it has none, the nearest of these initialise
-    the plane search against the ``MAX_SOURCES`` images that contribute most pixels. Accepted planes (by the
-    rule of :func:`refine_depths`) are measured depths: nothing is interpolated.
+    The nearest of their projections initialise the plane search against the images that contribute most
+    pixels. Accepted planes (by the rule of :func:`refine_depths`) are measured depths: nothing is
+    interpolated.
     """
     max_sources = 4  # Largest number of views from which a depth map is completed
     # Size of the gaps between projected pixels that completion fills, and number of passes of its search.
@@ -176,12 +176,10 @@ def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[i
 def frustum_samples(
     views: Mapping[int, PinholeView], n_views: int, depth_range: F64 | None = None
 ) -> tuple[F64, B8]:
-    """Sample the common frusta; return points (N, 3) and whether each of ``n_views`` shows them (V, N).
+    """Sample the common frusta: points (N, 3), and whether each of ``n_views`` shows them (V, N).
 
-    The points lie on the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2), and
-    are shown by the views whose image contains them. Without a range, another view shows a point only at a
-    triangulation angle from 0.5 to 40 degrees: below, depth is uncertain; above, windows look different.
-    Points shown only by their own view are left out.
+    On the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2); without it another
+    view shows a point only at a triangulation angle from 0.5 to 40 degrees. Points of one view are left out.
     """
     min_angle_deg, max_angle_deg = 0.5, 40.0
     # Depths between given limits, evenly in inverse depth; ratio of successive depths without limits.

@@ -84,10 +84,7 @@ def _least(matched: int, left_occluded: int, right_occluded: int) -> tuple[int, 
 def _enter_column(
     i: int, first: int, costs: I32, occluded: int, above: tuple[I32, I32], keys: tuple[I64, I64], states: U8
 ) -> None:
-    """Keys (3, D) of the nodes (i, j) from those with i - 1; ``occluded`` is the key of an occluded pixel.
-
-    ``states`` (D,) receives the predecessor of each of the three states, two bits each.
-    """
+    """Keys (3, D) of the nodes (i, j) from those with i - 1, and ``states`` (D,): predecessors, two bits."""
     n, width = costs.shape
     previous, present = keys
     up = above[0][i - 1]
@@ -117,12 +114,10 @@ def _solve_row(
 ) -> None:
     """Find the maximum-likelihood correspondences of one row from costs (D, W), ``NO_MATCH`` without a match.
 
-    Among solutions of equal likelihood the one with the fewest discontinuities along the row and against the
-    previous row is taken. A node (i, j) has passed i left and j right pixels, i - j = d. It is entered by a
-    match, by an occluded left pixel or by an occluded right pixel, which are its three states. ``penalties``:
-    cost of an occluded pixel and of one outside the other image, in steps. ``above`` are the disparities (W,)
-    of the previous row in both images; ``left`` and ``right`` (W,) receive the new ones, ``OCCLUDED`` where
-    occluded.
+    A node (i, j) has passed i left and j right pixels, i - j = d; it is entered by a match or an occluded
+    left or right pixel, its three states. Of equal likelihoods the fewest discontinuities, to the row
+    ``above`` too, count. ``penalties``: of an occluded pixel and one out of view; ``left``, ``right`` (W,):
+    ``OCCLUDED`` or disparities.
     """
     n, width = costs.shape
     occluded, border = penalties
@@ -185,9 +180,9 @@ def _solve_rows(
 ) -> None:
     """Solve the rows of a pair from the top, each with cohesion to the previous one.
 
-    ``left``, ``right``: (channels (K, H, W), valid (H, W)). ``disparities`` first and last. ``model``: window
-    radius, steps per squared channel unit, and the penalties of :func:`_solve_row`. ``out`` receives the
-    disparities (H, W), ``OCCLUDED`` where occluded, and their probabilities.
+    ``left``, ``right``: channels (K, H, W), valid (H, W); ``disparities``: first, last; ``model``: window
+    radius, steps per squared unit, penalties of :func:`_solve_row`; ``out``: disparities (H, W) and
+    probabilities.
     """
     first, last = disparities
     radius, scale, penalties = model[0], model[1], (model[2], model[3])

@@ -83,10 +83,7 @@ def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8,
 def _extend_row(
     cost: U8, before: U8, base: U8, p2: U8, settings: tuple[np.uint8, int, U8], path: U8, least: U8
 ) -> None:
-    """Path costs (D, W) of a row of pixels from those of the previous row, ``shift`` columns aside.
-
-    ``p2`` (W,) belongs to the previous pixel. ``settings`` are P1, the shift, and a row of unreachable costs.
-    """
+    """Path costs (D, W) of a row from the previous one, ``shift`` columns aside, of penalties ``p2``."""
     P1, shift, unreachable = settings
     n, width = cost.shape
     a, b = max(0, -shift), width - max(0, shift)
@@ -188,8 +185,7 @@ def _store(square: Word8, words: U64, first: int, column: int) -> None:
 def _transpose_rows(source: U8, out: U8) -> None:
     """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8.
 
-    Additional entries are arbitrary. Tiles avoid cache conflicts of row lengths that are multiples of a large
-    power of two.
+    Tiles avoid cache conflicts of row lengths that are multiples of a large power of two.
     """
     rows, n, width = source.shape
     words = out.view(np.uint64)
@@ -233,8 +229,8 @@ def scratch_size(height: int, disparities: int, width: int) -> int:
 def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
     """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
 
-    ``P2`` (4, H, W) from :func:`adaptive_P2`; ``total`` (P, H, D, W) receives the sums: P = 2 for rows and
-    columns, P = 4 with the diagonals. ``scratch`` (2, scratch_size) is work space.
+    ``P2`` (4, H, W) of :func:`adaptive_P2`; ``total`` (P, H, D, W): P = 2 for rows and columns, 4 with
+    diagonals.
     """
     height, n, width = costs.shape
     # Horizontal paths are sequential in x: transposed rows are vectorised over y.

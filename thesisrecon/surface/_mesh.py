@@ -65,10 +65,7 @@ def face_neighbours(faces: I64) -> I64:
 
 
 def halve_surface(mesh: TexturedMesh, size: I64, largest: int) -> I64:
-    """(M,) part of each face: boxes are halved until the sum of ``size`` (M,) in each is at most ``largest``.
-
-    They are cut across their longest side, so that parts are compact; one face is not cut.
-    """
+    """(M,) part of each face: boxes cut across their longest side, with ``size`` up to ``largest``."""
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     part, count, open_ = np.zeros(len(mesh.faces), dtype=np.int64), 0, [np.arange(len(mesh.faces))]
     while open_:
@@ -108,8 +105,8 @@ def max_depth_slope(P: F64, grazing_deg: float) -> float:
 def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
     """Divide the squares of depths (H, W) into triangles without surface break along a side.
 
-    Returns whether the diagonal, that of the smaller depth step, runs from the lower left to the upper right
-    (H - 1, W - 1), and which of the two triangles exist (H - 1, W - 1, 2).
+    Whether the diagonal, that of the smaller depth step, rises to the right (H - 1, W - 1), and which of the
+    two triangles exist (H - 1, W - 1, 2).
     """
     corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
@@ -134,11 +131,7 @@ def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> 
 def surface_from_depth(
     depth_map: DepthMap, *, step: int = 1, grazing_deg: float = GRAZING_DEG
 ) -> TexturedMesh:
-    """Triangulate a depth map.
-
-    Two pixels belong to one surface if the line between their points deviates from the rays by more than
-    ``grazing_deg``, or if their depths differ by less than three standard deviations.
-    """
+    """Triangulate a depth map between neighbours seen at more than ``grazing_deg``, or within three std."""
     depth = depth_map.depth[::step, ::step].astype(np.float64)
     std = depth_map.std[::step, ::step].astype(np.float64)
     diagonal, whole = triangulate_grid(depth, std, step * max_depth_slope(depth_map.P, grazing_deg))

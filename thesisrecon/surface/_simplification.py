@@ -1,8 +1,8 @@
 """Simplification of a mesh: edges collapse within an error limit at each vertex (Garland and Heckbert 1997).
 
-A vertex keeps the squared distances to the planes of all faces it replaces as a quadratic form. An edge
-collapses to the point with the smallest sum if the root mean square stays below the limit. Then each vertex
-moves by the mean distance of the original vertices from the faces around it.
+A vertex keeps the squared distances to the planes of the faces it replaces as a quadratic form; an edge
+collapses to the point of least sum if its rms is below the limit. At last each vertex moves by the mean
+distance of the original ones from the faces around it.
 """
 
 from __future__ import annotations
@@ -28,11 +28,10 @@ MAX_FAN = 24  #: largest number of faces around a vertex
 class MeshState(NamedTuple):
     """A mesh during its simplification.
 
-    ``points`` (N, 3); ``planes`` (N, 11): sum of n n' (upper triangle), n d and d^2 of the planes n x = d,
-    weighted, and the sum of the face areas; ``limit`` (N,) squared; ``border`` (N,) 1 on borders; ``faces``
-    (M, 3), removed ones begin with -1; ``first`` (N,) corner 3 m + k of each vertex and ``following`` (3M,)
-    its next corner, -1 for none; ``block`` (N,) of a vertex with all of its faces in one block, else -1;
-    ``into`` (N,) the vertex that replaced one, or itself.
+    ``points`` (N, 3); ``planes`` (N, 11): weighted sums of n n' (upper triangle), n d and d^2 of the planes n
+    x = d, and of areas; ``limit`` (N,) squared; ``border`` (N,); ``faces`` (M, 3), -1 if removed; ``first``
+    (N,) corner 3 m + k of each vertex and ``following`` (3M,) or -1; ``block`` (N,) of all faces of a vertex,
+    else -1; ``into`` (N,) the vertex that replaced one, or itself.
     """
 
     points: F64
@@ -298,8 +297,8 @@ def _merge(mesh: MeshState, v: int, w: int, planes: F64, point: F64) -> None:
 def sum_distances(mesh: MeshState, original: F32, total: F64) -> None:
     """Sum the distances of the ``original`` vertices (N, 3) from the faces around those that replaced them.
 
-    ``total`` (N, 4) receives, at the corners of the faces, sums of distance times normal and of the weights,
-    the barycentric coordinates of points that lie over a face.
+    ``total`` (N, 4): sums of distance times normal and of the weights, barycentric coordinates of points over
+    a face.
     """
     points, faces = mesh.points, mesh.faces
     side, other, away, normal, across = empty(3), empty(3), empty(3), empty(3), empty(3)
@@ -411,10 +410,7 @@ def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> Tex
 
 
 def _merge_in_cells(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
-    """Merge vertices that edges connect within a cell of a grid (Rossignac and Borrel 1993).
-
-    Cells are enlarged until the faces are few enough. Both sides of a sheet stay.
-    """
+    """Merge vertices that edges connect within a cell of a grid, enlarged as needed (Rossignac 1993)."""
     extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
     cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
     start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()

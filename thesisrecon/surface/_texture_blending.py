@@ -49,13 +49,11 @@ SCATTER = 20.0  #: distance from the median colour in grey levels at which the w
 
 
 class ViewSurface(NamedTuple):
-    """A surface seen by one view.
+    """A surface seen by one view; with (u, v, 1) z = M X + p, ``scale`` = det M.
 
-    With (u, v, 1) z = M X + p, the pixels per area are ``scale`` = det M times the distance of ``centre`` to
-    the tangent plane over z^3.
-    ``depth`` (H, W): nearest depth, inf without a surface; ``trust`` (H, W): weight of each pixel in 0 .. 1;
-    ``tolerance``: relative depth by which visible points may lie behind ``depth``; ``gain`` (3,): of the
-    brightness.
+    Pixels per area: ``scale`` times the distance of ``centre`` to the tangent plane over z^3. ``depth`` (H,
+    W): inf without a surface; ``trust`` (H, W): weight in 0 .. 1; ``tolerance``: relative depth by which
+    visible points may lie behind ``depth``; ``gain`` (3,): of the brightness.
     """
 
     P: F64
@@ -72,8 +70,7 @@ class ViewSurface(NamedTuple):
 def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
     """Observe points in one view: weights (pixels per area times trust) and colours times the gain.
 
-    A point is visible if it is at most ``view.tolerance`` of its depth behind the farthest of the four pixels
-    around.
+    Visible: at most ``view.tolerance`` of its depth behind the farthest of the four pixels around.
     """
     P, centre, scale, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
@@ -123,10 +120,7 @@ def _sort_weighted(values: F32, weights: F64, order: I64) -> tuple[int, float]:
 
 @kernel
 def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
-    """Let the observations (N,) of one more view replace the smallest kept ones (V, N) that are smaller.
-
-    Those of larger ``weight`` stay, of equal ones the first, in the order of the views.
-    """
+    """Let the observations (N,) of one more view replace smaller ones (V, N); of equals the first stays."""
     views = weight.shape[0]
     for n in range(len(one)):
         if one[n] <= 0.0:
@@ -150,8 +144,8 @@ def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
     """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
 
-    Relative weights are raised to ``power`` and multiplied by 1 / (1 + (d / scatter)^2)^2 with the RMS
-    distance d from the weighted median colour.
+    Relative weight^``power`` / (1 + (d / scatter)^2)^2, with the RMS distance d from the weighted median
+    colour.
     """
     views = weight.shape[0]
     relative = empty(views)
@@ -202,8 +196,7 @@ def grow_colors(texture: U8, drawn: B8) -> None:
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
     """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
 
-    ``corners`` (M, 3, 3): in homogeneous texels; ``face`` (H, W), -1 for none, and ``weights`` (H, W, 2) of
-    corners 1 and 2 are updated from the left, right, upper or lower neighbour.
+    ``corners`` (M, 3, 3): homogeneous texels; updates ``face`` (H, W), -1: none, and ``weights`` (H, W, 2).
     """
     (height, width), before = face.shape, np.pad(face, 1, constant_values=-1)
     for top, left in ((1, 0), (1, 2), (0, 1), (2, 1)):
@@ -226,13 +219,12 @@ def paint_texture(
     *,
     threads: int = 1,
 ) -> U8:
-    """Compute the colours of a texture (H, W, 3) as a robust blend of all images that show a point.
+    """Colours of a texture (H, W, 3) as a robust blend of all images that show a point, part by part.
 
     The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
-    foreground objects and where its colour contradicts the others (thin objects missing from the surface,
-    reflections, people). Weights vary smoothly, so no seams occur. ``uv`` (M, 3, 2): corners of the faces in
-    texels, NaN for faces that no view shows; other texels keep the colours of ``cut_out``. The surface is
-    painted part by part, each with the views whose image can contain it.
+    foreground objects and where its colour contradicts the others. Weights vary smoothly, so no seams occur.
+    ``uv`` (M, 3, 2): corners in texels, NaN for faces that no view shows; other texels keep the colours of
+    ``cut_out``.
     """
     prepared_bytes = 11  # Bytes of a pixel of a view that is prepared for blending
     grown_texels = 3  # Further texels that take the colours of the rim, for reduced textures

@@ -1,14 +1,12 @@
 """Textured surface model of a scene from all depth maps (thesis, section 2.6), and its texture atlas.
 
-A chart of the texture consists of connected faces that are assigned to one image and has the outline and
-resolution of that image. Its colours are blended from all images.
+A chart consists of connected faces assigned to one image, at its resolution; colours are blended from all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import repeat
 
 import numpy as np
 
@@ -42,10 +40,7 @@ def texture_mesh(
     max_texels: int = MAX_TEXELS,
     threads: int = 1,
 ) -> TexturedMesh:
-    """Texture a mesh at the resolution of the view that shows each part of the surface best (2.6).
-
-    Images are reduced until the texture has at most ``max_texels``.
-    """
+    """Texture a mesh at the resolution of the best view of each part, up to ``max_texels`` (2.6)."""
     min_scale = 0.05  # Smallest reduction of the images
     neighbours = face_neighbours(mesh.faces)
     given = [view_camera(view) for view in views]
@@ -58,7 +53,7 @@ def texture_mesh(
     while True:
         cameras = [camera.scaled(scale) for camera in given] if scale < 1.0 else given
         xy = _corners(mesh, cameras, label)
-        rectangles = _rectangles(xy, label, chart, cameras)
+        rectangles = _rectangles(xy, label, chart, np.array([camera.size for camera in cameras]))
         offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
         if size[0] * size[1] <= max_texels:
             break
@@ -71,7 +66,9 @@ def texture_mesh(
         whole = views
         views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
         buffers = depth_buffers(mesh, views)
-    cut_out = _fill(views, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size)
+    cut_out = _fill(
+        lambda v: views[v].rgb, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size
+    )
     seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
     prepared = prepare_views(mesh, views, buffers, threads=threads)
     texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
@@ -145,9 +142,8 @@ def choose_views(
 ) -> I64:
     """Choose the view (M,) from which each face is textured, -1 if no view sees it.
 
-    The best view of each face alone would give many small charts. Therefore the quality of each view relative
-    to the best one is diffused over the faces that it sees, and small charts join the neighbour with the
-    longest common border. Eight views are in memory at a time.
+    Quality relative to the best view is diffused over the faces that a view sees, and small charts join the
+    neighbour with the longest common border: few charts. Eight views are in memory at a time.
     """
     smooth_rounds = 40  # Faces over which the choice of views is smoothed
     own_weight = 0.1  # Weight of a face's own share relative to those of its neighbours
@@ -155,12 +151,16 @@ def choose_views(
     label = np.full(len(mesh.faces), -1, dtype=np.int64)
     best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
 
-    def best_of_eight(first: int, spreading: bool) -> tuple[F32, I64]:
-        share = face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
-        if not spreading:
-            visible[:, first // 8] = np.packbits(share > 0.0, axis=1)[:, 0]
-            return share.max(axis=1), first + share.argmax(axis=1)
-        share /= np.maximum(best, np.float32(1e-20))[:, None]
+    def quality_of_eight(first: int) -> F32:
+        return face_quality(mesh, views[first : first + 8], buffers[first : first + 8])
+
+    def best_of_eight(first: int) -> tuple[F32, I64]:
+        quality = quality_of_eight(first)
+        visible[:, first // 8] = np.packbits(quality > 0.0, axis=1)[:, 0]
+        return quality.max(axis=1), first + quality.argmax(axis=1)
+
+    def smoothest_of_eight(first: int) -> tuple[F32, I64]:
+        share = quality_of_eight(first) / np.maximum(best, np.float32(1e-20))[:, None]
         spread, other = share.copy(), np.empty_like(share)
         for _ in range(smooth_rounds):
             diffuse(share, neighbours, own_weight, spread, other)
@@ -169,8 +169,8 @@ def choose_views(
 
     with ThreadPool(threads) as pool:
         # Faces that the diffusion leaves without shares keep their best view.
-        for highest, spreading in ((best, False), (most, True)):
-            for value, view in pool.map(best_of_eight, range(0, len(views), 8), repeat(spreading)):
+        for highest, of_eight in ((best, best_of_eight), (most, smoothest_of_eight)):
+            for value, view in pool.map(of_eight, range(0, len(views), 8)):
                 higher = value > highest
                 highest[higher], label[higher] = value[higher], view[higher]
     for _ in range(3):
@@ -230,19 +230,18 @@ def _corners(mesh: TexturedMesh, cameras: Sequence[Camera], label: I64) -> F64:
     return xy
 
 
-def _rectangles(xy: F64, label: I64, chart: I64, cameras: Sequence[Camera]) -> I64:
-    """(C, 4) left, top, right, bottom of each chart in its image, the last two exclusive."""
-    charts = int(chart.max()) + 1
-    low = np.full((charts, 2), np.iinfo(np.int64).max)
-    high = np.full((charts, 2), -1)
-    view = np.zeros(charts, dtype=np.int64)
-    seen = label >= 0
+def _rectangles(xy: F64, label: I64, chart: I64, sizes: I64) -> I64:
+    """(C, 4) left, top, right, bottom of each chart in its view of ``sizes`` (V, 2), the last exclusive."""
+    charts = int(chart.max(initial=-1)) + 1
+    low, high = np.full((charts, 2), np.inf), np.full((charts, 2), -np.inf)
+    view, seen = np.zeros(charts, dtype=np.int64), label >= 0
     view[chart[seen]] = label[seen]
-    np.minimum.at(low, chart[seen], np.floor(xy[seen].min(axis=1)).astype(np.int64))
-    np.maximum.at(high, chart[seen], np.ceil(xy[seen].max(axis=1)).astype(np.int64) + 1)
-    sizes = np.array([camera.size for camera in cameras])[view]
-    low = np.where(high < 0, 0, np.maximum(low - CHART_MARGIN, 0))
-    high = np.where(high < 0, 0, np.minimum(high + CHART_MARGIN, sizes))
+    np.minimum.at(low, chart[seen], xy[seen].min(axis=1))
+    np.maximum.at(high, chart[seen], xy[seen].max(axis=1))
+    shown = np.isfinite(low)
+    low = np.clip(np.floor(np.where(shown, low, 0.0)).astype(np.int64) - CHART_MARGIN, 0, sizes[view] - 1)
+    high = np.clip(np.ceil(np.where(shown, high, 0.0)).astype(np.int64) + 1 + CHART_MARGIN, 1, sizes[view])
+    low, high = np.where(shown, low, 0), np.where(shown, high, 0)
     return np.concatenate([low, high], axis=1)
 
 
@@ -263,7 +262,7 @@ def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
 
 
 def _fill(
-    views: Sequence[PinholeView], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
+    image_of: Callable[[int], U8], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
 ) -> U8:
     """Texture (H, W, 3): the rectangle of each chart, copied from view ``label`` to its place."""
     texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
@@ -271,16 +270,13 @@ def _fill(
     for c in np.argsort(label, kind="stable"):
         (left, top, right, bottom), (x, y) = rectangles[c], offsets[c]
         if label[c] >= 0:
-            rgb = views[label[c]].rgb
+            rgb = image_of(int(label[c]))
             texture[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
     return texture
 
 
 def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
-    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show.
-
-    Every texel is the one of the whole texture, and corners on the cut keep their places, so that tiles fit.
-    """
+    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show."""
     keep = np.zeros(len(mesh.faces), dtype=bool)
     keep[faces] = True
     tile = select_faces(mesh, keep)
@@ -290,18 +286,11 @@ def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
     corners = np.column_stack([tile.faces.ravel(), tile.uv.reshape(-1, 2)])
     number = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
     chart = connected_parts(number, int(number.max(initial=-1)) + 1)
-    size = np.array(tile.texture.shape[1::-1])
-    low = np.full((int(chart.max(initial=-1)) + 1, 2), np.inf)
-    high = np.full_like(low, -np.inf)
-    np.minimum.at(low, chart, tile.uv.min(axis=1))
-    np.maximum.at(high, chart, tile.uv.max(axis=1))
-    first = np.clip(np.floor(low).astype(np.int64) - CHART_MARGIN, 0, size - 1)
-    last = np.clip(np.ceil(high).astype(np.int64) + 1 + CHART_MARGIN, 1, size)
-    offsets, (width, height) = _pack_rectangles(last - first)
-    texture = np.full((height, width, 3), 128, dtype=np.uint8)
-    for (left, top), (right, bottom), (x, y) in zip(first, last, offsets, strict=True):
-        texture[y : y + bottom - top, x : x + right - left] = tile.texture[top:bottom, left:right]
-    return replace(tile, uv=tile.uv + (offsets - first)[chart][:, None, :], texture=texture)
+    whole, charts = tile.texture, int(chart.max(initial=-1)) + 1
+    rectangles = _rectangles(tile.uv, np.zeros_like(chart), chart, np.array([whole.shape[1::-1]]))
+    offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
+    texture = _fill(lambda _: whole, np.zeros(charts, dtype=np.int64), rectangles, offsets, size)
+    return replace(tile, uv=tile.uv + (offsets - rectangles[:, :2])[chart][:, None, :], texture=texture)
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:

@@ -1,8 +1,4 @@
-"""Forward warping of an image, nearer pixels in front (thesis, sections 1.2 and 1.3).
-
-McMillan and Bishop (1995) order the pixels so that nearer ones overwrite farther ones. Here the inverse
-depth of each pixel is compared, which gives the same image in any order.
-"""
+"""Forward warping of an image, nearer pixels in front in any order (thesis, sections 1.2 and 1.3)."""
 
 from __future__ import annotations
 
@@ -132,9 +128,9 @@ def _draw_surface(
 ) -> None:
     """Draw the surface of an image's pixels into some rows of another view, nearest in front.
 
-    ``limits``: largest differences of inverse depth and of position (px) between neighbours of one surface.
-    Four pixels around a point form two triangles, three connected ones form one; at discontinuities and
-    borders a pixel covers half a pixel to each side.
+    ``limits``: largest differences of inverse depth and position (px) on one surface. Four pixels form two
+    triangles, three connected ones form one; at discontinuities and borders a pixel covers half a pixel to
+    each side.
     """
     height, width = inverse_depth.shape
     for y in range(height):
@@ -293,11 +289,10 @@ def forward_map(
 ) -> tuple[F32, F32]:
     """Position of an image that each pixel of another view shows, and its inverse depth; NaN for none.
 
-    ``target_xy`` (h, w, 2): position of each pixel in the view, NaN for none; ``inverse_depth`` (h, w):
-    larger values are in front, in any unit (a disparity, for example). Pixels are corners of small triangles
-    in which positions are interpolated. Neighbours belong to one surface if they come at most 3 px apart, or
-    twice their median distance, and their inverse depth differs by at most ``step``; at discontinuities a
-    pixel covers half a pixel to each side. Back faces are not drawn.
+    ``target_xy`` (h, w, 2): position of each pixel in the view; ``inverse_depth`` (h, w): larger is in front,
+    in any unit. Pixels are corners of small triangles. Neighbours belong to one surface if they come at most
+    3 px apart, or twice their median distance, and their inverse depth differs by at most ``step``. Back
+    faces are not drawn.
     """
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
@@ -328,8 +323,8 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
     """Fill holes (NaN inverse depth) with the background around them: occluded surfaces are background.
 
-    The nearest known pixel in each of sixteen directions is used if its inverse depth is at most ``step``, or
-    0.4 of the range, above the smallest. Their colours are averaged with weights 1 / distance^2.
+    The nearest known pixels in sixteen directions, at most ``step`` or 0.4 of the range above the smallest
+    inverse depth, are averaged with weights 1 / distance^2.
     """
     filled = rgb.copy()
     distance = distances_to_known(inverse_depth)

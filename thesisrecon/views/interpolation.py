@@ -32,7 +32,7 @@ def filter_extrapolated_by_colour(
 ) -> None:
     """Replace disparities of confidence 0 by a colour-weighted median of their surroundings.
 
-    ``limits``: colour difference at which weights fall to 1 / e; weight of guesses relative to known values.
+    ``limits``: colour difference of weight 1 / e; weight of guesses relative to known values.
     """
     height, width = disparity.shape
     values, weights = empty(WINDOW * WINDOW, np.float32), empty(WINDOW * WINDOW)
@@ -84,9 +84,9 @@ def blend(
 ) -> None:
     """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and ``weights`` (H, W).
 
-    Where both inverse depths agree, the weighted mean is used. Otherwise known pixels replace guessed ones,
-    the nearer of two known pixels is used, and the farther of two guessed ones. ``limits``: tolerance of
-    inverse depth, weight up to which a pixel is guessed, and s.
+    The weighted mean if both inverse depths agree; else known before guessed pixels, the nearer of two known
+    ones and the farther of two guessed ones. ``limits``: tolerance of inverse depth, weight of a guessed
+    pixel, and s.
     """
     alike, guess, s = limits
     (n0, n1), (w0, w1), (first, second) = fronts, weights, colors
@@ -106,9 +106,8 @@ def blend(
 def original_from_rectified(H: F64, size: tuple[int, int], s: float) -> F64:
     """Return the homography from the rectified frame to the pixels of the view between two images at s.
 
-    In the rectified frame a point of the view is (1 - s) x_left + s x_right, its exact image in a camera on
-    the baseline. The homography takes a quadrilateral to the image corners: that of the first image for
-    s = 0, that of the second for s = 1, and linear in between.
+    In the frame a point is (1 - s) x_left + s x_right, its exact image in a camera on the baseline. The
+    homography takes a quadrilateral, linear between those of both images, to the image corners.
     """
     corners, left, right = _quadrilaterals(H, size)
     between = (1.0 - s) * left + s * right
@@ -144,8 +143,7 @@ def _quadrilaterals(H: F64, size: tuple[int, int]) -> tuple[F64, F64, F64]:
 def detect_monotonicity_violations(disparity: F32) -> B8:
     """Find the pixels of a rectified image that violate the monotonicity constraint (figure 1.1).
 
-    If u1 is left of v1 then u2 must be left of v2; u is then left of v in every view between. A thin object
-    in front of a distant background violates it, together with the background that it passes.
+    If u1 is left of v1 then u2 must be left of v2; then u is left of v in every view between.
     """
     slack_px = 0.5  # Largest violation of monotonicity that counts as noise of the disparities
     at = np.arange(disparity.shape[1]) - disparity.astype(np.float64)

@@ -91,11 +91,10 @@ def interpolate_cameras(
 
 
 def estimate_up(cameras: Sequence[Camera]) -> F64:
-    """Estimate the up direction of the scene.
+    """Estimate the up direction of the scene: perpendicular to image rows, and slightly to optical axes.
 
-    It is the direction nearest to perpendicular to the image rows, and with a small weight to the optical
-    axes: hand-held cameras are tilted but hardly rolled. Its sign is that of the image up directions or, if
-    these cancel, follows from cameras that look down.
+    Hand-held cameras are tilted but hardly rolled. The sign is that of the image up directions or, if these
+    cancel, follows from cameras that look down.
     """
     rows, down, axis = np.array([camera.R for camera in cameras]).transpose(1, 0, 2)
     up = np.linalg.eigh(rows.T @ rows + TILT_WEIGHT * axis.T @ axis)[1][:, 0]

@@ -6,7 +6,7 @@ PSNR and SSIM of a rendered and a real image (H, W, 3) of uint8 use the pixels `
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -35,8 +35,8 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 @kernel
-def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lights: F64, ambient: float) -> None:
-    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye.
+def _shade_points(color: F32, points: F32, normals: F32, lights: F64, ambient: float) -> None:
+    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye at 0.
 
     ``lights`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
     """
@@ -44,7 +44,7 @@ def _shade_points(color: F32, points: F32, normals: F32, eye: F64, lights: F64, 
     for p in range(color.shape[0]):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
         nx, ny, nz = _unit(normals[p, 0], normals[p, 1], normals[p, 2])
-        ex, ey, ez = _unit(eye[0] - px, eye[1] - py, eye[2] - pz)
+        ex, ey, ez = _unit(-px, -py, -pz)
         if nx * ex + ny * ey + nz * ez < 0.0:
             nx, ny, nz = -nx, -ny, -nz
         light[:] = ambient
@@ -89,12 +89,6 @@ class Light:
         if self.direction is not None and not np.linalg.norm(self.direction) > 0.0:
             raise ValueError("the direction of a Light must not be zero")
 
-    @property
-    def _row(self) -> list[float]:
-        """Row of ``lights`` in :func:`_shade_points`."""
-        place = self.direction if self.position is None else self.position
-        return [float(self.position is not None), *(place or (0.0, 0.0, 0.0)), *self.color]
-
 
 @dataclass(frozen=True)
 class Shading:
@@ -123,7 +117,7 @@ def render_mesh(
     lit: list[F32] = []
     if shading is not None:
         # About the camera: single precision would round coordinates of a map grid.
-        shading = _moved(shading, camera.centre)
+        lights = _light_rows(shading, camera.centre)
         lit = [a.astype(np.float32) for a in (mesh.vertices - camera.centre, vertex_normals(mesh))]
 
     def measure(start: int, stop: int, raster: Raster) -> None:
@@ -137,7 +131,7 @@ def render_mesh(
             color = _colors(mesh, source, part)
             if shading is not None:
                 points, normals = (part.interpolate(v, mesh.faces).reshape(-1, 3) for v in lit)
-                _shade(color.reshape(-1, 3), points, normals, np.zeros(3), shading)
+                _shade_points(color.reshape(-1, 3), points, normals, lights, shading.ambient)
             _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
     if samples == 1:
@@ -178,21 +172,15 @@ def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
     return color
 
 
-def _moved(shading: Shading, origin: F64) -> Shading:
-    """The shading in coordinates about another origin."""
-    lights = (
-        light
-        if light.position is None
-        else replace(light, position=tuple(np.subtract(light.position, origin)))
+def _light_rows(shading: Shading, origin: F64) -> F64:
+    """Rows (L, 7) of the lights for :func:`_shade_points`, in coordinates about an origin."""
+    rows = [
+        (0.0, *light.direction, *light.color)
+        if light.direction is not None
+        else (1.0, *np.subtract(light.position, origin), *light.color)
         for light in shading.lights
-    )
-    return replace(shading, lights=tuple(lights))
-
-
-def _shade(color: F32, points: F32, normals: F32, eye: F64, shading: Shading) -> None:
-    """Shade the colours (P, 3) of surface points in place."""
-    lights = np.array([light._row for light in shading.lights], dtype=np.float64).reshape(-1, 7)
-    _shade_points(color, points, normals, np.asarray(eye, dtype=np.float64), lights, float(shading.ambient))
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 GREY = np.array([0.299, 0.587, 0.114])

@@ -1,15 +1,11 @@
 """View synthesis from two images by the trilinear tensor (thesis, section 1.3).
 
 After Avidan and Shashua (CVPR 1997, PAMI 1998). Cameras P1 = [I 0], P2 = [a, a_4], P3 = [b, b_4] have the
-tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. If the third camera rotates and moves to [Rb, R b_4 + t],
-
-    T'_i^jk = R_l^k T_i^jl + t^k a_i^j
-
-One seed tensor gives all others; neither cameras nor scene points are needed. Unknown intrinsics are guessed,
-as in the thesis; new views are then correct up to a projective transform of space. Every pixel is transferred
-by the tensor of the virtual camera and drawn there, nearer pixels in front. A pixel without correspondence is
-occluded in the other image; it takes the depth of the nearest surrounding surface that would not stand in
-front of anything the other image shows.
+tensor T_i^jk = a_i^j b_4^k - a_4^j b_i^k. If the third camera moves to [Rb, R b_4 + t], T'_i^jk = R_l^k
+T_i^jl + t^k a_i^j: one seed tensor gives all others. Unknown intrinsics are guessed, as in the thesis; new
+views are then correct up to a projective transform of space. A pixel without correspondence is occluded in
+the other image; it takes the depth of the nearest surrounding surface that would not stand in front of
+anything the other image shows.
 """
 
 from __future__ import annotations
@@ -21,7 +17,18 @@ import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon._numba import kernel
-from thesisrecon.arrays import B8, F32, F64, I16, I32, U8, require_calibration, require_finite
+from thesisrecon.arrays import (
+    B8,
+    F32,
+    F64,
+    I16,
+    I32,
+    U8,
+    require_calibration,
+    require_finite,
+    require_rotations,
+    require_shapes,
+)
 from thesisrecon.camera import rq
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_centre
@@ -34,16 +41,9 @@ AGREE_PX = 1.5  #: tolerance of the forward-backward check: half a pixel of roun
 
 
 def _require_motion(R: F64, t: F64) -> None:
-    """Check that R is a rotation within ``OFF_ROTATION`` and t three finite numbers."""
-    off_rotation = 1e-4  # Tolerance of R'R - I: a rotation written with four digits passes
-    R = np.asarray(R, dtype=np.float64)
-    if R.shape != (3, 3) or not np.isfinite(R).all():
-        raise ValueError(f"a rotation is a finite matrix (3, 3); got shape {R.shape}")
-    off, det = float(np.abs(R.T @ R - np.eye(3)).max()), float(np.linalg.det(R))
-    if not (off <= off_rotation and det > 0.0):
-        raise ValueError(f"a rotation has R'R = I and det R = 1; this one is off by {off:.2g}, det {det:.3g}")
-    if np.shape(t) != (3,) or not np.isfinite(t).all():
-        raise ValueError(f"a translation is three finite numbers; got {t}")
+    require_shapes("view synthesis", R=(R, (3, 3)), t=(t, (3,)))
+    require_finite("view synthesis", R, t)
+    require_rotations("view synthesis", R)
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,7 @@ class CalibratedPair:
 
     @property
     def P2(self) -> F64:
-        """The second camera [a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0].
-
-        Space points are K1 X_1, so a point is (x, 1 / depth) for its pixel x in view 1 and a is the infinite
-        homography.
-        """
+        """The second camera [a, a_4] = [K2 R K1^-1, K2 t] (3, 4) beside P1 = [I 0], of points K1 X_1."""
         return np.column_stack([self.K2 @ self.R @ np.linalg.inv(self.K1), self.K2 @ self.t])
 
     @property
@@ -89,11 +85,11 @@ def default_intrinsics(size: tuple[int, int]) -> F64:
 
 
 def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> CalibratedPair:
-    """Compute the two cameras of F for given intrinsics (thesis, section 1.3).
+    """Compute the two cameras of F for given intrinsics (thesis, section 1.3); they have F exactly.
 
-    The fundamental matrix of the result is F exactly. The first camera has K1; of all second cameras that F
-    allows, the left part is nearest to K2 R K1^-1 (least squares in coordinates of K2 and K1) with R from the
-    essential matrix. Its intrinsics differ from K2 where F contradicts them.
+    The first has K1; of all second cameras that F allows, the left part is nearest to K2 R K1^-1 (least
+    squares in coordinates of K2 and K1) with R from the essential matrix. Its K differs from K2 where F
+    contradicts it.
     """
     in_front = 0.75  # Share of matches that must lie in front of both cameras
     require_finite("pair_from_fundamental", F, xy1, xy2)
@@ -247,10 +243,7 @@ def seed_of_two(pair: CalibratedPair, *, first: bool = False) -> VirtualTensor:
 
 @kernel
 def _transfer(T: F64, P2: F64, xy1: F64, xy2: F64, xy: F64, inverse_depth: F64) -> None:
-    """Transfer matches (N, 2), see :meth:`VirtualTensor.transfer`.
-
-    With X = (x, rho), l'(a x + rho a_4) = 0 and x'' is -(l'a_4) (b x + rho b_4).
-    """
+    """Transfer matches (N, 2): with l'(a x + rho a_4) = 0, x'' is -(l'a_4) (b x + rho b_4)."""
     for n in range(len(xy)):
         x, y, x2, y2 = xy1[n, 0], xy1[n, 1], xy2[n, 0], xy2[n, 1]
         xy[n, 0] = xy[n, 1] = inverse_depth[n] = np.nan
@@ -281,8 +274,8 @@ def _extrapolate_inverse_depth(
 ) -> None:
     """Complete the inverse depth of the first image of two from the surrounding pixels.
 
-    The nearest known pixel in any direction (``distance`` steps away, see :func:`distances_to_known`) is used
-    whose surface would not occlude a surface that the other image shows; if all would, the nearest of all.
+    The nearest known pixel in any direction (``distance`` steps) that would not occlude a surface of the
+    other image.
     """
     own, other = inverse_depth
     for y in range(own.shape[0]):
@@ -418,9 +411,8 @@ class TensorSynthesis:
 def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: float) -> F32:
     """Blending weight (H, W) of the second image, NaN where both are empty.
 
-    Where both show the same surface it is ``share``. Where they differ, the nearer surface is shown: with
-    full weight if the camera is in the half of the baseline next to its own image, with weight 0 in the last
-    quarter before the other image, which does not show it.
+    ``share`` on one surface; else the nearer surface is shown in the half of the baseline next to its own
+    image, with weight 0 in the last quarter before the other image, which does not show it.
     """
     (first, near1), (second, near2) = layers
     seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
