@@ -205,9 +205,5 @@ def vertex_normals(mesh: TexturedMesh) -> F64:
 def run_in_strips(work: Callable[[tuple[int, int]], None], height: int, threads: int) -> None:
     """Call a function for strips (first row, last + 1) of rows in parallel."""
     edges = np.linspace(0, height, max(threads, 1) + 1).round().astype(int)
-    strips = [(int(a), int(b)) for a, b in pairwise(edges)]
-    if len(strips) == 1:
-        work(strips[0])
-        return
-    with ThreadPool(len(strips)) as pool:
-        list(pool.map(work, strips))
+    with ThreadPool(threads) as pool:
+        list(pool.map(work, pairwise(edges.tolist())))

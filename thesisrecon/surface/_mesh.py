@@ -117,15 +117,15 @@ def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
         triple = np.where(rising[..., None], RISING[k], FALLING[k])
         at, std_at = (np.take_along_axis(values, triple, axis=-1) for values in (z, spread))
         before, std_before = (np.roll(values, 1, axis=-1) for values in (at, std_at))
-        with np.errstate(invalid="ignore"):
-            whole[..., k] = same_surface(at, before, std_at, std_before, np.sqrt(2.0) * slope).all(axis=-1)
+        whole[..., k] = same_surface(at, before, std_at, std_before, np.sqrt(2.0) * slope).all(axis=-1)
     return rising, whole
 
 
 def same_surface(z1: F64, z2: F64, std1: F64, std2: F64, slope: float | F64) -> B8:
     """Whether two depths differ by at most ``slope`` of the smaller, or three standard deviations."""
-    limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
-    return np.asarray(np.abs(z1 - z2) <= limit)
+    with np.errstate(invalid="ignore"):
+        limit = np.maximum(slope * np.minimum(z1, z2), 3.0 * np.hypot(std1, std2))
+        return np.asarray(np.abs(z1 - z2) <= limit)
 
 
 def surface_from_depth(

@@ -80,8 +80,7 @@ def _both(mask: B8, axis: int) -> B8:
 
 def _alike(depth: F64, std: F64, slope: F64, axis: int) -> B8:
     """Whether neighbouring depths along an axis are close enough for one surface."""
-    with np.errstate(invalid="ignore"):
-        return same_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
+    return same_surface(*_pairs(depth, axis), *_pairs(std, axis), np.maximum(*_pairs(slope, axis)))
 
 
 def _steps(rho: F64, deviation: F64, axis: int) -> B8:

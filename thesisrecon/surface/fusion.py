@@ -23,6 +23,7 @@ from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.imaging.on_demand import OnDemand
+from thesisrecon.imaging.resampling import bilinear_samples
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface import _mesh
 from thesisrecon.surface._simplification import simplify_surface
@@ -593,12 +594,8 @@ class DepthSheets:
             inside: B8 = np.asarray((z > 0.0) & np.all((at >= 0.0) & (at < whole.shape[::-1]), axis=1))
             place = np.where(inside[:, None], at, 0.0)
             x, y = place.astype(np.int64).T
-            inside = inside & whole[y, x]
-            n = np.flatnonzero(inside)
-            (x, y), (u, v) = np.stack([x, y])[:, n], place[n].T % 1.0
-            a, b, c, d = (1.0 / depth[y + k, x + m] for k in (0, 1) for m in (0, 1))
-            there = 1.0 / ((1.0 - v) * ((1.0 - u) * a + u * b) + v * ((1.0 - u) * c + u * d))
-            inside[n] = np.abs(there - z[n]) <= np.maximum(max_relative * z[n], 3.0 * std[y, x])
-            return np.asarray(inside)
+            there = 1.0 / bilinear_samples(1.0 / depth[..., None], *place.T)[0][:, 0]
+            near = np.abs(there - z) <= np.maximum(max_relative * z, 3.0 * std[y, x])
+            return np.asarray(inside & whole[y, x] & near)
 
         return shown
