@@ -19,7 +19,7 @@ from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import classify_configuration
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import camera_matrix, strata, three_view, two_view
-from thesisrecon.geometry.conditioning import normalizing_transform
+from thesisrecon.geometry.homogeneous import normalizing_transform
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.geometry.triangulation import resect_linear

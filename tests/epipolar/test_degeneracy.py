@@ -25,8 +25,7 @@ from thesisrecon.epipolar._matches import PairFrame, multiplicity_weights
 from thesisrecon.epipolar.degeneracy import _contradicted_fraction, assess_degeneracy
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.two_view import (
     epipoles,
     homography_linear,

@@ -11,7 +11,7 @@ from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle.scatter import BlockScatter
 from thesisrecon.records import SelfCalibration, Upgrade
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 
 
 def true_calibration(scene):

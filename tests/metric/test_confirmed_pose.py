@@ -9,7 +9,7 @@ from thesisrecon.arrays import rows_of_views
 from thesisrecon.metric import _resection
 from thesisrecon.metric._model import MetricEstimate
 from thesisrecon.metric._resection import FEWEST_POINTS, MIN_MATCHES, confirmed_pose
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.projection import MetricCameras
 
 SIZE, NOISE_PX, FOCAL = (640, 480), 0.3, 700.0
 K = np.array([[FOCAL, 0, 319.5], [0, FOCAL, 239.5], [0, 0, 1]])

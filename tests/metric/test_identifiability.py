@@ -22,7 +22,7 @@ from thesisrecon.optimize.bundle.identifiability import (
 )
 from thesisrecon.pipeline.large_sets import restrict_views
 from thesisrecon.records import IdentifiabilityReport
-from thesisrecon.selfcalibration._candidates import check_identifiability
+from thesisrecon.selfcalibration._upgrade import check_identifiability
 
 SETS = (
     "truth/temple/images", "truth/lego/images", "truth/dino/images", "truth/kitti1/images",

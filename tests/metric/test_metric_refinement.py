@@ -16,10 +16,9 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.optimize.ransac import Budget
-from thesisrecon.optimize.robust_resection import resect_calibrated
+from thesisrecon.optimize.ransac import Budget, resect_calibrated
 from thesisrecon.records import Tracks
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 
 
 def test_scenes_come_back_with_their_lens_and_principal_point():
@@ -153,7 +152,7 @@ def test_a_candidate_without_inliers_leaves_the_others_whole(monkeypatch):
     prior = prior_for(start, IntrinsicsOptions())
     calibration = HypothesesAndRefinement().calibrate(start, prior=prior, rng=np.random.default_rng(0))
     best = calibration.candidates[0]
-    upgraded = refinement.upgraded_model
+    upgraded = refinement._model.upgraded_model
 
     def broken(reconstruction, upgrade, *given):
         model = upgraded(reconstruction, upgrade, *given)
@@ -163,7 +162,7 @@ def test_a_candidate_without_inliers_leaves_the_others_whole(monkeypatch):
         given = replace(calibration, candidates=candidates)
         return MetricRefinement().refine(start, given, prior=prior, rng=np.random.default_rng(0))
 
-    monkeypatch.setattr(refinement, "upgraded_model", broken)
+    monkeypatch.setattr(refinement._model, "upgraded_model", broken)
     bad = replace(best, method="broken")
     found = refined((bad, best), prior)
     assert found.trusted

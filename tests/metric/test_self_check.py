@@ -34,7 +34,7 @@ from thesisrecon.metric._shared_camera import (
 )
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
 from thesisrecon.metric.refinement import MAX_REMAINING
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.projection import MetricCameras
 from thesisrecon.optimize.bundle.scatter import block_scatter
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
 

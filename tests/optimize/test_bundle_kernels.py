@@ -11,15 +11,20 @@ from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.geometry.small_matrices import floored_diagonal
 from thesisrecon.optimize.bundle import covariance as bundle_covariance
-from thesisrecon.optimize.bundle import metric_kernels, projective, scatter, schur
+from thesisrecon.optimize.bundle import projection, projective, scatter, schur
 from thesisrecon.optimize.bundle.covariance import robust_sigma
 from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points, sum_leverages
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting, sort_observations
+from thesisrecon.optimize.bundle.projection import (
+    Jacobians,
+    MetricCameras,
+    Observations,
+    Weighting,
+    sort_observations,
+)
 from thesisrecon.optimize.bundle.scatter import _gram_matrix, block_scatter, linearise_fit, pose_uncertainty
 from thesisrecon.optimize.bundle.schur import BundleSystem, build_layout
-from thesisrecon.optimize.noise import huber
+from thesisrecon.optimize.least_squares import huber
 from thesisrecon.records import IntrinsicsPrior
 from validation.scenes.walks import make_walk
 
@@ -28,11 +33,11 @@ def _linearized_metric(block, xy, delta=np.inf, sigma=1.0):
     c, n = block.cameras, len(xy)
     width = c.intrinsics.shape[1]
     J = Jacobians.empty(n, 6, width)
-    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    model = projection.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, weighting = block.seen(xy), Weighting(sigma, delta)
     own = np.zeros(0, dtype=np.int64)
-    cost = metric_kernels.linearize_metric(model, seen, weighting, own, np.arange(width), J)
-    assert metric_kernels.metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
+    cost = projection.linearize_metric(model, seen, weighting, own, np.arange(width), J)
+    assert projection.metric_cost(model, seen, weighting) == pytest.approx(cost, rel=1e-12)
     return cost, J
 
 
@@ -41,7 +46,7 @@ def _moved(cameras, pose, intrinsics):
     q = cameras.intrinsics + intrinsics
     q[:, 0] = cameras.intrinsics[:, 0] * np.exp(intrinsics[:, 0])
     t = np.einsum("vab,vb->va", turn, cameras.t) + pose[:, 3:]
-    return metric_kernels.MetricCameras(turn @ cameras.R, t, q, cameras.group)
+    return projection.MetricCameras(turn @ cameras.R, t, q, cameras.group)
 
 
 @pytest.mark.parametrize("lens", [(), (-0.03, 0.02)])
@@ -71,7 +76,7 @@ def test_poses_move_by_the_exponential_map(size):
     R, t = Rotation.random(9, random_state=rng).as_matrix(), rng.normal(size=(9, 3))
     step = size * rng.normal(size=(9, 6))
     R_out, t_out = np.empty_like(R), np.empty_like(t)
-    metric_kernels.move_poses(R, t, step, R_out, t_out)
+    projection.move_poses(R, t, step, R_out, t_out)
     turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
     np.testing.assert_allclose(R_out, turn @ R, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(t_out, np.einsum("vab,vb->va", turn, t) + step[:, 3:], rtol=1e-14, atol=2e-15)
@@ -157,8 +162,8 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     if solver == "banded":
         layout = replace(layout, solver=schur.BandedCholesky(np.array([2, 0, 1, 4, 3]), 4))
     J = layout.jacobians()
-    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
-    cost = metric_kernels.linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
+    model = projection.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    cost = projection.linearize_metric(model, o.seen, Weighting(1.0, np.inf), own, common, J)
     gradient = np.zeros(layout.size)
     gradient[[6, 40]] = [3.0, -3.0]
     Q = np.zeros((layout.size, layout.size))
@@ -226,11 +231,11 @@ def test_a_bending_loss_keeps_the_gradient_and_bends_the_curvature():
     block = make_block()
     c, n = block.cameras, len(block.xy)
     xy = block.xy + np.random.default_rng(1).normal(size=block.xy.shape)
-    model = metric_kernels.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
+    model = projection.MetricModel(c.R, c.t, c.intrinsics, c.group, block.X)
     seen, own, common = block.seen(xy), np.array([0, 3]), np.array([4, 5])
     plain, bent = Jacobians.empty(n, 8, 2), Jacobians.empty(n, 8, 2)
     for J, least in ((plain, 1.0), (bent, 0.2)):
-        metric_kernels.linearize_metric(model, seen, Weighting(1.0, 1.1, least), own, common, J)
+        projection.linearize_metric(model, seen, Weighting(1.0, 1.1, least), own, common, J)
     for a, b in ((plain.A, bent.A), (plain.E, bent.E), (plain.B, bent.B)):
         gradient = np.einsum("kic,ki->kc", a, plain.residual)
         np.testing.assert_allclose(np.einsum("kic,ki->kc", b, bent.residual), gradient, rtol=1e-9, atol=1e-9)

@@ -9,8 +9,7 @@ from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.intrinsic_unknowns import number_unknowns
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.records import IntrinsicsPrior
 
 FOCAL = np.array([True, False, False, False, False, False])

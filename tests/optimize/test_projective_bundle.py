@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from tests.optimize.bundle_scenes import make_block
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.conditioning import whitening_transform
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.geometry.homogeneous import whitening_transform
 from thesisrecon.optimize.bundle.partial import refine_camera, refine_points, refine_pose
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 
 

@@ -16,18 +16,16 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import decompose_camera
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.conditioning import whitened_frame
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, whitened_frame
 from thesisrecon.geometry.three_view import cameras_from_tensor
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import (
     minimize_reprojection,
     refine_camera,
     refine_points,
     refine_pose,
 )
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.least_squares import minimize_residuals
 
@@ -183,7 +181,7 @@ def pair(seed, *, plane=False, n=120):
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("criterion", ["sampson", "epipolar-distance", "reprojection"])
-@pytest.mark.parametrize("parameters", ["orthonormal", "row", "row-and-column"])
+@pytest.mark.parametrize("parameters", ["orthonormal", "row"])
 def test_fundamental_matrix(seed, criterion, parameters):
     xy1, xy2 = pair(seed)
     F = fundamental_from_cameras(*make_block(seed=seed).cameras.P[[1, 4]])

@@ -10,7 +10,7 @@ from tests.metric.metric_stage import centre_error
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, true_pairs, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.metric import _model, _resection, _shared_camera, refinement
+from thesisrecon.metric import _model, _resection, _shared_camera
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle import schur
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
@@ -18,7 +18,7 @@ from thesisrecon.pipeline.large_sets import CORE_VIEWS, MAX_CORES, calibrate_wit
 from thesisrecon.projective._model import select_core
 from thesisrecon.projective.incremental import OUTSIDE_CORE, IncrementalProjective
 from thesisrecon.records import SelfCalibration, Tracks
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 from validation.scenes.walks import SIZE, make_walk
 
 
@@ -173,7 +173,9 @@ def test_shared_intrinsics_of_many_views_are_tested_in_runs(monkeypatch):
     monkeypatch.setattr(_shared_camera, "RUN", 4)
     tests = []
     check = _shared_camera.check_shared_cameras
-    monkeypatch.setattr(refinement, "check_shared_cameras", lambda *a: tests.append(check(*a)) or tests[-1])
+    monkeypatch.setattr(
+        _shared_camera, "check_shared_cameras", lambda *a: tests.append(check(*a)) or tests[-1]
+    )
     reconstruct(scene, 8)
     reconstruct(zoomed, 8)
     assert not tests[0].found

@@ -13,11 +13,9 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import project_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.optimize.ransac import Budget
-from thesisrecon.optimize.robust_resection import resect_projective
+from thesisrecon.optimize.ransac import Budget, resect_projective
 from thesisrecon.projective._model import (
     ProjectiveModel,
     consistent_observations,

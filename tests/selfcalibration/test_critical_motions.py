@@ -24,17 +24,16 @@ from thesisrecon.optimize.bundle.identifiability import (
     projective_infinity_shifts,
 )
 from thesisrecon.records import Tracks, Upgrade
-from thesisrecon.selfcalibration._candidates import (
+from thesisrecon.selfcalibration._frame import normalized_frame
+from thesisrecon.selfcalibration._refinement import RotationCriterion
+from thesisrecon.selfcalibration._upgrade import (
     _biased_focal,
     _no_candidate_failure,
     check_identifiability,
+    gherardi_fusiello_planes,
     identifiability_without_calibration,
-    plane_from_focals,
 )
-from thesisrecon.selfcalibration._frame import normalized_frame
-from thesisrecon.selfcalibration._refinement import RotationCriterion
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
-from thesisrecon.selfcalibration.quadric import quadric_hypotheses
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement, quadric_hypotheses
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 
 CRITICAL = [motion for motion in Motion if motion is not Motion.GENERAL]
@@ -275,7 +274,7 @@ def test_each_closed_form_contains_the_truth():
     log_f = np.full((1, 1), np.log(f))
     assert criterion.cost(frame, planes, log_f)[0] < 1e-12
     other = 0 if frame.reference != 0 else 1
-    both_signs = plane_from_focals(frame, other, np.array([f]), np.array([f]))
+    both_signs = gherardi_fusiello_planes(frame, other, np.array([f]), np.array([f]))
     assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
 
 

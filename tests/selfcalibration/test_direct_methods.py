@@ -15,12 +15,11 @@ from tests.selfcalibration.stratified_scenes import calibrated, with_calibration
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
-from thesisrecon.optimize.noise import soft_l1
+from thesisrecon.optimize.least_squares import soft_l1
 from thesisrecon.records import IntrinsicsPrior
 from thesisrecon.selfcalibration import _refinement
-from thesisrecon.selfcalibration._candidates import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration._refinement import (
     RotationCriterion,
@@ -28,8 +27,8 @@ from thesisrecon.selfcalibration._refinement import (
     minimize_batch,
     refine_hypotheses,
 )
+from thesisrecon.selfcalibration._upgrade import Candidate, distinct_candidates, square_pixel_calibrations
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import (
     KruppaEquations,
     _kruppa_cost,
@@ -39,7 +38,13 @@ from thesisrecon.selfcalibration.kruppa import (
     _Pairs,
     _plane_for_focals,
 )
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric, linear_quadric, rank_three
+from thesisrecon.selfcalibration.quadric import (
+    HypothesesAndRefinement,
+    LinearQuadric,
+    NonlinearQuadric,
+    linear_quadric,
+    rank_three,
+)
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)

@@ -19,8 +19,7 @@ from tests.selfcalibration.stratified_scenes import (
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
 from thesisrecon.pipeline.outputs import write_affine
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import (

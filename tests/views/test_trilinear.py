@@ -10,8 +10,7 @@ from tests.conftest import refuses
 from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, project
-from thesisrecon.geometry.conditioning import unit_tensor
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals, unit_tensor
 from thesisrecon.geometry.three_view import tensor_from_cameras
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.views import tensor

@@ -12,8 +12,7 @@ from thesisrecon.arrays import B8, F64, I64, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations, sort_observations
+from thesisrecon.optimize.bundle.projection import POSE_DOF, MetricCameras, Observations, sort_observations
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {

@@ -12,8 +12,7 @@ from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
-from thesisrecon.geometry.conditioning import pixel_from_unit
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint

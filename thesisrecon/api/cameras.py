@@ -20,8 +20,7 @@ from thesisrecon.arrays import (
 from thesisrecon.camera import Camera, compose_camera, decompose_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate_points
-from thesisrecon.optimize.ransac import Budget
-from thesisrecon.optimize.robust_resection import Resection, resect_robust
+from thesisrecon.optimize.ransac import Budget, Resection, resect_robust
 from thesisrecon.records import Reconstruction, Tracks
 
 CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction

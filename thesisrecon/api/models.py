@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from thesisrecon.arrays import B8, F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words, unknown_word
-from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import read_json
 from thesisrecon.io._models import read_model, read_positions

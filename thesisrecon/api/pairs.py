@@ -19,7 +19,7 @@ from thesisrecon.epipolar.homography import HomographyFit, fit_homography
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
 from thesisrecon.errors import Notice, StageFailure, unknown_word
-from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.two_view import lines_of_points
 from thesisrecon.io._images import read_image, read_pixels
 from thesisrecon.pipeline.image_pair import ImageInput, match_images

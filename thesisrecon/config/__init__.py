@@ -51,9 +51,8 @@ from thesisrecon.records import (
     Tracks,
     TwoView,
 )
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
 from thesisrecon.selfcalibration.kruppa import KruppaEquations
-from thesisrecon.selfcalibration.quadric import LinearQuadric, NonlinearQuadric
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement, LinearQuadric, NonlinearQuadric
 from thesisrecon.selfcalibration.stratified import Stratified
 from thesisrecon.stereo.correspondence import PairMatching, RectifiedPair
 from thesisrecon.stereo.depth import MultiViewScene, MultiViewStereo

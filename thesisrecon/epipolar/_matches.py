@@ -13,8 +13,8 @@ import numpy as np
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.optimize.noise import MAD_FACTOR
+from thesisrecon.geometry.homogeneous import unit_norm
+from thesisrecon.optimize.least_squares import MAD_FACTOR
 
 # Ratio of the spread across to the spread along the main direction below which points count as collinear.
 COLLINEAR = 1e-9
@@ -184,11 +184,7 @@ def noise_scale(residuals: F64, *, parameters: int = 7) -> float:
 
 
 def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> float:
-    """Return the width that contains the noise: ``threshold``, or more if the noise exceeds it.
-
-    The median of normal noise is 0.22 of a width of 3 standard deviations: the width grows until this holds;
-    beyond 11 thresholds the residuals are those of wrong matches.
-    """
+    """Width of the noise: ``threshold``, or more until the median is 0.22 of it, as within 3 sigma."""
     width, ordered = threshold, np.sort(residuals)
     for _ in range(7):
         n = int(np.searchsorted(ordered, width))
@@ -202,10 +198,7 @@ def noise_width(residuals: F64, threshold: float, *, parameters: int = 7) -> flo
 
 @dataclass(frozen=True)
 class NoiseMixture:
-    """Normal noise (``sigma``), its tail four times as wide, and wrong matches (``spread``), with fractions.
-
-    ``log_likelihood`` is the mean over the residuals.
-    """
+    """Normal noise (``sigma``), its tail, four times as wide, wrong matches (``spread``), their fractions."""
 
     sigma: float
     spread: float
@@ -247,10 +240,7 @@ class NoiseMixture:
 
 
 def multiplicity_weights(xy1: F64, xy2: F64) -> F64:
-    """Weight (N,) of each match, one over the number of those within 2 px of it in an image.
-
-    At most one of them is right, and all agree with every F whose epipole lies there: they count once.
-    """
+    """Weights (N,): one over the matches within 2 px in an image, of which at most one is right."""
     numbers = np.zeros(len(xy1), dtype=np.int64)
     for xy in (xy1, xy2):
         x, y = np.floor(xy / 2.0).astype(np.int64).T

@@ -112,11 +112,7 @@ def solve_seven_point_batch(X: F64, Y: F64) -> None:
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
-    """Real roots of x^3 + a x^2 + b x + c: one by Newton, the others from the remaining quadratic.
-
-    The iteration starts beyond the turning point on the side of the root, where it is monotone. It may miss a
-    double root or find it as two close ones; no root if a coefficient is not finite.
-    """
+    """Real roots of x^3 + a x^2 + b x + c: one by Newton from beyond the turning point, and a quadratic."""
     centre = -a / 3.0
     Q = (a * a - 3.0 * b) / 9.0
     value = ((centre + a) * centre + b) * centre + c
@@ -190,10 +186,7 @@ def _leave_basis(g: F64, Y: F64, lane: int, f: F64) -> bool:
 
 @kernel(forceinline=True)
 def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
-    """Write the F (3, 9) of a solved sample that satisfy the oriented constraint; returns their number.
-
-    ``work`` (9,) is scratch memory.
-    """
+    """Write the F (3, 9) of a solved sample that satisfy the oriented constraint; returns their number."""
     roots, g, found = work[:3], work[3:], 0
     for k in range(_newton_cubic_roots(Y[51, lane], Y[52, lane], Y[53, lane], roots)):
         for m in range(6):
@@ -226,10 +219,7 @@ def sampson_distances(f: F64, points: F64) -> F64:
 
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
-    """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the number with r < gate.
-
-    No branches and contiguous rows, so that the loop vectorises.
-    """
+    """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the inliers."""
     total, inside, wide = 0.0, 0.0, gate * gate
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for k in range(start, end):
@@ -271,10 +261,7 @@ def truncated_score(
 
 @kernel
 def _log_likelihood_ratios(right: float, wrong: float) -> tuple[float, float]:
-    """Log likelihood ratios wrong : right of a point inside and outside the gate, from the fractions inside.
-
-    Zeros (never stop early) if the two are too close.
-    """
+    """Log likelihood ratios wrong : right inside and outside the gate; zeros (never stop) if close."""
     right = min(right, 0.99)
     if not right > 1.5 * wrong:
         return 0.0, 0.0
@@ -297,10 +284,7 @@ def draw_sample(uniforms: F64, n: int, out: I64) -> None:
 
 @kernel
 def required_samples(inlier_ratio: float, sample_size: int, confidence: float, largest: int) -> int:
-    """Return the number of samples of which one is free of outliers with probability ``confidence``.
-
-    N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981), at most ``largest``.
-    """
+    """N = log(1 - confidence) / log(1 - ratio^size) (Fischler and Bolles 1981), at most ``largest``."""
     good = inlier_ratio**sample_size
     if good <= 1e-12:
         return largest

@@ -1,4 +1,4 @@
-"""Degenerate planes (section 5.5; DEGENSAC): do the matches determine F, or does another F explain them too?
+"""Degenerate planes (DEGENSAC, CVPR 2005): do the matches determine F, or does another F explain them too?
 
 If most matches lie on one plane with homography H, every [e]x H explains them: the epipole depends on the few
 matches off the plane, and a wrong F has as many inliers as the right one.
@@ -15,18 +15,14 @@ import scipy
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar._matches import (
-    PairFrame,
-    chance_of_agreement,
-    check_matches,
-    multiplicity_weights,
-)
+from thesisrecon.epipolar import _matches
+from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.homography import OFF_PLANE, find_dominant_plane, fundamentals_of_plane
 from thesisrecon.epipolar.refinement import SAMPSON, refine
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import epipolar_distance_std
-from thesisrecon.optimize.noise import student_factor
+from thesisrecon.optimize.least_squares import student_factor
 from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
@@ -81,9 +77,8 @@ def _competing_starts(
 ) -> tuple[F64, float]:
     """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance.
 
-    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005), right or wrong, is scored
-    on all matches off the plane; the best distinct ones remain. In half of the pairs one match agrees with
-    ``f`` and the other does not, since a wrong F often shares most of its inliers with the right one.
+    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005) is scored on all matches
+    off the plane. In half of the pairs only one match agrees with ``f``: a wrong F often shares most inliers.
     """
     off = np.flatnonzero(off_plane)
     if len(off) < 3:
@@ -132,12 +127,11 @@ def assess_degeneracy(
     """Test whether the matches determine the fundamental matrix of a fit.
 
     F is undetermined if the inliers off the dominant plane are no more than expected by chance, if another F
-    of that plane or of another search explains about as many matches (McNemar's test) at a relevant distance,
-    if more than a fifth of the inliers off the plane are contradicted by neighbours on it (as matches between
-    repeated windows are), or if the covariance allows errors of the epipolar lines above ``unit_px``. Wrong
-    matches as coherent as a surface cannot be detected.
+    explains about as many matches (McNemar's test) at a relevant distance, if more than a fifth of the
+    inliers off the plane are contradicted by neighbours on it (repeated windows), or if the covariance allows
+    errors of the epipolar lines above ``unit_px``. Wrong matches as coherent as a surface cannot be detected.
     """
-    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    xy1, xy2 = _matches.check_matches(xy1, xy2, needed=MINIMUM)
     if fit.inliers.shape != (len(xy1),):
         raise ValueError(f"the fit has {fit.inliers.shape} inlier flags for {len(xy1)} matches")
     frame = PairFrame.of(xy1, xy2)
@@ -149,7 +143,7 @@ def assess_degeneracy(
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
     H, off_plane = plane[0], plane[1] > OFF_PLANE
-    weights, band = multiplicity_weights(xy1 / unit_px, xy2 / unit_px), band_px * frame.scale
+    weights, band = _matches.multiplicity_weights(xy1 / unit_px, xy2 / unit_px), band_px * frame.scale
     of_plane, chance_of_model = _competing_starts(f, points, weights, H, off_plane, band=band, rng=rng)
     starts = [*of_plane, *(frame.matrix_in_frame(F) for F in fit.competing_models)]
     models = [_competing_model(start, f, points, weights, band) for start in starts]
@@ -157,7 +151,7 @@ def assess_degeneracy(
     agreeing, tried = float(weights[mine & off_plane].sum()), float(weights[off_plane].sum())
     part = _contradicted_fraction(points[mine], weights[mine], H, off_plane[mine], near)
     contradicted = agreeing * part
-    chance_of_match = chance_of_agreement(xy1, xy2, band_px)
+    chance_of_match = _matches.chance_of_agreement(xy1, xy2, band_px)
     chance = max(chance_of_model, chance_of_match)
     false_alarms = log10_false_alarms(agreeing - contradicted, tried, chance=chance, free=2)
     relevant_px = max(unit_px, 2.0 * fit.sigma_px)
@@ -203,8 +197,7 @@ def _reasons(
 def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:
     """Fraction of a sample of the inliers ``off`` the plane that 30 % of their neighbours on it contradict.
 
-    A parallax that differs by more than the distance in image 1 would change the order of two points of an
-    opaque surface. Points nearer than ``near`` are the same feature.
+    A larger difference of parallax than of position would change the order of two points of a surface.
     """
     chosen = np.flatnonzero(off)
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
@@ -246,7 +239,7 @@ class FundamentalEstimate(FundamentalFit):
 
     @cached_property
     def degeneracy(self) -> DegeneracyReport:
-        """The test of section 5.5 with its evidence; the same for the same matches and F."""
+        """The test for degenerate configurations with its evidence; the same for the same matches and F."""
         if len(self.xy1) < MINIMUM:
             return DegeneracyReport(False, (f"{len(self.xy1)} matches are too few to test F",))
         return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0), unit_px=self.unit_px)

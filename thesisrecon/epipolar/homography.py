@@ -15,10 +15,9 @@ from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, noise_width
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
-from thesisrecon.optimize.noise import VARIANCE_OF_INLIERS, next_inlier_limit
+from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
 from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
@@ -29,10 +28,7 @@ OFF_PLANE = 16.0
 
 @kernel
 def _equations(h: F64, match: F64, J: F64) -> tuple[float, float, float]:
-    """Equations c of x2 ~ H x1 and w = (H x1)_3; writes their derivatives ``J`` (2, 2) by x1.
-
-    The derivatives by x2 are -w I.
-    """
+    """Equations c of x2 ~ H x1 and w = (H x1)_3; writes ``J`` (2, 2), dc / dx1; dc / dx2 is -w I."""
     x1, y1, x2, y2 = match[0], match[1], match[2], match[3]
     w = h[2, 0] * x1 + h[2, 1] * y1 + h[2, 2]
     for j in range(2):
@@ -83,38 +79,50 @@ def induced_homographies(F: F64, e2: F64, points: F64, triples: I64, smallest_ar
 
 
 def _normal_matrix(H: F64, points: F64, gate: float) -> F64:
-    """Sum (9, 9) of the squared equations of x2 ~ H x1 in the entries of H.
-
-    Each match has the weight (J J')^-1 and, within the gate, (1 - d^2 / gate^2)^2 (Tukey).
-    """
-    share = squared_plane_distances(H, points) / gate**2
-    return np.asarray(_sum_equations(np.ascontiguousarray(H), points, share))
+    """Sum (9, 9) of squared equations in H, weights (J J')^-1 (1 - d^2 / gate^2)^2 in the gate (Tukey)."""
+    weight = np.maximum(1.0 - squared_plane_distances(H, points) / gate**2, 0.0)
+    G = np.zeros((9, 9))
+    _add_equations(np.ascontiguousarray(H), points, weight, False, G, np.zeros(9))
+    return G
 
 
 @kernel
-def _sum_equations(H: F64, points: F64, share: F64) -> F64:
-    """The sum of :func:`_normal_matrix`; ``share`` (N,) is d^2 / gate^2."""
-    G, row, J = zeros((9, 9)), zeros((2, 9)), empty((2, 2))
+def _add_equations(H: F64, points: F64, weight: F64, nearest: bool, G: F64, g: F64) -> float:
+    """Add products (9, 9) of the whitened equations times ``weight`` (N,), and (9,) with their residuals r.
+
+    Returns sum r'r. Whitened by the Cholesky factor L of J J' (L r = c), at the matches or at the ``nearest``
+    exact ones, to first order x - J' v with v = (J J')^-1 c: the gradient of c' v is twice v' times their
+    coefficients there.
+    """
+    J, row, total = empty((2, 2)), zeros((2, 9)), 0.0
     for k in range(len(points)):
-        if not share[k] < 1.0:
+        if not weight[k] > 0.0:
             continue
-        w = _equations(H, points[k], J)[2]
+        c0, c1, w = _equations(H, points[k], J)
         a, b = J[0, 0] ** 2 + J[0, 1] ** 2 + w * w, J[0, 0] * J[1, 0] + J[0, 1] * J[1, 1]
         # det J J', without the rounding of a difference.
         determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2
         determinant += w * w * (a + J[1, 0] ** 2 + J[1, 1] ** 2)
-        # The rows of L^-1 [equations], L the Cholesky factor of J J', times the root of the weight.
-        s, t = (1.0 - share[k]) / np.sqrt(a), (1.0 - share[k]) * np.sqrt(a / determinant)
-        x2, y2 = points[k, 2], points[k, 3]
+        l11, l22 = np.sqrt(a), np.sqrt(determinant / a)
+        r0 = c0 / l11
+        r1 = (c1 - b / l11 * r0) / l22
+        total += r0 * r0 + r1 * r1
+        v1 = r1 / l22 if nearest else 0.0
+        v0 = (r0 - b / l11 * v1) / l11 if nearest else 0.0
+        x1 = points[k, 0] - J[0, 0] * v0 - J[1, 0] * v1
+        y1 = points[k, 1] - J[0, 1] * v0 - J[1, 1] * v1
+        x2, y2 = points[k, 2] + w * v0, points[k, 3] + w * v1
+        s, t = weight[k] / l11, weight[k] / l22
         for j in range(3):
-            x = points[k, j] if j < 2 else 1.0
+            x = x1 if j == 0 else (y1 if j == 1 else 1.0)
             row[0, j], row[0, 6 + j] = s * x, -s * x2 * x
             row[1, j], row[1, 3 + j], row[1, 6 + j] = -t * b / a * x, t * x, -t * (y2 - b / a * x2) * x
         for i in range(9):
+            g[i] += row[0, i] * r0 + row[1, i] * r1
             for j in range(i, 9):
                 G[i, j] += row[0, i] * row[0, j] + row[1, i] * row[1, j]
                 G[j, i] = G[i, j]
-    return G
+    return total
 
 
 def refine_plane(H: F64, points: F64, gate: float, iterations: int) -> F64:
@@ -264,10 +272,9 @@ def _undetermined(evidence: str) -> StageFailure:
 
 
 def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
-    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers.
+    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers, equal ones once.
 
-    A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 in that of
-    the other image. Equal matches count once.
+    A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
     """
     squared = squared_plane_distances(H, points)
     near = squared <= gate**2
@@ -292,8 +299,7 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
 def _through_four(samples: F64) -> F64:
     """Homographies (B', 3, 3) of samples of four matches (B, 4, 4) whose triangles keep their orientation.
 
-    With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
-    fourth, H = B diag(b / a) A^-1.
+    H = B diag(b / a) A^-1 with three points as the columns of A, B and barycentric coordinates of the fourth.
     """
     apart = samples[:, :3] - samples[:, 3:]
     e, f = np.roll(apart, -1, axis=1), np.roll(apart, -2, axis=1)
@@ -323,49 +329,15 @@ def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F
     return found.model, found.samples
 
 
-@kernel
-def _gauss_newton(H: F64, points: F64, G: F64, g: F64) -> float:
-    """Sum of squared distances; adds to G (9, 9) and g (9,) the products of their derivatives by H.
-
-    With v = (J J')^-1 c, the nearest exact match is to first order x - J' v, and the gradient of c' v is
-    twice v' times the equations' coefficients at that match.
-    """
-    J, row, total = empty((2, 2)), zeros((2, 9)), 0.0
-    for k in range(len(points)):
-        c0, c1, w = _equations(H, points[k], J)
-        a, b = J[0, 0] ** 2 + J[0, 1] ** 2 + w * w, J[0, 0] * J[1, 0] + J[0, 1] * J[1, 1]
-        determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2
-        determinant += w * w * (a + J[1, 0] ** 2 + J[1, 1] ** 2)
-        l11, l22 = np.sqrt(a), np.sqrt(determinant / a)
-        r0 = c0 / l11
-        r1 = (c1 - b / l11 * r0) / l22
-        v1 = r1 / l22
-        v0 = (r0 - b / l11 * v1) / l11
-        x1 = points[k, 0] - J[0, 0] * v0 - J[1, 0] * v1
-        y1 = points[k, 1] - J[0, 1] * v0 - J[1, 1] * v1
-        x2, y2 = points[k, 2] + w * v0, points[k, 3] + w * v1
-        total += r0 * r0 + r1 * r1
-        for j in range(3):
-            x = x1 if j == 0 else (y1 if j == 1 else 1.0)
-            row[0, j], row[0, 6 + j] = x / l11, -x2 * x / l11
-            row[1, j], row[1, 3 + j] = -b / a * x / l22, x / l22
-            row[1, 6 + j] = -(y2 - b / a * x2) * x / l22
-        for i in range(9):
-            g[i] += row[0, i] * r0 + row[1, i] * r1
-            for j in range(i, 9):
-                G[i, j] += row[0, i] * row[0, j] + row[1, i] * row[1, j]
-    return total
-
-
 def _refine(H: F64, points: F64) -> tuple[F64, F64]:
     """H of least Sampson distances of matches (n, 4), and the inverse (9, 9) of its information."""
-    h, damping, cost = H.ravel() / np.linalg.norm(H), 0.0, np.inf
+    h, damping, cost, every = H.ravel() / np.linalg.norm(H), 0.0, np.inf, np.ones(len(points))
     for _ in range(50):
         G, g = np.zeros((9, 9)), np.zeros(9)
-        now = _gauss_newton(h.reshape(3, 3), points, G, g)
+        now = _add_equations(h.reshape(3, 3), points, every, True, G, g)
         if now <= cost:
             tangent = np.linalg.svd(h[None])[2][1:]
-            information = tangent @ (G + np.triu(G, 1).T) @ tangent.T
+            information = tangent @ G @ tangent.T
             kept, cost, gradient = h, now, tangent @ g
             damping = 0.1 * damping if damping > 1e-12 else 0.0
         else:

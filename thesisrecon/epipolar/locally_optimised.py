@@ -12,7 +12,7 @@ from thesisrecon.epipolar._matches import NoiseMixture, PairFrame, check_matches
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.epipolar.refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.errors import StageFailure
-from thesisrecon.optimize.noise import best_huber_width, effective_noise
+from thesisrecon.optimize.least_squares import best_huber_width, effective_noise
 from thesisrecon.records import FundamentalFit
 
 MINIMUM = 8
@@ -99,10 +99,7 @@ class LocallyOptimisedRansac:
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, others)
 
     def _repeat_search(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
-        """Score and F (9,) of each search until enough agree, and the number of samples.
-
-        If the first searches disagree, these and all later ones continue among the matches near their F.
-        """
+        """Score and F (9,) of the searches, among near matches once they differ; number of samples."""
         found: list[tuple[float, F64]] = []
         samples = 0
         for k in range(self.max_starts):
@@ -125,10 +122,7 @@ class LocallyOptimisedRansac:
         return found, samples
 
     def _agree(self, found: list[tuple[float, F64]], points: F64, gate: float) -> bool:
-        """Whether enough searches end at the best score.
-
-        Two that end at the same minimum differ by about the root of the number of matches near the gate.
-        """
+        """Whether enough searches end at the best score, to the root of the matches near the gate."""
         if len(found) < self.starts:
             return False
         best, f = min(found, key=lambda end: end[0])
@@ -189,11 +183,7 @@ class _Candidate:
     competing_models: list[F64]
 
     def explains_more_than(self, other: _Candidate) -> bool:
-        """Whether this result of a wider gate is more likely and leaves few matches unexplained.
-
-        A wide gate accepts wrong F near many wrong matches: this one must explain most of those that
-        ``other`` rejects.
-        """
+        """Whether this result of a wider gate is more likely and leaves few matches unexplained."""
         if self.noise is None or other.noise is None:
             return other.noise is None
         explained = int(np.count_nonzero(self.residuals < self.noise.limit))
@@ -217,10 +207,7 @@ def _score_samples(
     sampled: F64, points: F64, columns: F64, gate: float, limits: tuple[int, int, float],
     state: F64, f: F64, rng: Generator,
 ) -> int:  # fmt: skip
-    """Improve ``f`` in place by samples of some points, each better one refined; return their number.
-
-    ``limits``: minimum and maximum number, and the probability of a sample without outliers.
-    """
+    """Improve ``f`` in place by samples, each better one refined; ``limits``: least, most, confidence."""
     (least, most, confidence), drawn, uniforms = limits, 0, np.empty((0, 7))
     while drawn < most:
         if not len(uniforms):
@@ -269,10 +256,7 @@ def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float)
 
 
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
-    """Refine ``f`` in place with the loss fitted to its residuals; return the noise and the loss.
-
-    The noise is None if too few residuals are within it.
-    """
+    """Refine ``f`` in place with the loss fitted to its residuals; noise (None: too few) and loss."""
     loss, rounds = (0.0, 0.0), 2
     # Smallest width of the loss in units of the frame, for matches without noise.
     exact = 1e-9
@@ -300,10 +284,7 @@ def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | N
 
 
 def _noise_exceeds_gate(r: F64, noise: NoiseMixture, gate: float) -> bool:
-    """Whether more residuals (N,) lie just beyond the noise than are expected of wrong matches.
-
-    In a ring of 15 gates beyond 3 sigma, by at least a quarter of the inliers (less if they are few).
-    """
+    """Whether more residuals lie in a ring of 15 gates beyond 3 sigma than are expected of wrong matches."""
     end, width = 3.0 * noise.sigma, 15.0 * gate
     inside = int(np.count_nonzero(r < end))
     beyond = len(r) - inside

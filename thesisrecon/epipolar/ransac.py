@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -12,17 +11,17 @@ from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import MIN_PX, PairFrame, as_matches, check_matches, noise_scale
-from thesisrecon.epipolar._sampling import draw_sample, sampson_distances
+from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import normalizing_transform, unit_norm
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
 from thesisrecon.geometry.two_view import (
     enforce_rank_two,
     epipolar_distances,
     sampson_residuals,
     symmetric_residuals,
 )
+from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import FundamentalFit
 
 
@@ -51,11 +50,7 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
 
 
 def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
-    """All fundamental matrices (0 to 3, 3, 3) through exactly seven matches (HZ, section 11.1.2), unit norm.
-
-    Singular members of the pencil of two solutions of (5.1) are searched in all directions, also F1 - F2,
-    which alpha F1 + (1 - alpha) F2 of the thesis reaches only at infinity.
-    """
+    """All unit F (0 to 3, 3, 3) of exactly seven matches (HZ, section 11.1.2), also the thesis' F1 - F2."""
     xy1, xy2 = as_matches(xy1, xy2)
     if xy1.shape != (7, 2):
         raise ValueError(f"the seven-point algorithm needs two (7, 2) arrays; got {xy1.shape}, {xy2.shape}")
@@ -67,10 +62,7 @@ def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
 
 
 def seven_point(points: F64) -> list[F64]:
-    """Unit F (0 to 3, 9) through each sample of seven rows (x1, y1, x2, y2) of points (B, 7, 4) in a frame.
-
-    The null space of the equations (5.1) are the last two columns of the orthogonal factor.
-    """
+    """Unit F (0 to 3, 9) of each sample (B, 7, 4) in a frame; QR gives the null space of (5.1)."""
     x1, x2 = homogenize(points[..., :2]), homogenize(points[..., 2:])
     A = (x2[..., :, None] * x1[..., None, :]).reshape(-1, 7, 9)
     Q, R = np.linalg.qr(A.swapaxes(1, 2), mode="complete")
@@ -82,9 +74,8 @@ def seven_point(points: F64) -> list[F64]:
 def singular_members(pencils: F64) -> list[F64]:
     """The unit members (0 to 3, 9) with determinant 0 of each of the pencils (B, 2, 9).
 
-    The determinant is a homogeneous cubic of the pencil coordinates. It cannot vanish in four directions
-    unless it vanishes everywhere, so the direction with the largest determinant of four becomes the first
-    basis vector: the leading coefficient is never small and no solution is lost at infinity.
+    The determinant is a cubic of the pencil coordinates. The direction of four with the largest one becomes
+    the first basis vector: the leading coefficient is never small and no solution is lost at infinity.
     """
     half = np.sqrt(0.5)
     directions = np.array([[1.0, 0.0], [0.0, 1.0], [half, half], [half, -half]])
@@ -106,10 +97,7 @@ def singular_members(pencils: F64) -> list[F64]:
 
 
 def distinct_real_roots(roots: F64) -> F64:
-    """The real roots of a cubic, the middle one first, a double one once and last.
-
-    Rounding splits a double root into two near ones or a complex pair.
-    """
+    """The real roots of a cubic, the middle one first, a double one (split by rounding) once and last."""
     real = np.sort(roots.real[np.abs(roots.imag) <= 1e-6 * (1.0 + np.abs(roots))])
     if len(real) < 3:
         return real[:1]
@@ -260,18 +248,15 @@ def _search(
 ) -> tuple[F64 | None, B8, int]:  # fmt: skip
     """Algorithm 2: F (9,) of seven points with the most of them within the gate, these, and the samples.
 
-    Between models with the same number of inliers the lower standard deviation decides (Fischler and
-    Bolles, 1981). An exhaustive search would need n! / (s! (n - s)!) samples of size s (the thesis' text has
-    n! / s!). More than ``enough`` inliers end the search; without a gate the lowest median of the distances
-    decides (Rousseeuw, 1984).
+    Of equal numbers the lower standard deviation decides (Fischler and Bolles, 1981), without a gate the
+    lowest median (Rousseeuw, 1984). More than ``enough`` inliers end the search. The thesis' text has n! / s!
+    samples of size s where n! / (s! (n - s)!) is meant.
     """
     best, inliers, best_rank, drawn = None, np.zeros(len(points), dtype=bool), (-np.inf, 0.0), 0
-    chosen, middle = np.empty((samples, 7), dtype=np.int64), len(points) // 2
-    for sample, uniforms in zip(chosen, deepcopy(rng).random((samples, 7)), strict=True):
-        draw_sample(uniforms, len(points), sample)
+    middle = len(points) // 2
     while drawn < samples and best_rank[0] <= enough:
         if drawn % _BATCH == 0:
-            solved = seven_point(points[chosen[drawn : drawn + _BATCH]])
+            solved = seven_point(points[draw_samples(rng, _BATCH, len(points), 7)])
         for model in solved[drawn % _BATCH]:
             r = np.abs(distances(model))
             if np.isinf(gate):
@@ -284,8 +269,6 @@ def _search(
             if rank > best_rank:
                 best, inliers, best_rank = model, inside, rank
         drawn += 1
-    # Numbers of samples that were not needed are left to others.
-    rng.random((drawn, 7))
     return best, inliers, drawn
 
 

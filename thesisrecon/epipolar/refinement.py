@@ -1,4 +1,4 @@
-"""Sections 5.3 and 5.5: criteria of F (gold standard, Sampson, ...), minimised over rank 2, covariance of F.
+"""Section 5.3: criteria of F (gold standard, Sampson, ...), minimised over rank 2; covariance of F (HZ 5.2).
 
 The criteria are the Sampson distance (5.4), which the thesis calls the gradient criterion, the distances to
 the epipolar lines (5.6) and the reprojection error (HZ, algorithm 11.3). F = U diag(cos phi, sin phi, 0) V'
@@ -8,7 +8,6 @@ common frame, F is a row-major vector of 9.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,10 +16,10 @@ from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import PairFrame, check_matches, check_start
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry.conditioning import unit_norm
+from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.small_matrices import orthogonalize_columns, solve_damped
 from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.optimize.least_squares import DenseProblem, DenseSystem, run_levenberg_marquardt
+from thesisrecon.optimize.least_squares import DenseSystem, central_differences, run_levenberg_marquardt
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -123,10 +122,7 @@ def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D:
 
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def normal_equations(f: F64, points: F64, criterion: int, gate: float, delta: float, G: F64, h: F64) -> float:
-    """Gauss-Newton matrix ``G`` (9, 9) and gradient ``h`` (9,) of 1/2 sum rho(r) by F; returns the cost.
-
-    rho is Huber's loss of width ``delta``, constant beyond ``gate``.
-    """
+    """Matrix ``G`` (9, 9), gradient ``h`` (9,), cost of 1/2 sum rho(r): Huber, constant beyond ``gate``."""
     G[:] = 0.0
     h[:] = 0.0
     cost = 0.0
@@ -246,10 +242,7 @@ def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
 def refine(
     f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
 ) -> tuple[float, int]:
-    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and the number of linear solves.
-
-    Residuals beyond ``gate`` have no weight; ``delta`` is the width of Huber's loss.
-    """
+    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves."""
     U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
     B, step, trial = empty((9, 7)), empty(7), empty(9)
@@ -287,10 +280,9 @@ def refine(
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
-    """Covariance (9, 9) of vec(F), px, unit norm, first order: sigma^2 B (J'J)^-1 B' (section 5.5).
+    """Covariance (9, 9) of vec(F), px, unit norm: sigma^2 B (J'J)^-1 B' to first order (HZ 5.2).
 
-    J are the derivatives of the Sampson distances by the seven parameters and B those of vec(F). ``f`` (9,),
-    inliers (N, 4) and the noise ``sigma`` of a coordinate are in the frame.
+    J: derivatives of the Sampson distances by seven parameters, B: of vec(F); f, sigma in the frame.
     """
     U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
     G, h = np.empty((9, 9)), np.empty(9)
@@ -309,7 +301,7 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
 
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
-Parameters = Literal["orthonormal", "row", "row-and-column"]
+Parameters = Literal["orthonormal", "row"]
 _CRITERIA = {"sampson": SAMPSON, "epipolar-distance": EPIPOLAR_DISTANCE, "reprojection": REPROJECTION}
 MAX_ITERATIONS = 50
 MAPS_TRIED = 4
@@ -321,9 +313,8 @@ def refine_fundamental(
     """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt, from a start F.
 
     The reprojection error gives the maximum likelihood for Gaussian noise (HZ, algorithm 11.3); the Sampson
-    distance is optimal to first order in the noise. With the ``parameters`` "row" and "row-and-column" one
-    row (and one column) of F is a combination of the others, as in the thesis; its 18 (36) maps reach the
-    same minimum more slowly.
+    distance is optimal to first order in the noise. With the ``parameters`` "row" a row of F is a combination
+    of the others, as in the thesis, which reaches the same minimum more slowly.
     """
     if criterion not in _CRITERIA:
         raise ValueError(unknown_word("criterion", criterion, _CRITERIA))
@@ -335,74 +326,52 @@ def refine_fundamental(
     if parameters == "orthonormal":
         refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
     else:
-        f = _refine_by_rows(f, points, _CRITERIA[criterion], and_columns=parameters == "row-and-column")
+        f = _refine_by_rows(f, points, _CRITERIA[criterion])
     return frame.matrix_in_pixels(f)
 
 
-@dataclass(frozen=True)
-class _RowMap:
-    """F = L B R: row ``row`` of F, and optionally column ``column``, are combinations of the others.
+def _row_map(F: F64) -> tuple[int, int]:
+    """The dependent row of F, that of the largest coordinate of e2, and the largest entry of the others."""
+    row = int(np.argmax(np.abs(epipoles(F)[1])))
+    return row, int(np.argmax(np.abs(np.delete(F, row, axis=0))))
 
-    L (3, 2) holds the identity and (alpha, beta) in the dependent row: the epipole e2 is (alpha, beta, -1) in
-    that order of coordinates (the thesis has e1 here). With a dependent column (Luong and Faugeras, IJCV
-    1996) R (2, 3) does the same for e1, else it is the identity. No map represents an epipole whose
-    coordinate of the dependent row is zero: 18 maps (36 with columns) are needed for all matrices of rank 2.
-    ``fixed`` is the entry of B, row by row, that is 1.
+
+def _row_parameters(F: F64, row: int, fixed: int) -> F64:
+    """Entries of two rows of F over the ``fixed`` one, and the factors of the other ``row`` in them (7,)."""
+    rows, e2 = np.delete(F, row, axis=0).ravel(), epipoles(F)[1]
+    return np.append(np.delete(rows, fixed) / rows[fixed], -np.delete(e2, row) / e2[row])
+
+
+def _fundamental_from_rows(parameters: F64, row: int, fixed: int) -> F64:
+    """F of unit norm of five entries of two rows, with 1 at ``fixed``, and the factors of ``row`` (7,)."""
+    rows = np.insert(parameters[:5], fixed, 1.0).reshape(2, 3)
+    return unit_norm(np.insert(rows, row, parameters[5:] @ rows, axis=0))
+
+
+def _refine_by_rows(f: F64, points: F64, criterion: int) -> F64:
+    """Minimise a criterion in the thesis' parameters: a row of F is alpha and beta times the other two.
+
+    The epipole e2 is (alpha, beta, -1) in that order of coordinates (the thesis has e1 here), so that 18 maps
+    are needed for all matrices of rank 2. The map is chosen again when the estimate leaves it.
     """
-
-    row: int
-    fixed: int
-    column: int | None = None
-
-    @classmethod
-    def best_for(cls, F: F64, *, and_columns: bool = False) -> _RowMap:
-        """The map in which all parameters of F are at most 1."""
-        e1, e2 = epipoles(F)
-        row, column = int(np.argmax(np.abs(e2))), int(np.argmax(np.abs(e1))) if and_columns else None
-        return cls(row, int(np.argmax(np.abs(cls(row, 0, column)._independent(F)))), column)
-
-    def parameters(self, F: F64) -> F64:
-        """Entries of B but one, alpha, beta (and gamma, delta): (7,), for the nearest F of rank 2."""
-        e1, e2 = epipoles(F)
-        B = self._independent(F)
-        parts = [np.delete(B, self.fixed) / B[self.fixed], -np.delete(e2, self.row) / e2[self.row]]
-        if self.column is not None:
-            parts.append(-np.delete(e1, self.column) / e1[self.column])
-        return np.concatenate(parts)
-
-    def matrix(self, parameters: F64) -> F64:
-        """F of its parameters (7,), rank 2, unit norm."""
-        n = 5 if self.column is None else 3
-        B = np.insert(parameters[:n], self.fixed, 1.0).reshape(2, -1)
-        L = np.insert(np.eye(2), self.row, parameters[n : n + 2], axis=0)
-        R = np.eye(3) if self.column is None else np.insert(np.eye(2), self.column, parameters[5:], axis=1)
-        return unit_norm(L @ B @ R)
-
-    def _independent(self, F: F64) -> F64:
-        rows = np.delete(F, self.row, axis=0)
-        return (rows if self.column is None else np.delete(rows, self.column, axis=1)).ravel()
-
-
-def _refine_by_rows(f: F64, points: F64, criterion: int, *, and_columns: bool) -> F64:
-    """Minimise a criterion in the thesis' parameters; the map is chosen again when the estimate leaves it."""
     current, G, h = f.reshape(3, 3), np.empty((9, 9)), np.empty(9)
     for _ in range(MAPS_TRIED):
-        chart = _RowMap.best_for(current, and_columns=and_columns)
+        chosen = _row_map(current)
 
-        def cost(p: F64, chart: _RowMap = chart) -> float:
-            F = chart.matrix(p).ravel()
+        def cost(p: F64, chosen: tuple[int, int] = chosen) -> float:
+            F = _fundamental_from_rows(p, *chosen).ravel()
             return float(normal_equations(F, points, criterion, np.inf, UNBOUNDED, G, h))
 
-        def linearize(p: F64, chart: _RowMap = chart) -> DenseSystem:
-            steps = 1e-6 * np.eye(7)
-            B = np.array([chart.matrix(p + d) - chart.matrix(p - d) for d in steps]).reshape(7, 9) / 2e-6
-            value = cost(p, chart)
-            return DenseSystem(value, B @ G @ B.T, B @ h)
+        def linearize(p: F64, chosen: tuple[int, int] = chosen) -> DenseSystem:
+            B = central_differences(lambda q: _fundamental_from_rows(q, *chosen).ravel(), p)
+            value = cost(p, chosen)
+            return DenseSystem(value, B.T @ G @ B, B.T @ h)
 
-        problem = DenseProblem(linearize, lambda p, step: p + step, cost)
-        start = chart.parameters(current)
-        found = run_levenberg_marquardt(problem, start, max_iterations=MAX_ITERATIONS, initial_damping=1e-3)
-        current = chart.matrix(found.state)
-        if _RowMap.best_for(current, and_columns=and_columns) == chart:
+        found = run_levenberg_marquardt(
+            linearize, lambda p, step: p + step, cost, _row_parameters(current, *chosen),
+            max_iterations=MAX_ITERATIONS, initial_damping=1e-3,
+        )  # fmt: skip
+        current = _fundamental_from_rows(found.state, *chosen)
+        if _row_map(current) == chosen:
             break
     return current.ravel()

@@ -5,7 +5,6 @@ Linear equations; least algebraic error (HZ, algorithm 16.2); least reprojection
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,16 +13,16 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import normalizing_transform, unit_tensor
-from thesisrecon.geometry.homogeneous import homogenize, unit_normals
+from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_normals, unit_tensor
 from thesisrecon.geometry.three_view import cameras_from_tensor, tensor_epipoles, tensor_from_cameras
 from thesisrecon.optimize.least_squares import (
     DenseSystem,
+    central_differences,
+    huber,
     invert_information,
     minimize_residuals,
     run_levenberg_marquardt,
 )
-from thesisrecon.optimize.noise import huber
 
 # Seven points, thirteen lines, or a mixture (HZ 16.1).
 NEEDED_EQUATIONS = 26
@@ -135,8 +134,7 @@ def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
 class _ReprojectionProblem:
     """Reprojection error of points and lines by 18 coordinates c of P2 and P3 near those of a conditioned T.
 
-    A state is c and four coordinates f of each point (the last one unused) and line, moves orthogonal to the
-    start, fitted to the cameras of each step (variable projection).
+    A state is c and four coordinates f of each point and line, fitted at each step (variable projection).
     """
 
     def __init__(self, T: F64, points: F64, segments: F64, transforms: F64, loss_px: float) -> None:
@@ -145,7 +143,7 @@ class _ReprojectionProblem:
         self.per_pixel, self.loss_px = transforms[:, 0, 0], loss_px
         self.P, self.moves = np.stack(cameras_from_tensor(T)), np.eye(24)
         # T does not depend on six of 24 directions: the scales of P2 and P3 and the frame of space.
-        self.moves = np.linalg.svd(_derivatives(self.tensors, np.zeros(24)).reshape(27, 24))[2][:18]
+        self.moves = np.linalg.svd(central_differences(self.tensor, np.zeros(24)).reshape(27, 24))[2][:18]
         # A line is where the planes of its image lines meet, a point where those of axis-parallel lines meet.
         axes = np.eye(3)[:2] - self.x[..., :2, None] * np.eye(3)[2]
         lines = unit_normals(np.cross(self.y[:, :, :1], self.y[:, :, 1:]))
@@ -158,9 +156,9 @@ class _ReprojectionProblem:
         moves = np.reshape(c @ self.moves, (*c.shape[:-1], 2, 3, 4))
         return self.P + np.insert(moves, 0, 0.0, axis=-3)
 
-    def tensors(self, c: F64) -> F64:
-        """Conditioned tensors (B, 3, 3, 3) of unit norm for coordinates (B, 18)."""
-        return np.stack([tensor_from_cameras(*P) for P in self.cameras(c)])
+    def tensor(self, c: F64) -> F64:
+        """Conditioned tensor (3, 3, 3) of unit norm for coordinates (18,)."""
+        return tensor_from_cameras(*self.cameras(c))
 
     def residual(self, c: F64, f: F64) -> F64:
         """Offsets of the points, then distances of the segment ends, (..., N + M, 3 views, 2) px."""
@@ -184,8 +182,8 @@ class _ReprojectionProblem:
     def linearize(self, state: _State) -> DenseSystem:
         """The normal equations of the cameras, points and lines eliminated."""
         c, f = state
-        r, B = self._weighted(state, _derivatives(lambda f: self.residual(c, f), f))
-        _, A = self._weighted(state, _derivatives(lambda c: self.residual(c, f), c))
+        r, B = self._weighted(state, central_differences(lambda f: self.residual(c, f), f))
+        _, A = self._weighted(state, central_differences(lambda c: self.residual(c, f), c))
         A = A - B @ (np.linalg.pinv(B) @ A)
         H, g = np.einsum("nri,nrj->ij", A, A), np.einsum("nri,nrj->i", A, r)
         return DenseSystem(self.cost(state), H, g)
@@ -194,7 +192,7 @@ class _ReprojectionProblem:
         """Move the cameras, then points and lines by Gauss-Newton steps that lower their cost."""
         c, f = state[0] + step, state[1]
         for _ in range(3):
-            r, B = self._weighted((c, f), _derivatives(lambda f: self.residual(c, f), f))
+            r, B = self._weighted((c, f), central_differences(lambda f: self.residual(c, f), f))
             moved = f - (np.linalg.pinv(B) @ r)[..., 0]
             before, after = (self.losses(self.residual(c, g))[0].sum(axis=1) for g in (f, moved))
             f = np.where((after < before)[:, None], moved, f)
@@ -207,28 +205,25 @@ class _ReprojectionProblem:
         return (root * residual).reshape(-1, 6, 1), (root * J).reshape(-1, 6, J.shape[-1])
 
 
-def _derivatives(function: Callable[[F64], F64], x: F64) -> F64:
-    """Central differences (..., D) by the last axis (D,) of x; the function takes a batch."""
-    steps = 1e-6 * np.expand_dims(np.eye(x.shape[-1]), tuple(range(1, x.ndim)))
-    return np.moveaxis(function(x + steps) - function(x - steps), 0, -1) / 2e-6
-
-
 def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _TensorEquations) -> TrifocalFit:
     """The fit; whether the matches determine it is not tested."""
     n, m = len(problem.X), len(problem.L)
     start = problem.retract((np.zeros(18), np.zeros((n + m, 4))), np.zeros(18))
-    found = run_levenberg_marquardt(problem, start, max_iterations=50, tolerance=1e-9, initial_damping=1e-3)
+    found = run_levenberg_marquardt(
+        problem.linearize, problem.retract, problem.cost, start,
+        max_iterations=50, tolerance=1e-9, initial_damping=1e-3,
+    )  # fmt: skip
     c, f = found.state
     residual = problem.residual(c, f)
     sigma = float(np.sqrt(np.sum(residual**2) / max(3 * n + 2 * m - 18, 1)))
     of_cameras = sigma**2 * invert_information(problem.linearize((c, f)).hessian)
 
-    def tensors_px(c: F64) -> F64:
-        return np.stack([equations.in_pixels(T) for T in problem.tensors(c)])
+    def tensor_px(c: F64) -> F64:
+        return equations.in_pixels(problem.tensor(c))
 
-    J, J_px = (_derivatives(tensors, c).reshape(27, 18) for tensors in (problem.tensors, tensors_px))
+    J, J_px = (central_differences(tensor, c).reshape(27, 18) for tensor in (problem.tensor, tensor_px))
     return TrifocalFit(
-        T=tensors_px(c[None])[0],
+        T=tensor_px(c),
         point_residuals_px=np.linalg.norm(residual[:n], axis=2).T,
         line_residuals_px=np.abs(residual[n:]).swapaxes(0, 1),
         sigma_px=sigma,
@@ -285,10 +280,7 @@ class _TensorEquations:
         return np.asarray(Vt[26].reshape(3, 3, 3))
 
     def noise_levels_px(self) -> F64:
-        """Noise (27,) that would explain each of 27 solutions of the equations, the best first.
-
-        Roots of the eigenvalues of A'A relative to those of unit noise (Kanatani's renormalisation).
-        """
+        """Noise (27,) that explains each of 27 solutions of the equations (Kanatani's renormalisation)."""
         values, vectors = np.linalg.eigh(self.noise.T @ self.noise)
         whitening = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
         return np.asarray(np.linalg.svd(self.A @ whitening, compute_uv=False)[::-1])
@@ -313,11 +305,7 @@ class _TensorEquations:
 
 
 def _tensor_equations(points: F64, segments: F64) -> _TensorEquations:
-    """Set up the equations of points (3, N, 2) and segment ends (3, M, 2, 2) of three views (HZ table 15.1).
-
-    A triplet of points gives four equations, the two axis-parallel lines through x2 with those through x3; a
-    triplet of lines gives two, for the two ends of its segment in view 1.
-    """
+    """Linear equations of points (3, N, 2), four each by axis-parallel lines, and of segments, two each."""
     ends = segments.reshape(3, -1, 2)
     transforms = np.stack([normalizing_transform(xy) for xy in np.concatenate([points, ends], axis=1)])
     x = homogenize(points) @ transforms.swapaxes(1, 2)

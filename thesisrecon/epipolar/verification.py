@@ -1,8 +1,8 @@
-"""Verification of a pair: the model that explains it (section 5.5), and the share of one homography.
+"""Verification of a pair: the model that explains it, and the share of one homography.
 
-A homography explains a plane or a rotating camera, [e]x one that does not rotate. A simpler model is rejected
-if its residuals exceed the noise, or if F explains more of the remaining matches than chance would. A
-homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
+A homography explains a plane or a rotating camera, [e]x one that does not rotate (the wolf of section 5.5). A
+simpler model is rejected if its residuals exceed the noise, or if F explains more of the remaining matches
+than chance would. A homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
 """
 
 from __future__ import annotations
@@ -14,28 +14,13 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.epipolar._matches import (
-    PairFrame,
-    chance_of_agreement,
-    check_matches,
-    check_start,
-    multiplicity_weights,
-    noise_scale,
-)
+from thesisrecon.epipolar import _matches, homography
+from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
-from thesisrecon.epipolar.homography import (
-    SUBSET,
-    find_dominant_plane,
-    fundamentals_of_plane,
-    induced_homographies,
-    plane_covariance,
-    refine_plane,
-)
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry.conditioning import unit_norm
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.small_matrices import solve_positive
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.geometry.two_view import (
@@ -44,8 +29,7 @@ from thesisrecon.geometry.two_view import (
     homography_residuals,
     homography_sampson_residuals,
 )
-from thesisrecon.optimize.least_squares import minimize_residuals
-from thesisrecon.optimize.noise import trimmed_noise_scale
+from thesisrecon.optimize.least_squares import minimize_residuals, trimmed_noise_scale
 from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
@@ -115,24 +99,24 @@ class Configuration(Enum):
 def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = None) -> Configuration:
     """Determine which model explains at least 12 inliers of F (GENERAL: relief and baseline exceed noise).
 
-    The outliers show how many matches agree by chance. Both images are assumed to share their intrinsics
-    (otherwise a rotation is classified as a plane and a translation as general) and to have square pixels.
+    Model selection by tests, not by penalties as in GRIC (Torr 1998). Both images are assumed to share their
+    intrinsics (else a rotation is a plane and a translation general) and to have square pixels.
     """
-    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+    xy1, xy2 = _matches.check_matches(xy1, xy2, needed=MINIMUM)
     inliers = np.ones(len(xy1), dtype=bool) if inliers is None else inliers
     if inliers.shape != (len(xy1),):
         raise ValueError(f"classify_configuration got {inliers.shape} inlier flags for {len(xy1)} matches")
-    check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
+    _matches.check_matches(xy1[inliers], xy2[inliers], needed=MINIMUM)
     # One centre for both images keeps F of a translation skew-symmetric and the eigenvalues of a rotation.
     own = PairFrame.of(xy1[inliers], xy2[inliers])
     centre = 0.5 * (own.centroid1 + own.centroid2)
     frame = PairFrame(centre, centre, own.scale)
-    points, f = frame.points(xy1, xy2), check_start(F, frame)
+    points, f = frame.points(xy1, xy2), _matches.check_start(F, frame)
     refine(f, points[inliers], SAMPSON, np.inf, _scale(f, points[inliers]) * 3.0, 15)
     sigma = _scale(f, points[inliers])
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
-    chance = chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
-    return _classify(_InlierData(f, points, agree, multiplicity_weights(xy1, xy2), sigma, chance))
+    chance = _matches.chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
+    return _classify(_InlierData(f, points, agree, _matches.multiplicity_weights(xy1, xy2), sigma, chance))
 
 
 @dataclass(frozen=True)
@@ -156,12 +140,12 @@ class _InlierData:
 
 def _scale(f: F64, points: F64) -> float:
     r = np.asarray(sampson_distances(f, points))
-    return max(trimmed_noise_scale(r, noise_scale(r)), 1e-12)
+    return max(trimmed_noise_scale(r, _matches.noise_scale(r)), 1e-12)
 
 
 def _classify(case: _InlierData) -> Configuration:
     rng = np.random.default_rng(0)
-    plane = find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
+    plane = homography.find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
     if plane is not None:
         H, squared = plane[0], plane[1] * case.sigma**2
         noise = _plane_noise(squared[case.agree])
@@ -171,11 +155,11 @@ def _classify(case: _InlierData) -> Configuration:
         if errors < 4.0 and case.false_alarms(far, EPIPOLE) > MAX_CHANCE:
             inliers = case.points[near]
             # Least squares of all of them, for which the covariance holds.
-            H = refine_plane(H, inliers, 1e6 * noise, 4)
+            H = homography.refine_plane(H, inliers, 1e6 * noise, 4)
             # Student's limit, since the noise is estimated.
             limit = float(scipy.special.stdtrit(len(inliers) - 7, 1.0 - ROTATION_RISK))
             rotation = (
-                _eigenvalue_errors(H, plane_covariance(H, inliers, noise)) < limit
+                _eigenvalue_errors(H, homography.plane_covariance(H, inliers, noise)) < limit
                 and _rotation_test(H, inliers[:, :2], inliers[:, 2:]) <= 1.0
             )
             return Configuration.ROTATION if rotation else Configuration.PLANE
@@ -183,10 +167,7 @@ def _classify(case: _InlierData) -> Configuration:
 
 
 def _plane_noise(squared: F64) -> float:
-    """Standard deviation of one coordinate from squared distances (N,) to a homography with outliers.
-
-    In sigma^2 they are chi-square(2): the median is 1.386, the mean of those below 11 is 2 * 0.977.
-    """
+    """Noise from squared distances (N,) to a homography, chi-square(2), with outliers."""
     variance = float(np.median(squared)) / 1.386294
     for _ in range(3):
         near = squared[squared < NEAR * variance]
@@ -199,8 +180,7 @@ def _plane_noise(squared: F64) -> float:
 def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
     """Standard errors by which the squared parallax of the matches near the plane exceeds the noise.
 
-    A homography leaves 2 K - 8 of the residuals, F of these matches K - 7 across the epipolar lines: K - 1
-    along the lines have the same variance if they are noise.
+    Of the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
     """
     k = int(near.sum())
     if k < MINIMUM - 4:
@@ -266,7 +246,7 @@ def _fit_translation(points: F64, sigma: float) -> F64:
     some = points[rng.permutation(len(points))[:200]]
     pairs = rng.integers(0, len(some), (100, 2))
     weights = np.ones((1, len(some)))
-    F, _, found = fundamentals_of_plane(np.eye(3), some, weights, pairs, 4.0 * BAND * sigma)
+    F, _, found = homography.fundamentals_of_plane(np.eye(3), some, weights, pairs, 4.0 * BAND * sigma)
     f: F64 = F[int(np.argmax(found[:, 0]))].copy()
     for gate in (4.0, 2.0, 1.5):
         _refine_translation(f, points, gate * 4.0 * sigma)
@@ -373,19 +353,20 @@ def homography_inlier_ratio(
 ) -> float:
     """The largest fraction of the matches (N, 2) of F that one homography maps to within ``tolerance_px``.
 
-    The best of 200 planes through three matches is fitted again to its inliers until they stay the same.
-    Fewer than 5 matches always have a homography.
+    The best of 200 planes through three matches, fitted again to its inliers; 1 for fewer than 5 matches.
     """
     n = len(xy1)
     if n < 5:
         return 1.0
-    chosen = rng.permutation(n)[:SUBSET]
+    chosen = rng.permutation(n)[: homography.SUBSET]
     # A plane with a quarter of the matches is found with 96 %.
     triples = np.argsort(rng.random((200, min(len(chosen), 50))), axis=1)[:, :3]
     offsets = rng.integers(0, len(chosen), (200, 1))
     triples = chosen[(triples + offsets) % len(chosen)]
     smallest_area = 1e-4 * float(np.ptp(xy1, axis=0).max()) ** 2
-    planes = induced_homographies(unit_norm(F), epipoles(F)[1], np.hstack([xy1, xy2]), triples, smallest_area)
+    planes = homography.induced_homographies(
+        unit_norm(F), epipoles(F)[1], np.hstack([xy1, xy2]), triples, smallest_area
+    )
     moved = dehomogenize(homogenize(xy1[chosen]) @ planes.swapaxes(1, 2))
     counts = (np.sum((moved - xy2[chosen]) ** 2, axis=2) < tolerance_px**2).sum(axis=1)
     H = planes[counts.argmax()] if len(planes) else np.eye(3)

@@ -66,9 +66,8 @@ def depth(P: F64, X: F64) -> F64:
 def orient_signs(P: F64, X: F64, view: I64, point: I64) -> tuple[F64, F64, float]:
     """Signs of cameras and points that make the projective depths w of P X = w (u, v, 1) positive.
 
-    Starts from the view with most observations; then the sign of each point and of each camera is that of the
-    majority of its observations, so that a few wrong matches do not spread. Also returns the fraction of the
-    observations with positive depth (Hartley, "Chirality", IJCV 26(1), 1998, theorem 17).
+    From the view with most observations on, each sign is that of the majority of its observations. Also
+    returns the fraction with positive depth (Hartley, "Chirality", IJCV 26(1), 1998, theorem 17).
     """
     w = np.sign(np.einsum("kj,kj->k", P[view, 2], X[point]))
     views, points = np.zeros(len(P)), np.zeros(len(X))

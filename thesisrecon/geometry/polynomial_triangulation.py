@@ -18,8 +18,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, require_finite, require_shapes
-from thesisrecon.geometry.conditioning import checked_unit
-from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix
 from thesisrecon.geometry.triangulation import sort_by_point, triangulate_linear
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 
@@ -70,10 +69,7 @@ def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
 
 @kernel
 def _roots_in_unit_interval(c: F64, roots: F64) -> int:
-    """Fill roots (8,) with the real roots in [-1, 1] at which c (7,) changes sign; return their number.
-
-    The roots of each derivative divide the interval into pieces on which the next lower one is monotone.
-    """
+    """Fill roots (8,) with those of c (7,) in [-1, 1] between the roots of its derivative; their number."""
     d = empty(_DEGREE + 1)
     cuts = empty(_DEGREE + 2)
     found = 0

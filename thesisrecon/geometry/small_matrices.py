@@ -62,10 +62,7 @@ def solve_positive(A: F64, b: F64) -> F64 | None:
 
 @kernel
 def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
-    """Solve (H + damping diag H) step = -g by Cholesky factorisation, inside kernels.
-
-    False if the damped matrix is not positive definite.
-    """
+    """Solve (H + damping diag H) step = -g by Cholesky factorisation in kernels; False if not positive."""
     n = len(g)
     L = zeros((n, n))
     floor = 0.0
@@ -100,11 +97,7 @@ def solve_damped(H: F64, g: F64, damping: float, step: F64) -> bool:
 
 @kernel
 def orthogonalize_columns(A: F64, V: F64) -> None:
-    """Make the columns of A (m, n) orthogonal in place by one-sided Jacobi rotations (Hestenes 1958).
-
-    A becomes A V with the right singular vectors V (n, n); column lengths are the singular values, not
-    sorted.
-    """
+    """Make A (m, n) in place A V with orthogonal columns, V (n, n), by Jacobi rotations (Hestenes 1958)."""
     m, n = A.shape
     V[:] = 0.0
     for p in range(n):

@@ -23,7 +23,7 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, require_finite, require_shapes
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry.conditioning import checked_inverse, checked_unit
+from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit
 from thesisrecon.records import Similarity
 
 Group = Literal["projective", "affine", "metric", "euclidean"]

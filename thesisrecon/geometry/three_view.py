@@ -11,8 +11,14 @@ import numpy as np
 
 from thesisrecon.arrays import F64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.conditioning import checked_unit, unit_norm, unit_tensor
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.homogeneous import (
+    checked_unit,
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    unit_norm,
+    unit_tensor,
+)
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
 _SKEW = cross_matrix(np.array([0.31, 0.17, 0.53]))

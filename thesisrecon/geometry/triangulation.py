@@ -14,8 +14,7 @@ import numpy as np
 from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.conditioning import normalizing_transform, unit_norm
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
 from thesisrecon.geometry.small_matrices import orthogonalize_columns
 
 PASSES = 10
@@ -152,10 +151,7 @@ SortedPixels = tuple[I64, I64, F64]
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
-    """Triangulate observations in any order by the linear method: unit points (n_points, 4).
-
-    Zeros for fewer than two observations, or observations from one centre only.
-    """
+    """Linear triangulation of observations in any order: unit points (n_points, 4), zeros from one centre."""
     if not (point[1:] >= point[:-1]).all():
         order = np.argsort(point, kind="stable")
         view, point, xy = view[order], point[order], xy[order]

@@ -1,7 +1,7 @@
 """Section 3.6: two views: F, epipoles and epipolar lines, Sampson distances, homographies, canonical cameras.
 
 x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, F' e2 = 0. Homographies are
-those of a plane (3.6.4) and of matches, with the test for parallax (section 5.5).
+those of a plane (3.6.4) and of matches, with the test for parallax.
 """
 
 from __future__ import annotations
@@ -11,8 +11,15 @@ import numpy as np
 from thesisrecon.arrays import F64, require_finite, require_shapes
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.conditioning import checked_unit, normalizing_transform, unit_norm
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
+from thesisrecon.geometry.homogeneous import (
+    checked_unit,
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    normalizing_transform,
+    unit_norm,
+    unit_normals,
+)
 
 
 def _check(F: F64, caller: str) -> None:
@@ -80,11 +87,7 @@ def _gradients(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
 
 def sampson_residuals(F: F64, xy1: F64, xy2: F64) -> F64:
-    """Signed Sampson distances (N,) (5.4).
-
-    To first order the distance of (x1, y1, x2, y2) to the nearest exact match, with the standard deviation of
-    one image coordinate (5.3).
-    """
+    """Signed Sampson distances (N,) (5.4): to the nearest exact match to first order, of the noise (5.3)."""
     g2, g1 = _gradients(F, xy1, xy2)
     return _algebraic_residuals(F, xy1, xy2) / np.sqrt(g1 + g2)
 
@@ -221,7 +224,7 @@ def homography_sampson_residuals(H: F64, xy1: F64, xy2: F64) -> F64:
 def require_parallax_of_matches(
     F: F64, xy1: F64, xy2: F64, *, at_infinity: F64 | None = None, advice: str = ""
 ) -> None:
-    """Raise ``StageFailure`` if one homography explains the N >= 4 inliers of F (section 5.5).
+    """Raise ``StageFailure`` if one homography explains the N >= 4 inliers of F.
 
     With ``at_infinity``, the homography of the plane at infinity of known cameras, a plane has parallax.
     Without it, matches that are no inliers of F are refused too, as of images in the other order.

@@ -15,7 +15,7 @@ from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.matching._prepared import MapAll, PreparedImage, select_found
 from thesisrecon.matching.track_alignment import AFFINE_STD, MIN_CORRELATION, align_corners
-from thesisrecon.optimize.bundle.observations import cached_pair_order
+from thesisrecon.optimize.bundle.projection import cached_pair_order
 from thesisrecon.records import Matches, Tracks, TwoView
 
 MERGE_PX = 1.0  # default distance up to which positions become one corner: their noise from pair to pair

@@ -31,9 +31,9 @@ from thesisrecon.optimize.bundle.metric import (
     MetricBundleResult,
     refine_metric_bundle,
 )
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.scatter import LinearisedFit, linearise_fit, point_blocks
-from thesisrecon.optimize.noise import best_huber_width, noise_from_distances
+from thesisrecon.optimize.least_squares import best_huber_width, noise_from_distances
 from thesisrecon.records import IntrinsicsPrior
 
 MIN_OBSERVATIONS = 40

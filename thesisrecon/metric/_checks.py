@@ -26,17 +26,12 @@ from thesisrecon.metric._model import (
 )
 from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
 from thesisrecon.metric._uncertainty import USUAL_INFLATION, Intervals
-from thesisrecon.optimize.bundle.identifiability import (
-    CalibrationProblem,
-    UpgradedCameras,
-    excess_equations,
-    identifiability_report,
-)
+from thesisrecon.optimize.bundle import identifiability
+from thesisrecon.optimize.bundle.identifiability import CalibrationProblem, UpgradedCameras
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_pose
-from thesisrecon.optimize.noise import MAD_FACTOR, noise_from_distances
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
+from thesisrecon.optimize.least_squares import MAD_FACTOR, noise_from_distances
 from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, SelfCalibration, common_points
 
 MIN_OBSERVATIONS = 30
@@ -142,10 +137,8 @@ class Join(NamedTuple):
 def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
     """Find the two parts of the images whose common tracks agree least with the model; None without any.
 
-    Matches between similar sides of an object can join two parts whose own matches are right. Such a join is
-    an edge of the maximum spanning tree of the views; weights are common inliers times their share of the
-    common tracks. Only ``near`` observations (K,) count, by :func:`triangulable_observations`: points
-    of nearly coincident cameras are never inliers.
+    Matches between similar sides of an object can join two parts whose own matches are right: an edge of the
+    maximum spanning tree of the views, weighted by common inliers times their share.
     """
     t, views = model.tracks, np.flatnonzero(model.registered)
     k = np.flatnonzero(near)
@@ -222,8 +215,7 @@ def self_check(
 ) -> tuple[dict[str, float], list[str], list[str]]:
     """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
 
-    A limitation is a deviation of the images from the camera model that leaves the cameras right.
-    ``intervals`` are the intrinsics of each view as in ``MetricResult``; ``sigmas`` is the gate of inliers.
+    A limitation leaves the cameras right; ``intervals`` as in ``MetricResult``, ``sigmas``: inlier gate.
     """
     views = np.flatnonzero(model.registered).tolist()
     longest = model.sizes[views].max(axis=1)
@@ -339,11 +331,7 @@ def returned_cameras(model: MetricEstimate) -> UpgradedCameras:
 def check_returned(
     model: MetricEstimate, adjustment: MetricAdjustment, motion: Mapping[str, float], intervals: Intervals
 ) -> IdentifiabilityReport:
-    """Check whether the images and the prior determine a model as it is, without adjusting it again.
-
-    ``motion`` are the measures of all cameras, and the focal lengths are known as the ``intervals`` say.
-    Covariances are those of some of the views and observations.
-    """
+    """Check whether images and prior determine a model; the ``intervals`` say how well focals are known."""
     part = runs_of_views(model)
     seen = subsample_inliers(part)
     count = np.bincount(seen.view_index, minlength=len(model.registered))
@@ -363,8 +351,8 @@ def check_returned(
     )  # fmt: skip
     focals = [intervals[v]["focal_px"] for v in views.tolist()]
     std = np.array([focal.std / focal.value for focal in focals])
-    excess = excess_equations(adjustment.prior, model.registered)
+    excess = identifiability.excess_equations(adjustment.prior, model.registered)
     everywhere = np.flatnonzero(model.registered)
     focal = c.intrinsics[c.group[everywhere], FOCAL] / model.sizes[everywhere].max(axis=1)
     motion = {**motion, "focal_long_sides": float(np.median(focal))}
-    return identifiability_report(problem, excess, motion=motion, focal_std=std)
+    return identifiability.identifiability_report(problem, excess, motion=motion, focal_std=std)

@@ -17,6 +17,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import undistort
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import Reconstruction, Similarity
 
@@ -33,10 +34,7 @@ MAX_STD = 0.01
 
 @dataclass(frozen=True)
 class _Points:
-    """Estimates (N, 3) of the same points in two models and their covariances (N, 3, 3).
-
-    ``whole`` (N,) marks those of which both models know the depth.
-    """
+    """Points (N, 3) in two models, covariances (N, 3, 3), and whether (N,) both know the depth."""
 
     a: F64
     b: F64
@@ -107,11 +105,7 @@ def join_all(
 def join_models(
     first: Reconstruction, second: Reconstruction, rng: np.random.Generator
 ) -> Reconstruction | None:
-    """Join two metric models of the same tracks, without a common image, in the world of the first one.
-
-    None if fewer than ``MIN_COMMON`` of their common points agree, if chance explains the agreement, or if
-    the similarity is not determined.
-    """
+    """Join models of the same tracks in the world of the first; None if few points agree, or by chance."""
     numbers = np.flatnonzero(_observed(first, second) & _observed(second, first))
     whole = (first.valid & second.valid)[numbers]
     if len(numbers) < MIN_COMMON or whole.sum() < 3 or not (first.used.any() and second.used.any()):
@@ -163,11 +157,7 @@ def _refined(points: _Points, s: Similarity) -> Similarity:
 
 
 def _log_chance(points: _Points, s: Similarity, agree: B8) -> float:
-    """Logarithm of the expected number of similarities on which as many random points agree.
-
-    A random point agrees if it lies in the ellipsoid of the gate, out of the extent of all points. Three
-    points, of which any may be chosen, determine the similarity.
-    """
+    """Log expected number of similarities on which as many random points, in the extent of all, agree."""
     variance, axes = np.linalg.eigh(points.covariance(s)[agree])
     spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a[points.whole].T), axes)
     gate = 2.0 * SIGMAS * np.sqrt(variance / np.maximum(12.0 * spread, 1e-300))
@@ -179,9 +169,9 @@ def _log_chance(points: _Points, s: Similarity, agree: B8) -> float:
 
 def _std(points: _Points, s: Similarity, agree: B8) -> float:
     """Largest standard deviation of the rotation (rad) and the relative scale."""
-    some, steps = points.select(agree), 1e-4 * np.eye(7)
-    change = [some.whitened(some.moved(s, h)) - some.whitened(some.moved(s, -h)) for h in steps]
-    singular, Vt = np.linalg.svd(np.reshape(change, (7, -1)).T / 2e-4, full_matrices=False)[1:]
+    some = points.select(agree)
+    J = central_differences(lambda step: some.whitened(some.moved(s, step)).ravel(), np.zeros(7))
+    singular, Vt = np.linalg.svd(J, full_matrices=False)[1:]
     std = np.linalg.norm(Vt.T / np.maximum(singular, 1e-300), axis=1)
     return float(std[:4].max())
 
@@ -194,10 +184,7 @@ def _observed(model: Reconstruction, other: Reconstruction) -> B8:
 
 
 def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
-    """Points (N, 3) of a model and their covariances (N, 3, 3) given its cameras.
-
-    A point that is not valid lies at the median depth of the model on the ray of its only observation.
-    """
+    """Points (N, 3) and covariances (N, 3, 3) given the cameras; those seen once at the median depth."""
     assert model.K is not None
     assert model.distortion is not None
     t, place = model.tracks, np.full(model.tracks.n_points, -1)

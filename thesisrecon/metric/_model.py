@@ -11,8 +11,8 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import undistort
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, MetricModel, image_points
 from thesisrecon.optimize.bundle.partial import refine_points
+from thesisrecon.optimize.bundle.projection import MetricCameras, MetricModel, image_points
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
@@ -79,8 +79,7 @@ def with_enough_points(model: MetricEstimate) -> MetricEstimate:
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
     """Select among the points of all ``tracks`` those of the least residuals first; return their numbers too.
 
-    On a surface with relief a corner is not a fixed point: its position changes with the viewing direction.
-    This error is smaller than the noise, but systematic, and bends long sequences of views.
+    A corner of a surface with relief moves with the viewing direction, which bends long sequences of views.
     """
     model = with_tracks(model, tracks)
     t, variance = model.tracks, model.sigma_px**2
@@ -186,10 +185,7 @@ def with_tracks(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
 
 
 def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> MetricEstimate:
-    """The model with principal points more than 3 standard deviations from their mean moved back to it.
-
-    The prior has two minima if the images hardly determine a principal point; that near the mean is tried.
-    """
+    """The model with principal points over 3 standard deviations off, a false minimum, moved back."""
     first = np.unique(model.cameras.group, return_index=True)[1]
     mean, std = prior.mean[first][:, CENTRE], prior.std[first][:, CENTRE]
     intrinsics = model.cameras.intrinsics.copy()
@@ -264,8 +260,7 @@ def upgraded_model(
 ) -> MetricEstimate | None:
     """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras remain.
 
-    Cameras C = K^-1 P H further than 0.3 from a scaled rotation (Frobenius norm of 3 C C' / tr(C C') - I) are
-    left out and resected again.
+    Cameras C = K^-1 P H further than 0.3 from a scaled rotation (3 C C' / tr(C C') - I) are left out.
     """
     views = np.flatnonzero(reconstruction.registered)
     H = upgrade.metric_from_projective

@@ -14,25 +14,13 @@ from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice, counted
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.triangulation import pose_from_three_points
+from thesisrecon.metric import _model
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment
-from thesisrecon.metric._model import (
-    EARLY_SIGMAS,
-    K1,
-    LATE_SIGMAS,
-    MANY_VIEWS,
-    WIDTH,
-    MetricEstimate,
-    inlier_ratios,
-    normalized_observations,
-    restrict_points,
-    retriangulate_tracks,
-    seen_views,
-)
+from thesisrecon.metric._model import EARLY_SIGMAS, LATE_SIGMAS, MANY_VIEWS, MetricEstimate, restrict_points
 from thesisrecon.optimize.bundle.partial import refine_pose
-from thesisrecon.optimize.ransac import Budget, draw_samples
-from thesisrecon.optimize.robust_resection import resect_calibrated
+from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
 
-WITHOUT_K2_K3 = np.arange(WIDTH) <= K1
+WITHOUT_K2_K3 = np.arange(_model.WIDTH) <= _model.K1
 """k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
 MIN_POINTS = 15
 """Points of the model that a missing camera must see, unless other matches confirm its pose."""
@@ -57,7 +45,7 @@ def _pose_and_focal(
         table = model.cameras.intrinsics.copy()
         table[row, 0] *= zoom
         cameras = replace(model.cameras, intrinsics=table)
-        normalized = normalized_observations(cameras, t.view_index[k], t.xy[k])
+        normalized = _model.normalized_observations(cameras, t.view_index[k], t.xy[k])
         threshold = threshold_px / table[row, 0]
         # The nearest of the tried focals may be some per cent off: widen the gate.
         threshold = max(threshold, 0.01) if len(zooms) > 1 else threshold
@@ -74,7 +62,7 @@ def register_missing_cameras(
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Register missing and inconsistent cameras; return the model, and the reasons of those that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
-    suspects = model.registered & (inlier_ratios(model) < MIN_INLIER_RATIO)
+    suspects = model.registered & (_model.inlier_ratios(model) < MIN_INLIER_RATIO)
     if suspects.any() and (model.registered & ~suspects).sum() >= 3:
         model, rejected = _register_again(model, adjustment, rng, suspects)
     return model, rejected
@@ -84,7 +72,7 @@ def _grow(
     model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator, allowed: B8
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Triangulate, resect ``allowed`` views and adjust until the inlier ratio stops growing."""
-    model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
+    model = _model.retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
     rows = rows_of_views(model.tracks.view_index, model.tracks.n_views)
     share, rounds, adjusted = 0.0, 0, model.registered
     while True:
@@ -97,11 +85,11 @@ def _grow(
             model = _adjust_window(model, adjustment, joined)
             continue
         if joined.any():
-            model = retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
+            model = _model.retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
         iterations = 12 if model.registered.sum() > MANY_VIEWS else 6
         model = adjustment.run(model, free=WITHOUT_K2_K3, iterations=iterations)[0]
         # A wide gate in the first round readmits observations that a wrong model had excluded.
-        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS if rounds else EARLY_SIGMAS)
+        model = _model.retriangulate_tracks(model, sigmas=LATE_SIGMAS if rounds else EARLY_SIGMAS)
         now = float(model.inlier.mean())
         rounds, gain, share, adjusted = rounds + 1, now - share, now, model.registered
         if not joined.any() and rounds > 1 and (gain < 0.003 or rounds >= 6):
@@ -112,14 +100,14 @@ def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B
     """Triangulate the points of some views and adjust both; other cameras and shared intrinsics are fixed."""
     t, cameras = model.tracks, model.cameras
     points = np.unique(t.point_index[views[t.view_index]])
-    part = retriangulate_tracks(restrict_points(model, points), sigmas=EARLY_SIGMAS)
+    part = _model.retriangulate_tracks(restrict_points(model, points), sigmas=EARLY_SIGMAS)
     if part.inlier.sum() < MIN_OBSERVATIONS:
         return model
     assert cameras.shared is not None
     inside, outside = (cameras.shared[cameras.group[model.registered & v]] for v in (views, ~views))
     own = np.array([not np.isin(a, b).any() for a, b in zip(inside.T, outside.T, strict=True)])
     part = adjustment.run(part, free=WITHOUT_K2_K3 & own, fixed=~views, iterations=6)[0]
-    part = retriangulate_tracks(
+    part = _model.retriangulate_tracks(
         replace(part, sigma_px=model.sigma_px, loss_sigmas=model.loss_sigmas, tail=model.tail),
         sigmas=LATE_SIGMAS,
     )
@@ -141,7 +129,7 @@ def _register_missing(
     reached = missing & (counts >= 0.2 * np.array([len(k) for k in rows]))
     rejected: dict[int, str] = {}
     few = missing & (counts < MIN_POINTS)
-    parts = (reached, missing & ~reached) if seen_views(t) > MANY_VIEWS else (missing,)
+    parts = (reached, missing & ~reached) if _model.seen_views(t) > MANY_VIEWS else (missing,)
     for views in (*(part & ~few for part in parts), few):
         for view in sorted(np.flatnonzero(views).tolist(), key=lambda v: -counts[v]):
             added = _register(model, view, rows[view], rng)
@@ -194,13 +182,13 @@ def _register_again(
     model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
     model, _ = _grow(model, adjustment, rng, none)
     model, rejected = _grow(model, adjustment, rng, ~none)
-    share = inlier_ratios(model)
+    share = _model.inlier_ratios(model)
     wrong = model.registered & (share < MIN_INLIER_RATIO)
     if wrong.any():
         for view in np.flatnonzero(wrong):
             rejected[int(view)] = Notice("contradicted-by-others", share[view])
         model = replace(model, registered=model.registered & ~wrong)
-        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
+        model = _model.retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected
 
 
@@ -269,9 +257,7 @@ def confirmed_pose(
 ) -> tuple[F64, F64] | None:
     """R and t of a camera that sees few points of the model, None if points or other matches contradict it.
 
-    Matches to registered images that are no points of the model determine the pose by epipolar geometry,
-    except for the length of the translation, which few points determine: a row of images continues beyond a
-    weak link. ``rows`` are its observations.
+    Its other matches determine the pose up to the length of the translation, which needs few points only.
     """
     evidence = _evidence(model, rows)
     if len(evidence.X) < FEWEST_POINTS or len(evidence.theirs) < MIN_MATCHES:
@@ -300,7 +286,7 @@ def _evidence(model: MetricEstimate, rows: I64) -> _Evidence:
     k, own[t.point_index[rows[~known]]] = rows[known], rows[~known]
     other = np.flatnonzero(model.registered[t.view_index] & (own[t.point_index] >= 0))
     rays = (
-        homogenize(normalized_observations(cameras, t.view_index[i], t.xy[i]))
+        homogenize(_model.normalized_observations(cameras, t.view_index[i], t.xy[i]))
         for i in (k, own[t.point_index[other]], other)
     )
     of_points, of_matches, theirs = rays

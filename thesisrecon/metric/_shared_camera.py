@@ -27,8 +27,7 @@ from thesisrecon.metric._model import (
 )
 from thesisrecon.metric._uncertainty import MIN_BLOCKS, USUAL_INFLATION
 from thesisrecon.optimize.bundle.metric import MetricBundleResult, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras, move_poses
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations, move_poses
 from thesisrecon.optimize.bundle.scatter import BlockScatter, linearise_fit
 from thesisrecon.records import IntrinsicsPrior
 
@@ -119,9 +118,8 @@ def focal_std_of_deviations(
 ) -> float:
     """Relative standard deviation of the focal lengths by deviations of the images from the camera model.
 
-    Images may have own aspect ratios and skews, as unordered images with a rolling shutter do; with up to
-    six images or after a ``critical`` motion own principal points too. These are then as large as
-    possible if the images have ``contradicted`` one camera. The images of a video may show a rolling shutter.
+    Images may have own aspect ratios and skews; with up to six images or after a ``critical`` motion own
+    principal points too, as large as possible if ``contradicted``. Videos may show a rolling shutter.
     """
     assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
@@ -140,12 +138,10 @@ def _variance_by_own_values(
 ) -> float:
     """Variance of the focal lengths (log) if the images have own values in ``columns``.
 
-    The own values are normal about the shared ones with the standard deviation s ``OWN_STD``; each s of the
-    ``scales`` has the same prior probability, and the result is the mean over the posterior one. In the
-    linearised adjustment let l be the eigenvalues of the information on the own values in units of
-    ``OWN_STD``, h their gradient and b the response of a focal length along the eigenvectors. With
-    w = s^2 / (1 + s^2 l) the logarithm of the marginal likelihood is sum (w h^2 - log(1 + s^2 l)) / 2, and
-    the focal length has the mean sum w b h and the variance sum w b^2.
+    The own values are normal about the shared ones with ``OWN_STD`` times one of the ``scales``, averaged
+    over its posterior; see bundle-adjustment.md. With eigenvalues l of the information on the own values,
+    their gradient h, the response b of a focal length and w = s^2 / (1 + s^2 l): log likelihood sum (w h^2 -
+    log(1 + s^2 l)) / 2.
     """
     noise = adjustment.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
     fit = linearise_fit(*_per_view(model, adjustment, columns, own_std=OWN_STD), noise)
@@ -172,8 +168,7 @@ def _variance_by_own_values(
 def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
     """Largest change of a focal length (log) by the readout time of a rolling shutter; 0 without evidence.
 
-    A point in row y was seen when its camera had moved by (y / height - 1/2) of the readout, in times between
-    consecutive images. This displacement is subtracted from the observations.
+    A point in row y is seen when the camera has moved by (y / height - 1/2) of the readout to the next image.
     """
     t, index = model.tracks, np.flatnonzero(model.inlier)
     view = t.view_index[index]
@@ -383,11 +378,7 @@ def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustmen
 def inconsistent_principal_point(
     model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter
 ) -> list[str]:
-    """Detect a deformed model: a moved principal point and blocks that disagree (those of crops agree).
-
-    The variance ratio of blocks over points is 1.5 to 5 for correct models of real images, 11 to 28 if
-    deformed.
-    """
+    """Detect a deformed model: a moved principal point and blocks that disagree (right ones: up to 5)."""
     views = np.flatnonzero(model.registered)
     if scatter.blocks < MIN_BLOCKS or not scatter.overdispersion > 8.0:
         return []

@@ -22,7 +22,7 @@ from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
-from thesisrecon.optimize.noise import MAD_FACTOR, student_factor
+from thesisrecon.optimize.least_squares import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
 
 USUAL_INFLATION = 4.0  # inflation of standard deviations if it cannot be measured; measured values are 2 to 5
@@ -118,8 +118,7 @@ def find_outliers(value: F64, std: F64) -> B8:
 def estimate_spread(value: F64, std: F64, total: F64) -> float:
     """Estimate the standard deviation tau of true values behind noisy ones by REML (Harville 1977).
 
-    ``std`` is their noise, ``total`` noise and model error together. tau is at least 0.3 times the median
-    noise, since a few values can agree by chance; inf for fewer than two values.
+    At least 0.3 times the median noise ``std``; ``total`` contains the model error; inf for one value.
     """
     if len(value) < 2:
         return np.inf
@@ -229,8 +228,7 @@ def widen_unverified_focals(intervals: Intervals, focal_std: F64) -> Intervals:
 def widen_by_camera_model(intervals: Intervals, difference: tuple[float, float], misfit: float) -> Intervals:
     """Add the differences to a richer camera model to the standard deviations, or scale these by the misfit.
 
-    ``difference`` are those of the focal lengths and of the principal points, over the focal length. If both
-    are 0, variances are multiplied by ``misfit``, chi-square per degree of freedom (Birge ratio).
+    Of focals, and principal points over the focal; if 0, variances times ``misfit`` (Birge ratio).
     """
     moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
     factor = 1.0 if any(difference) else np.sqrt(misfit)
@@ -250,8 +248,7 @@ def pose_std(
 ) -> F64:
     """Standard deviations (V, 6) of rotations and centres as in ``MetricResult.pose_std``.
 
-    The errors that the stated ``intervals`` allow for move the poses too. Fixed aspect ratio, skew and
-    decentring may be wrong by the floor of the camera model.
+    They contain the errors of the stated ``intervals`` and of a fixed aspect, skew and decentring.
     """
     number = poses.number
     std = np.sqrt(np.diag(poses.covariance))

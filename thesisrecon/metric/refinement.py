@@ -13,63 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.metric._adjustment import (
-    FOCAL_AND_CENTRE,
-    MAX_CHANGE,
-    MIN_OBSERVATIONS,
-    SETTLED,
-    MetricAdjustment,
-    camera_differences,
-    differences_of_images,
-    remaining_cost,
-    richer_models,
-    with_initial_gate,
-    with_own_values,
-)
+from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
+from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import check_returned, returned_cameras, self_check
-from thesisrecon.metric._model import (
-    EARLY_SIGMAS,
-    K1,
-    LATE_SIGMAS,
-    MIN_ANGLE,
-    MetricEstimate,
-    residual_norms,
-    retriangulate_tracks,
-    select_inliers,
-    truncated_cost,
-    upgraded_model,
-    with_enough_points,
-    with_expected_centres,
-    with_precise_points,
-    with_tracks,
-)
+from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, register_missing_cameras
-from thesisrecon.metric._shared_camera import (
-    SharedCameraTest,
-    check_shared_cameras,
-    contradicted_focal_priors,
-    focal_std_of_deviations,
-    inconsistent_principal_point,
-)
-from thesisrecon.metric._uncertainty import (
-    PerCameraEstimates,
-    apply_hierarchical_prior,
-    estimate_hierarchical_prior,
-    focal_shrinkage,
-    intrinsic_intervals,
-    per_camera_estimates,
-    pose_std,
-    widen_by_camera_model,
-    widen_unverified_focals,
-)
-from thesisrecon.optimize.bundle.identifiability import excess_noise, measure_motion, nearest_critical_motion
-from thesisrecon.optimize.bundle.scatter import (
-    BlockScatter,
-    LinearisedFit,
-    block_scatter,
-    pose_uncertainty,
-)
-from thesisrecon.optimize.noise import noise_from_distances
+from thesisrecon.optimize.bundle import identifiability
+from thesisrecon.optimize.bundle.scatter import BlockScatter, LinearisedFit, block_scatter, pose_uncertainty
+from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import (
     IntrinsicsPrior,
     MetricResult,
@@ -90,12 +41,12 @@ NOT_EXPLAINED = (
 class _Finished(NamedTuple):
     model: MetricEstimate
     adjustment: MetricAdjustment
-    own: PerCameraEstimates
+    own: _uncertainty.PerCameraEstimates
     fit: LinearisedFit
     scatter: BlockScatter
 
 
-_Settled = tuple[_Finished, SharedCameraTest, tuple[str, ...], tuple[float, float]]
+_Settled = tuple[_Finished, _shared_camera.SharedCameraTest, tuple[str, ...], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -113,7 +64,7 @@ class MetricRefinement:
         if not models:
             raise _no_candidate(prior, len(trials))
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
-        costs = np.array([truncated_cost(m, gate) for m in models])
+        costs = np.array([_model.truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
@@ -127,25 +78,27 @@ def _assess(
     """State the intervals of a final model with all ``tracks``, and check it."""
     final, sharing, enlarged, difference = settled
     model, adjustment, own, fit, scatter = final
-    shrinkage = focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
-    intervals = intrinsic_intervals(model, adjustment, scatter, shrinkage)
-    intervals = widen_unverified_focals(intervals, sharing.focal_std)
-    intervals = widen_by_camera_model(intervals, difference, sharing.misfit)
-    complete = with_tracks(model, tracks)
-    motion = measure_motion(returned_cameras(complete))
-    critical = nearest_critical_motion(motion)[1] < 1.0
-    deviations = focal_std_of_deviations(model, adjustment, critical=critical, contradicted=bool(enlarged))
-    intervals = widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
+    shrinkage = _uncertainty.focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
+    intervals = _uncertainty.intrinsic_intervals(model, adjustment, scatter, shrinkage)
+    intervals = _uncertainty.widen_unverified_focals(intervals, sharing.focal_std)
+    intervals = _uncertainty.widen_by_camera_model(intervals, difference, sharing.misfit)
+    complete = _model.with_tracks(model, tracks)
+    motion = identifiability.measure_motion(returned_cameras(complete))
+    critical = identifiability.nearest_critical_motion(motion)[1] < 1.0
+    deviations = _shared_camera.focal_std_of_deviations(
+        model, adjustment, critical=critical, contradicted=bool(enlarged)
+    )
+    intervals = _uncertainty.widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
     report = check_returned(model, adjustment, motion, intervals)
-    poses = pose_std(model, pose_uncertainty(fit), scatter, intervals)
+    poses = _uncertainty.pose_std(model, pose_uncertainty(fit), scatter, intervals)
     model = complete
     check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted.
     start = [] if enlarged else _contradiction(calibration)
     failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
-    failed_checks += [*contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
-    failed_checks += inconsistent_principal_point(model, adjustment, scatter)
-    if deviations > MAX_CHANGE:
+    failed_checks += [*_shared_camera.contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
+    failed_checks += _shared_camera.inconsistent_principal_point(model, adjustment, scatter)
+    if deviations > _adjustment.MAX_CHANGE:
         failed_checks.append(Notice("focal-by-camera-model", deviations))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
@@ -161,47 +114,46 @@ def _contradiction(calibration: SelfCalibration) -> list[str]:
     if report is None or not report.prior_contradicted:
         return []
     views = counted(int((calibration.K[:, 0, 0] > 0.0).sum()), "image")
-    return [Notice("start-contradicts-prior", views, excess_noise(report.evidence))]
+    return [Notice("start-contradicts-prior", views, identifiability.excess_noise(report.evidence))]
 
 
 def _start(
     reconstruction: Reconstruction, upgrade: Upgrade, adjustment: MetricAdjustment
 ) -> MetricEstimate | None:
     """Upgrade the core cameras and adjust them on projective inliers while the gate narrows."""
-    model = upgraded_model(reconstruction, upgrade, adjustment.prior)
+    model = _model.upgraded_model(reconstruction, upgrade, adjustment.prior)
     if model is None:
         return None
-    model = with_enough_points(model)
+    model = _model.with_enough_points(model)
     # Without distortion the noise is overestimated: keep the gate at least as wide as before.
     gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
-    model = with_initial_gate(model)
+    model = _adjustment.with_initial_gate(model)
     for _ in range(3):
         if model.valid.sum() < 20:
             return None
-        model = select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
-        if model.inlier.sum() < MIN_OBSERVATIONS:
+        model = _model.select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
+        if model.inlier.sum() < _adjustment.MIN_OBSERVATIONS:
             return None
-        model = gentle.run(model, free=FOCAL_AND_CENTRE, iterations=15)[0]
-    return select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
+        model = gentle.run(model, free=_adjustment.FOCAL_AND_CENTRE, iterations=15)[0]
+    return _model.select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
 
 def settle_camera_model(simple: _Finished) -> _Settled:
     """Choose between the shared camera model and richer ones if the images contradict shared intrinsics.
 
-    A richer model, with one value per image, is adopted if it predicts held-out observations far better. If
-    it is not adopted and hardly changes the cameras, the contradictions are only limitations; the returned
-    differences of focal lengths and principal points, over the focal length, then widen the intervals.
+    One value per image is adopted if it predicts held-out observations far better. If it hardly changes the
+    cameras, contradictions are limitations, and the differences, over the focal, widen the intervals.
     """
-    chosen, sharing = simple, check_shared_cameras(*simple[:2])
+    chosen, sharing = simple, _shared_camera.check_shared_cameras(*simple[:2])
     limitations, difference = tuple[str, ...](), (0.0, 0.0)
-    for columns in richer_models(sharing.contradicted, simple[1].prior):
+    for columns in _adjustment.richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
-        rich = finish_metric(*with_own_values(simple.model, simple.adjustment, columns))
-        if remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
-            chosen, sharing = rich, check_shared_cameras(*rich[:2])
-            limitations, difference = (differences_of_images(rich.model, columns),), (0.0, 0.0)
-        elif (change := camera_differences(chosen.model, rich.model)).harmless:
+        rich = finish_metric(*_adjustment.with_own_values(simple.model, simple.adjustment, columns))
+        if _adjustment.remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
+            chosen, sharing = rich, _shared_camera.check_shared_cameras(*rich[:2])
+            limitations, difference = (_adjustment.differences_of_images(rich.model, columns),), (0.0, 0.0)
+        elif (change := _adjustment.camera_differences(chosen.model, rich.model)).harmless:
             difference = max(difference[0], change.focal), max(difference[1], change.principal_point)
     if sharing.failed_checks and any(difference):
         limitations += tuple(f"{fact}. {NOT_EXPLAINED}" for fact, _ in sharing.found)
@@ -213,33 +165,35 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     """Adjust everything, then again with the noise that blocks of the scene show and a hierarchical prior."""
     model = _iterate_inliers(model, adjustment)
     scatter = block_scatter(adjustment.linearised(model))
-    own = per_camera_estimates(model, adjustment, scatter)
+    own = _uncertainty.per_camera_estimates(model, adjustment, scatter)
     assert model.cameras.shared is not None
-    hierarchical = estimate_hierarchical_prior(own, model.cameras.shared)
+    hierarchical = _uncertainty.estimate_hierarchical_prior(own, model.cameras.shared)
     # Correlated errors do not average out: without the inflation they would overrule every prior.
     adjustment = replace(adjustment, inflation=scatter.inflation)
     if hierarchical is not None:
-        model, adjustment = apply_hierarchical_prior(model, adjustment, hierarchical)
-    model = _iterate_inliers(with_expected_centres(model, adjustment.prior), adjustment)
+        model, adjustment = _uncertainty.apply_hierarchical_prior(model, adjustment, hierarchical)
+    model = _iterate_inliers(_model.with_expected_centres(model, adjustment.prior), adjustment)
     fit, alone = adjustment.linearised(model), replace(adjustment, hierarchical=None)
     scatter = block_scatter(fit)
     single = scatter if hierarchical is None else block_scatter(alone.linearised(model))
-    return _Finished(model, adjustment, per_camera_estimates(model, alone, single), fit, scatter)
+    return _Finished(model, adjustment, _uncertainty.per_camera_estimates(model, alone, single), fit, scatter)
 
 
 def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
     """Adjust and triangulate until the inliers stay, then adjust to the minimum of these very inliers."""
-    gate = {"sigmas": LATE_SIGMAS, "min_angle": MIN_ANGLE}
+    gate = {"sigmas": LATE_SIGMAS, "min_angle": _model.MIN_ANGLE}
     for _ in range(4):
         before = model.inlier
         model = adjustment.run(model)[0]
-        model = retriangulate_tracks(model, sigmas=LATE_SIGMAS)
+        model = _model.retriangulate_tracks(model, sigmas=LATE_SIGMAS)
         if np.count_nonzero(before != model.inlier) < 0.002 * len(before):
             break
     # Noise and inliers change less each time.
     for _ in range(2):
-        model = adjustment.run(select_inliers(model, **gate))[0]
-    return adjustment.run(select_inliers(model, **gate), settled=SETTLED, keep_noise=True)[0]
+        model = adjustment.run(_model.select_inliers(model, **gate))[0]
+    return adjustment.run(_model.select_inliers(model, **gate), settled=_adjustment.SETTLED, keep_noise=True)[
+        0
+    ]
 
 
 def _adjust_to_precise_points(
@@ -250,7 +204,7 @@ def _adjust_to_precise_points(
         return model
     before = np.empty(0, dtype=np.int64)
     for _ in range(5):
-        model, points = with_precise_points(model, tracks)
+        model, points = _model.with_precise_points(model, tracks)
         model = adjustment.run(model)[0]
         if len(np.intersect1d(points, before)) >= 0.98 * len(points):
             break
@@ -276,7 +230,7 @@ def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> Recon
     K = np.where(registered[:, None, None], model.cameras.K, 0.0)
     distortion = np.where(registered[:, None], model.cameras.intrinsics[model.cameras.group, K1:], 0.0)
     X = np.where(model.valid[:, None], np.column_stack([model.X, np.ones(len(model.X))]), 0.0)
-    norms = residual_norms(model)
+    norms = _model.residual_norms(model)
     sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
     seen = (registered, model.valid, model.inlier, model.tracks, model.sizes)
     return Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion).with_reasons(MIN_POINTS)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: one damping loop for every problem, and dense solvers for small ones."""
+"""Levenberg-Marquardt: one damping loop, dense solvers of small problems; robust losses and noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 
 State = TypeVar("State")
@@ -29,24 +29,13 @@ _MANY = 1200
 class _LinearSystem(Protocol[StepOut]):
     """Normal equations at one state.
 
-    ``solve`` returns the damped step, its predicted decrease in cost (gain), and the part due to the cameras
-    (in small problems all of it); None if the system is singular.
+    ``solve`` returns the damped step, its gain, and the part of the cameras (or all); None if singular.
     """
 
     @property
     def cost(self) -> float: ...
 
     def solve(self, damping: float) -> tuple[StepOut, float, float] | None: ...
-
-
-class _Problem(Protocol[State, Step]):
-    """``retract`` moves a state by a step; a ``cost`` that is not finite rejects a state."""
-
-    def linearize(self, state: State) -> _LinearSystem[Step]: ...
-
-    def retract(self, state: State, step: Step) -> State: ...
-
-    def cost(self, state: State) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -65,17 +54,18 @@ class Descent(Generic[State]):
 
 
 def run_levenberg_marquardt(
-    problem: _Problem[State, Step], state: State, *, max_iterations: int, tolerance: float = 1e-10,
+    linearize: Callable[[State], _LinearSystem[Step]], retract: Callable[[State, Step], State],
+    cost_of: Callable[[State], float], state: State, *, max_iterations: int, tolerance: float = 1e-10,
     min_camera_gain: float = 0.0, initial_damping: float = _WEAKEST,
 ) -> Descent[State]:  # fmt: skip
-    """Minimise a problem by Levenberg-Marquardt (6.7).
+    """Minimise a cost by Levenberg-Marquardt (6.7); one that is not finite rejects a state.
 
-    The damping multiplies the diagonal (Marquardt 1963), so that units do not matter and gauge freedoms need
-    no other treatment; it follows Nielsen (IMM-REP-1999-05). It ends when the predicted gain of an undamped
-    step is at most ``tolerance`` relative to the cost, or that of the cameras at most ``min_camera_gain``: in
-    a valley the damping makes steps short.
+    The damping multiplies the diagonal (Marquardt 1963), so that units and gauge freedoms do not matter; it
+    follows Nielsen (IMM-REP-1999-05). It ends when the predicted gain of an undamped step is at most
+    ``tolerance`` relative to the cost, or that of the cameras ``min_camera_gain``: in a valley the damping
+    makes steps short.
     """
-    system = problem.linearize(state)
+    system = linearize(state)
     cost, damping, growth = system.cost, initial_damping, 2.0
     iteration = 0
     while iteration < max_iterations and damping <= _MAX_DAMPING:
@@ -84,8 +74,8 @@ def run_levenberg_marquardt(
         gain, predicted, camera_gain, candidate = -1.0, np.inf, np.inf, state
         if solved is not None:
             step, predicted, camera_gain = solved
-            candidate = problem.retract(state, step)
-            gain = cost - problem.cost(candidate)
+            candidate = retract(state, step)
+            gain = cost - cost_of(candidate)
         small = camera_gain <= min_camera_gain or predicted <= tolerance * cost
         if gain > 0.0 and np.isfinite(gain):
             state, cost = candidate, cost - gain
@@ -95,7 +85,7 @@ def run_levenberg_marquardt(
             if small and growth == 2.0:
                 damping = min(damping, _WEAKEST)
             growth = 2.0
-            system = problem.linearize(state)
+            system = linearize(state)
             cost = system.cost
         elif (small and least) or predicted <= _ROUNDING * cost:
             break
@@ -127,21 +117,8 @@ class DenseSystem:
         return step, gain, gain
 
 
-@dataclass(frozen=True)
-class DenseProblem(Generic[State]):
-    """A problem of functions of its state, with dense normal equations."""
-
-    linearize: Callable[[State], DenseSystem]
-    retract: Callable[[State, F64], State]
-    cost: Callable[[State], float]
-
-
 def invert_information(information: F64) -> F64:
-    """Invert an information matrix, eigenvalues floored relative to the largest; inf if not finite.
-
-    Undetermined directions get a huge variance; the matrix is scaled to a unit diagonal, so that units do not
-    decide which these are.
-    """
+    """Invert an information matrix scaled to a unit diagonal, eigenvalues floored; inf if not finite."""
     if len(information) == 0:
         return np.zeros_like(information)
     if not np.isfinite(information).all():
@@ -173,23 +150,23 @@ def _squared(s: F64) -> tuple[F64, F64]:
     return s, np.ones_like(s)
 
 
-def _difference_jacobian(residual_fn: Callable[[F64], F64], x: F64, residual: F64) -> F64:
-    """Return forward differences (M, D), steps sqrt(eps) (1 + |x|); columns outside the domain are 0."""
-    J = np.zeros((len(residual), len(x)))
-    for d in range(len(x)):
-        h = 1.5e-8 * (1.0 + abs(x[d]))
-        moved = x.copy()
-        moved[d] += h
-        column = (residual_fn(moved) - residual) / h
-        J[:, d] = np.where(np.isfinite(column), column, 0.0)
-    return J
+def central_differences(function: Callable[[F64], F64], x: F64) -> F64:
+    """Derivatives (..., D) of the values of a function by the last axis of x (..., D), one at a time."""
+    if x.shape[-1] == 0:
+        return np.empty((*function(x).shape, 0))
+    steps, columns = 1e-6 * (1.0 + np.abs(x)), []
+    for k in range(x.shape[-1]):
+        shift = steps * (np.arange(x.shape[-1]) == k)
+        change, width = function(x + shift) - function(x - shift), 2.0 * steps[..., k]
+        columns.append(change / width.reshape(*width.shape, *[1] * (change.ndim - width.ndim)))
+    return np.stack(columns, axis=-1)
 
 
 def minimize_residuals(
-    residual_fn: Callable[[F64], F64], x0: F64, *, jacobian: Callable[[F64], F64] | None = None,
+    residual_fn: Callable[[F64], F64], x0: F64, *,
     loss: Callable[[F64], tuple[F64, F64]] = _squared, max_iterations: int = 50, tolerance: float = 1e-10,
 ) -> ResidualMinimum:  # fmt: skip
-    """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt, with forward differences by default.
+    """Minimise 1/2 sum rho(r_m(x)^2) by dense Levenberg-Marquardt with central differences.
 
     States with residuals that are not finite are rejected; such a start is a ``ValueError``.
     """
@@ -198,7 +175,7 @@ def minimize_residuals(
 
     def linearize(x: F64) -> DenseSystem:
         r = residual_fn(x)
-        J = jacobian(x) if jacobian else _difference_jacobian(residual_fn, x, r)
+        J = np.nan_to_num(central_differences(residual_fn, x), posinf=0.0, neginf=0.0)
         rho, weight = loss(r**2)
         return DenseSystem(0.5 * float(rho.sum()), (J.T * weight) @ J, J.T @ (weight * r))
 
@@ -206,11 +183,92 @@ def minimize_residuals(
         r = residual_fn(x)
         return 0.5 * float(loss(r**2)[0].sum()) if np.isfinite(r).all() else np.inf
 
-    problem = DenseProblem(linearize, lambda x, step: x + step, cost_at)
     found = run_levenberg_marquardt(
-        problem, x0, max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3
-    )
+        linearize, lambda x, step: x + step, cost_at, x0,
+        max_iterations=max_iterations, tolerance=tolerance, initial_damping=1e-3,
+    )  # fmt: skip
     x, cost = found.state, found.cost
     residual = residual_fn(x)
     variance = 2.0 * cost / max(len(residual) - len(x0), 1)
     return ResidualMinimum(x, cost, variance * invert_information(linearize(x).hessian), residual)
+
+
+def huber(s: F64, delta: float) -> tuple[F64, F64]:
+    """rho = s below delta^2, 2 delta sqrt(s) - delta^2 above (Huber 1964), and its derivative; convex."""
+    root = np.sqrt(np.maximum(s, delta**2))
+    inside = s <= delta**2
+    return np.where(inside, s, 2.0 * delta * root - delta**2), np.where(inside, 1.0, delta / root)
+
+
+def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
+    """rho = 2 delta^2 (sqrt(1 + s / delta^2) - 1), smooth and convex, and its derivative."""
+    root = np.sqrt(1.0 + s / delta**2)
+    return 2.0 * delta**2 * (root - 1.0), 1.0 / root
+
+
+NORMAL_95 = 1.959963984540054
+"""97.5 % quantile of the normal distribution."""
+# 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
+MAD_FACTOR = 1.4826022185056018
+_RAYLEIGH_MEDIAN = 1.1774
+INLIER_SIGMAS, VARIANCE_OF_INLIERS = 3.0, 0.9494
+"""Residual of an inlier in standard deviations, and the variance of residuals within it."""
+_HUBER_SIGMAS = (3.0, 2.0, 1.5, 1.0)
+
+
+def noise_from_distances(distances: F64) -> float:
+    """Standard deviation of a coordinate from lengths (N,) of residuals: their median by Rayleigh's."""
+    return float(np.median(distances)) / _RAYLEIGH_MEDIAN
+
+
+def student_factor(dof: int) -> float:
+    """Student's 95 % quantile over the normal one; ``dof`` degrees of freedom estimate the noise."""
+    return float(scipy.special.stdtrit(dof, 0.975) / NORMAL_95)
+
+
+def next_inlier_limit(distance: F64, inliers: B8, limit: float, *, unknowns: int) -> float:
+    """Limit of the inliers of the next round: ``INLIER_SIGMAS`` standard deviations of the noise of a fit."""
+    # The median of the inliers alone would be too small, since their limit cuts off the noise.
+    near = distance <= max(2.0 * limit, float(np.median(distance[inliers])))
+    fitted = 2.0 * int(inliers.sum())
+    return float(
+        INLIER_SIGMAS * noise_from_distances(distance[near]) * np.sqrt(fitted / max(fitted - unknowns, 1.0))
+    )
+
+
+def trimmed_noise_scale(residuals: F64, start: float, *, parameters: int = 7) -> float:
+    """Standard deviation of residuals >= 0 within 2.5 standard deviations; ``start`` if these are too few."""
+    sigma = start
+    for _ in range(5):
+        kept = residuals[residuals <= 2.5 * sigma]
+        if len(kept) <= 2 * parameters:
+            return start
+        # The variance of a normal variable trimmed there is 0.911.
+        sigma = float(np.sqrt(kept @ kept / (len(kept) - parameters) / 0.91125))
+    return sigma
+
+
+def best_huber_width(residuals: F64, sigma: float, *, parameters: int = 7) -> float:
+    """The width of Huber's loss with the least expected variance, infinite for least squares.
+
+    The asymptotic variance mean(psi^2) / mean(psi')^2 (Huber 1964; Jaeckel 1971) must fall by more than
+    chance.
+    """
+    n = len(residuals)
+    if n <= 2 * parameters:
+        return np.inf
+    needed = (1.0 + 2.0 / np.sqrt(n)) * n / (n - 2 * parameters)
+    width, least = np.inf, effective_noise(residuals, np.inf) ** 2
+    for k in _HUBER_SIGMAS:
+        variance = effective_noise(residuals, k * sigma) ** 2 * needed
+        if variance < least:
+            width, least = k * sigma, variance
+    return width
+
+
+def effective_noise(residuals: F64, width: float, *, parameters: int = 0) -> float:
+    """Normal noise with which least squares is as uncertain as Huber's loss (Huber, 1973)."""
+    n = len(residuals)
+    psi = np.minimum(residuals, width)
+    straight = max(int(np.count_nonzero(residuals < width)), 1) / n
+    return float(np.sqrt(psi @ psi / max(n - parameters, 1))) / straight

@@ -1,15 +1,23 @@
-"""RANSAC (Fischler and Bolles 1981): samples, rejection, local optimisation, and what chance explains."""
+"""RANSAC (Fischler and Bolles 1981) with local optimisation; robust resection of cameras (section 6.4)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.random import Generator
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.camera import compose_camera, decompose_camera
+from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.geometry.camera_matrix import depth, project
+from thesisrecon.geometry.homogeneous import homogenize, whitened_frame
+from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear, resect_six
+from thesisrecon.optimize.bundle.partial import refine_camera, refine_pose
+from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
 
 # Data on which all models are tried first, and data on which the remaining ones are scored.
 FIRST, SCORED = 48, 2000
@@ -47,21 +55,15 @@ def draw_samples(rng: Generator, count: int, n: int, size: int) -> I64:
 
 
 def search_models(
-    solve: Callable[[I64], F64],
-    squared: Callable[[F64, I64], F64],
-    refit: Callable[[F64, I64], F64],
-    rng: Generator,
-    n: int,
-    size: int,
-    budget: Budget,
-) -> Found | None:
+    solve: Callable[[I64], F64], squared: Callable[[F64, I64], F64], refit: Callable[[F64, I64], F64],
+    rng: Generator, n: int, size: int, budget: Budget,
+) -> Found | None:  # fmt: skip
     """The model of least truncated cost of random samples of ``size`` of n data, each best one refitted.
 
-    ``solve`` makes models (B', ...) of samples (B, size); ``squared`` gives squared distances (B', M) of
-    some data from models, 1 at the threshold; ``refit`` improves one model by its inliers (rows). Models with
-    fewer inliers among the first data than the best one leads to expect are not scored further, as in the
-    sequential test of Matas and Chum (ICCV 2005). The search ends when a sample without outliers was drawn
-    with the confidence of the ``budget``. None without any model.
+    ``solve`` makes models (B', ...) of samples (B, size); ``squared`` gives squared distances (B', M) of some
+    data, 1 at the threshold; ``refit`` improves a model by its inliers (rows). Models with too few inliers
+    among the first data are not scored further (Matas and Chum, ICCV 2005). The search ends when a sample
+    without outliers was drawn with the confidence of the ``budget``. None without any model.
     """
     scored = rng.permutation(n) if n <= SCORED else rng.choice(n, SCORED, replace=False)
     most = max(AT_ONCE // FIRST, 64)
@@ -111,10 +113,214 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
     if hits <= 0.0 or rest <= 0.0:
         return 0.0
     tail = float(scipy.special.betainc(hits, max(rest - hits, 0.0) + 1.0, min(chance, 1.0)))
-    ways = (
-        scipy.special.gammaln(tried + 1.0)
-        - scipy.special.gammaln(free + 1.0)
-        - scipy.special.gammaln(rest + 1.0)
-        + np.log(max(rest, 1.0))
-    )
+    gammaln = scipy.special.gammaln
+    ways = gammaln(tried + 1.0) - gammaln(free + 1.0) - gammaln(rest + 1.0) + np.log(max(rest, 1.0))
     return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
+
+
+_SAMPLE = 6
+# Search threshold if all points are inliers.
+_ANY_PX = 1e4
+# Rounds to find the inliers.
+_ROUNDS = 6
+# Residuals below this are rounding errors, not noise.
+_EXACT_PX = 1e-6
+# Ratio of extents below which points lie in one plane.
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Resection:
+    """A camera from space points and their pixels.
+
+    Parameters
+    ----------
+    P, K, R, t : ndarray (3, 4), (3, 3), (3, 3) and (3,)
+        Camera P = K [R t], with K as given or estimated.
+    inliers, sigma_px : ndarray (N,) of bool, float
+        Inliers, and the standard deviation of one image coordinate; NaN if no residuals are left.
+    covariance : ndarray (12, 12) or (6, 6)
+        Covariance of the entries of P (row-major, rank 11) or, with a given K, of the pose: rotation vector w
+        (rad) and translation d of x -> exp(w) x + d in the camera frame.
+    """
+
+    P: F64
+    K: F64
+    R: F64
+    t: F64
+    inliers: B8
+    sigma_px: float
+    covariance: F64
+
+
+def resect_robust(
+    X: F64, xy: F64, K: F64 | None, threshold_px: float | None, budget: Budget, rng: Generator
+) -> Resection:
+    """Resect a camera; arguments as for :func:`thesisrecon.resect`."""
+    needed, unknown = (6, 11) if K is None else (4, 6)
+    if len(X) < needed:
+        raise StageFailure(Notice("few-resection-points"), f"{counted(len(X), 'point')}, {needed} are needed")
+    extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
+    if not extent[2 if K is None else 1] > _FLAT * extent[0]:
+        place = "in one plane" if K is None else "on one line"
+        raise StageFailure(
+            f"the points do not determine the camera: they lie {place}",
+            "",
+            "add points off it" + (", or give the calibration matrix K" if K is None else ""),
+        )
+    if not np.ptp(xy, axis=0).any():
+        raise _no_camera(f"all {len(xy)} pixels are equal")
+    limit = threshold_px or _ANY_PX
+    if K is None:
+        found = resect_projective(homogenize(X), xy, threshold_px=limit, budget=budget, rng=rng)
+    else:
+        rays = homogenize(xy) @ np.linalg.inv(K).T
+        normalized = rays[:, :2] / rays[:, 2:]
+        found = resect_calibrated(X, normalized, threshold=limit / K[0, 0], budget=budget, rng=rng)
+    start, inliers, samples = found
+    if inliers.any() and threshold_px is None:
+        inliers[:] = True
+    elif start is not None:
+        P, size = (start, _SAMPLE) if K is None else (K @ start, 3)
+        _require_more_than_chance(X, xy, P, inliers, samples, size)
+    for _ in range(_ROUNDS):
+        if start is None or inliers.sum() < needed:
+            raise _no_camera(
+                f"{inliers.sum()} of {len(X)} agree with the best of {samples} samples, {needed} are needed"
+            )
+        fit = _refine(start, K, X, xy, inliers)
+        distance, front = np.linalg.norm(project(fit.P, X) - xy, axis=1), depth(fit.P, homogenize(X)) > 0.0
+        distance[~front] = np.inf
+        if threshold_px is None:
+            if not front.all():
+                raise _no_camera(f"{np.sum(~front)} of {len(X)} are behind the one that fits them best")
+            break
+        limit = max(next_inlier_limit(distance, fit.inliers, limit, unknowns=unknown), _EXACT_PX)
+        start = fit.P if K is None else np.column_stack([fit.R, fit.t])
+        inliers = front & (distance <= limit)
+        if np.array_equal(inliers, fit.inliers):
+            break
+    left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
+    sigma = float(np.sqrt(np.sum(distance[fit.inliers] ** 2) / left)) if left > 0 else float("nan")
+    return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
+
+
+def _require_more_than_chance(X: F64, xy: F64, P: F64, inliers: B8, samples: int, size: int) -> None:
+    """Raise ``StageFailure`` if a camera of wrong points would have as many inliers, equal ones once."""
+    n, k = len(X), len(np.unique(np.column_stack([X, xy])[inliers], axis=0))
+    if n <= max(size, 4):
+        return
+    distance = np.linalg.norm(project(P, X[inliers]) - xy[inliers], axis=1)
+    limit = max(float(distance.max(initial=0.0)), _EXACT_PX)
+    share = np.pi * limit**2 / max(float(np.prod(np.ptp(xy, axis=0))), limit**2)
+    if log10_false_alarms(k, n, chance=min(share, 1.0), free=size) > CHANCE:
+        raise _no_camera(f"{k} of {n} agree with the best of {samples} samples, which chance explains")
+
+
+def _no_camera(evidence: str) -> StageFailure:
+    advice = "check that points and pixels correspond, and that the points are in right-handed coordinates"
+    return StageFailure("no camera explains the points", evidence, advice)
+
+
+def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:
+    """The camera of least reprojection error of the inliers near P or [R t], its covariance for 1 px."""
+    if K is not None:
+        row = np.array([K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2], 0.0])
+        pose = refine_pose(
+            start[:, :3], start[:, 3], row, X[inliers], xy[inliers], free=np.zeros(6, bool), loss_px=np.inf
+        )
+        P = compose_camera(K, pose.R, pose.t)
+        return Resection(P, K, pose.R, pose.t, inliers, 1.0, pose.covariance)
+    P, covariance = refine_camera(start, homogenize(X[inliers]), xy[inliers], loss_px=np.inf)
+    K, R, t = decompose_camera(P)
+    scale = float(np.sum(compose_camera(K, R, t) * P) / np.sum(P**2))
+    return Resection(P * scale, K, R, t, inliers, 1.0, covariance * scale**2)
+
+
+def resect_projective(
+    X: F64, xy: F64, *, threshold_px: float, budget: Budget, rng: Generator
+) -> tuple[F64 | None, B8, int]:
+    """Resect a camera by RANSAC over six-point samples with a truncated-quadratic score (6.4; HZ 7.1).
+
+    Points X (M, 4) are signed so that depths have one sign. Returns the camera, None below six inliers, the
+    inliers (M,) and the number of samples.
+    """
+    none = np.zeros(len(X), dtype=bool)
+    if len(X) < _SAMPLE:
+        return None, none, 0
+    # The points of one view may fill a corner of the frame: whitening keeps all digits.
+    frame = whitened_frame(X)
+    Y = frame.points(X)
+    Y /= np.maximum(np.linalg.norm(Y, axis=1, keepdims=True), 1e-300)
+    # Few samples of six determine the camera if most points are on a line or plane.
+    of_all = resect_linear(Y, xy)[None]
+
+    def cameras(samples: I64) -> F64:
+        P = resect_six(Y[samples], xy[samples])
+        signs = np.sign(np.einsum("bmi,bi->bm", Y[samples], P[:, 2]))
+        # The points of a sample are in front.
+        P = (P * signs[:, :1, None])[(signs == signs[:, :1]).all(axis=1)]
+        return np.concatenate([P, of_all, -of_all])
+
+    def squared(P: F64, rows: I64) -> F64:
+        return _squared_residuals(P, Y[rows], xy[rows]) / threshold_px**2
+
+    def refit(P: F64, rows: I64) -> F64:
+        if len(rows) < _SAMPLE:
+            return P
+        camera = resect_linear(Y[rows], xy[rows])
+        return camera * (np.sign(np.median(Y[rows] @ camera[2])) or 1.0)
+
+    found = search_models(cameras, squared, refit, rng, len(Y), _SAMPLE, budget)
+    if found is None or len(found.inliers) < _SAMPLE:
+        return None, none, 0 if found is None else found.samples
+    P = refit(found.model, found.inliers)
+    if np.sum(squared(P[None], found.inliers) < 1.0) < len(found.inliers):
+        P = found.model
+    return frame.cameras_back(P), squared(P[None], np.arange(len(Y)))[0] < 1.0, found.samples
+
+
+def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
+    """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
+    xh = (P.reshape(-1, 4) @ X.T).reshape(len(P), 3, -1)
+    x, y, depths = xh[:, 0], xh[:, 1], xh[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        squared = (x / depths - xy[:, 0]) ** 2 + (y / depths - xy[:, 1]) ** 2
+    return np.where((depths > 0) & np.isfinite(squared), squared, np.inf)
+
+
+def resect_calibrated(
+    X: F64, normalized: F64, *, threshold: float, budget: Budget, rng: Generator
+) -> tuple[F64 | None, B8, int]:
+    """Estimate the pose of a calibrated camera by P3P in RANSAC with a truncated quadratic score (6.4).
+
+    Image points ``normalized`` (M, 2) and ``threshold`` have one unit. Returns [R t] or None, inliers,
+    samples.
+    """
+    Xh, none = homogenize(X), np.zeros(len(X), dtype=bool)
+    if len(X) < 4:
+        return None, none, 0
+    rays = homogenize(normalized)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    row = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+    def squared(poses: F64, rows: I64) -> F64:
+        return _squared_residuals(poses, Xh[rows], normalized[rows]) / threshold**2
+
+    def refit(pose: F64, rows: I64) -> F64:
+        some = rows[:300]
+        if len(some) < 4:
+            return pose
+        fit = refine_pose(
+            pose[:, :3], pose[:, 3], row, X[some], normalized[some], free=np.zeros(6, bool), loss_px=np.inf,
+            iterations=5,
+        )  # fmt: skip
+        return np.column_stack([fit.R, fit.t])
+
+    def poses(samples: I64) -> F64:
+        return pose_from_three_points(X[samples], rays[samples])
+
+    found = search_models(poses, squared, refit, rng, len(X), 3, budget)
+    if found is None:
+        return None, none, budget.max_samples
+    return found.model, squared(found.model[None], np.arange(len(X)))[0] < 1.0, found.samples

@@ -16,12 +16,7 @@ from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.pipeline.job import Job, name_images
-from thesisrecon.pipeline.large_sets import (
-    calibrated_part,
-    cameras_from_parts,
-    from_metric,
-    prior_of_views,
-)
+from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
 from thesisrecon.pipeline.left_over import groups_left_over, join_left_over, known_cameras, register_more
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (

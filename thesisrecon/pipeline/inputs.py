@@ -19,7 +19,7 @@ from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
-from thesisrecon.optimize.bundle.observations import Observations, sort_observations
+from thesisrecon.optimize.bundle.projection import Observations, sort_observations
 from thesisrecon.pipeline.image_pair import values_at, verify_matches
 from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import tracks_of_part

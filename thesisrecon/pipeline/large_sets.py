@@ -24,7 +24,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.matching.pair_selection import strong_pairs
-from thesisrecon.optimize.bundle.metric_kernels import MetricModel, image_points
+from thesisrecon.optimize.bundle.projection import MetricModel, image_points
 from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.run import Batch, stream
 from thesisrecon.records import (

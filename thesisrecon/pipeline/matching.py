@@ -18,7 +18,7 @@ from thesisrecon.matching._prepared import strongest_corners, strongest_share
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
 from thesisrecon.matching.tracks import tracks_of_corners
-from thesisrecon.optimize.bundle.observations import cached_pair_order
+from thesisrecon.optimize.bundle.projection import cached_pair_order
 from thesisrecon.pipeline.image_pair import detect_features, match_views, oblique_pairs, prepare_oblique
 from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import has_narrow_cut

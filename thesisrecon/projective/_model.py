@@ -12,13 +12,13 @@ import scipy.sparse
 from thesisrecon._numba import full, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.conditioning import pixel_from_unit, whitened_frame
+from thesisrecon.geometry.homogeneous import pixel_from_unit, whitened_frame
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.geometry.two_view import canonical_cameras, quasi_euclidean_planes
-from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_points, triangulate_points
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
-from thesisrecon.optimize.noise import noise_from_distances
+from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.
@@ -299,12 +299,11 @@ def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
 def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: float) -> B8:
     """Return the observations (K,) of each point that agree with its best two-view triangulation.
 
-    A wrong observation can shift a least-squares point so far that right ones look wrong. Each point is
-    triangulated from pairs of its ``chosen`` observations; the lowest truncated squares over all select one.
+    A wrong one shifts a least-squares point: least truncated squares select a pair of ``chosen`` ones.
     """
     t = model.tracks
     k = np.flatnonzero(chosen)
-    view, xy, P = t.view_index[k], t.xy[k], model.P[t.view_index[k]]
+    view, xy, every = t.view_index[k], t.xy[k], np.ones(len(k), dtype=bool)
     number, point = np.unique(t.point_index[k], return_inverse=True)
     counts = np.bincount(point)
     first, place = np.cumsum(counts) - counts, np.tile(np.arange(len(number)), 2)
@@ -316,7 +315,8 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: fl
         apart = np.where(counts <= 5, h // counts % (counts - 1), h * (counts - 1) // _HYPOTHESES)
         pair = np.concatenate([first + one, first + (one + 1 + apart) % counts])
         X = triangulate_observations(model.P, view[pair], place, xy[pair], len(number))
-        squared = np.minimum(_residuals(P, X[point], xy) / threshold_px, 1.0) ** 2
+        distance = project_observations(model.P, X, view, point, xy, every)[1]
+        squared = np.minimum(distance / threshold_px, 1.0) ** 2
         cost = np.bincount(point, squared)
         better = cost < best
         best = np.where(better, cost, best)
@@ -324,14 +324,6 @@ def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: fl
     marked = np.zeros(len(t.xy), dtype=bool)
     marked[k] = agree
     return marked
-
-
-def _residuals(P: F64, X: F64, xy: F64) -> F64:
-    """Return distances (K,) px of the images of X (K, 4) by P (K, 3, 4) from xy; inf in the focal plane."""
-    xh = np.einsum("kab,kb->ka", P, X)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        distance = np.linalg.norm(xh[:, :2] / xh[:, 2:] - xy, axis=1)
-    return np.asarray(np.nan_to_num(distance, nan=np.inf))
 
 
 def update_inliers(model: ProjectiveModel, sigmas: float) -> None:

@@ -15,21 +15,10 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry.camera_matrix import orient_signs
-from thesisrecon.geometry.conditioning import normalizing_transform
-from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform
 from thesisrecon.geometry.two_view import epipoles, homography_linear, homography_sampson_residuals
-from thesisrecon.optimize.noise import noise_from_distances
-from thesisrecon.projective._model import (
-    NO_PARALLAX,
-    ProjectiveModel,
-    adjust_all,
-    expand_to_all_tracks,
-    rank_initial_pairs,
-    require_pair_with_parallax,
-    retriangulate_points,
-    to_reconstruction,
-    working_tracks,
-)
+from thesisrecon.optimize.least_squares import noise_from_distances
+from thesisrecon.projective import _model
 from thesisrecon.projective.incremental import IncrementalProjective
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
@@ -46,8 +35,7 @@ Edge = tuple[int, int]
 def depths_from_fundamentals(xy: F64, F: Mapping[Edge, F64], tree: Sequence[Edge]) -> F64:
     """Projective depths (V, N) of xy (V, N, 2) from F[i, j], x_j' F x_i = 0, along a tree of edges (i, j).
 
-    The edges reach every view once, i before j: w_i F x_i = w_j (e_j x x_j), in least squares (Sturm and
-    Triggs, eq. 3), and the depths are 1 in the first view. Points near an epipole get inaccurate depths.
+    w_i F x_i = w_j (e_j x x_j) in least squares (Sturm and Triggs, eq. 3), from 1 in the first view on.
     """
     x = homogenize(xy)
     depths = np.ones(xy.shape[:2])
@@ -72,9 +60,9 @@ def _balance_depths(depths: F64, sizes: F64) -> F64:
 def factorize(xy: F64, depths: F64 | None = None, *, iterations: int = 0) -> tuple[F64, F64, F64]:
     """Factorize N >= 8 matches xy (V, N, 2) into cameras, unit points and reprojection distances (V, N).
 
-    Initial depths are equal by default, as for affine cameras; ``iterations`` are needed then. They are the
-    maximum number of depth updates; 0 is the published algorithm. Stops when the rank-4 residual of the
-    balanced matrix, which approximates the reprojection error, no longer falls.
+    Initial depths are equal by default, as for affine cameras. At most ``iterations`` updates, 0 as
+    published, end when the rank-4 residual of the balanced matrix, which approximates the reprojection error,
+    no longer falls.
     """
     depths = np.ones(xy.shape[:2]) if depths is None else depths
     T = np.stack([normalizing_transform(view) for view in xy])
@@ -138,20 +126,24 @@ class Factorization:
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
-        ranked = rank_initial_pairs(tracks, pairs)
-        require_pair_with_parallax(pairs)
+        ranked = _model.rank_initial_pairs(tracks, pairs)
+        _model.require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             found = f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted"
             raise StageFailure(
                 "no initial pair is left for the factorization", found,
                 "take images that overlap by more than half and show texture",
             )  # fmt: skip
-        selected, keep = working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
+        selected, keep = _model.working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)
-        return expand_to_all_tracks(to_reconstruction(model, self.growth.min_points), tracks, keep)
+        return _model.expand_to_all_tracks(
+            _model.to_reconstruction(model, self.growth.min_points), tracks, keep
+        )
 
-    def _core(self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64) -> ProjectiveModel:
+    def _core(
+        self, tracks: Tracks, pairs: Sequence[TwoView], start: TwoView, sizes: I64
+    ) -> _model.ProjectiveModel:
         """Reconstruct the core that grows from ``start`` by factorization and adjust it."""
         xy = np.full((tracks.n_views, tracks.n_points, 2), np.nan)
         xy[tracks.view_index, tracks.point_index] = tracks.xy
@@ -169,7 +161,9 @@ class Factorization:
         depths = depths_from_fundamentals(table, {e: F[v] for e, v in zip(edges, tree, strict=True)}, edges)
         growth, early, views = self.growth, self.growth.outlier_sigmas[0], _tree_views(tree)
         P, X, residual_px = _factorize_robustly(table, depths, growth.outlier_sigmas[1], self.iterations)
-        model = ProjectiveModel.empty(tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px)
+        model = _model.ProjectiveModel.empty(
+            tracks, sizes, sigma_px=sigma_px, noise_floor_px=growth.noise_floor_px
+        )
         # Before bundle adjustment the residuals are those of the factors.
         model.sigma_px = max(model.sigma_px, noise_from_distances(residual_px.ravel()))
         every = np.indices(residual_px.shape).reshape(2, -1)
@@ -177,8 +171,8 @@ class Factorization:
         model.P[views] = P * signs[:, None, None]
         model.registered[views] = True
         for _ in range(2):
-            retriangulate_points(model, early)
-            adjust_all(model, 2 * growth.bundle_iterations, early)
+            _model.retriangulate_points(model, early)
+            _model.adjust_all(model, 2 * growth.bundle_iterations, early)
         return model
 
 
@@ -225,7 +219,7 @@ def _is_planar(xy: F64, edges: Sequence[Edge], threshold_px: float) -> bool:
             distance = np.linalg.norm(homography_sampson_residuals(H, xy[i], xy[j]), axis=1)
             within = distance <= max(threshold_px, 2.0 * float(np.median(distance)))
         shares.append(np.mean(distance <= threshold_px))
-    return bool(min(shares) >= NO_PARALLAX)
+    return bool(min(shares) >= _model.NO_PARALLAX)
 
 
 def _factorize_robustly(xy: F64, depths: F64, sigmas: float, iterations: int) -> tuple[F64, F64, F64]:

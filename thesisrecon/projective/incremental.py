@@ -18,24 +18,9 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.optimize.bundle.partial import refine_camera
-from thesisrecon.optimize.ransac import Budget
-from thesisrecon.optimize.robust_resection import resect_projective
-from thesisrecon.projective._model import (
-    LOSS_SIGMAS,
-    ProjectiveModel,
-    adjust_all,
-    adjust_locally,
-    coverage_of_views,
-    expand_to_all_tracks,
-    initial_cameras,
-    rank_initial_pairs,
-    require_pair_with_parallax,
-    retriangulate_points,
-    select_core,
-    to_reconstruction,
-    tracks_of_views,
-    working_tracks,
-)
+from thesisrecon.optimize.ransac import Budget, resect_projective
+from thesisrecon.projective import _model
+from thesisrecon.projective._model import ProjectiveModel
 from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 
@@ -120,26 +105,28 @@ class IncrementalProjective:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
         core = self._core(pairs, tracks.n_views, attempt)
         inside = [pair for pair in pairs if core[pair.i] and core[pair.j]]
-        ranked = rank_initial_pairs(tracks, inside)
+        ranked = _model.rank_initial_pairs(tracks, inside)
         if not ranked:
             found = f"none of {counted(len(pairs), 'pair')} was verified"
             advice = "take images that overlap by more than half and show texture"
             raise StageFailure("no image pair was accepted", found, advice)
-        require_pair_with_parallax(pairs)
+        _model.require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             tried = f"all {len(ranked)} accepted image pairs were tried"
             raise StageFailure(Notice("no-other-initial-pair"), tried)
-        seen = tracks_of_views(tracks, core)
-        selected, keep = working_tracks(seen, inside, points_per_view=self.points_per_view)
+        seen = _model.tracks_of_views(tracks, core)
+        selected, keep = _model.working_tracks(seen, inside, points_per_view=self.points_per_view)
         best = self._best_model(selected, inside, sizes, ranked[attempt:], rng)
         for view in np.flatnonzero(~core):
             best.reasons[view] = OUTSIDE_CORE
-        return expand_to_all_tracks(to_reconstruction(best, self.min_points), tracks, keep, core)
+        return _model.expand_to_all_tracks(
+            _model.to_reconstruction(best, self.min_points), tracks, keep, core
+        )
 
     def _core(self, pairs: Sequence[TwoView], n_views: int, attempt: int) -> B8:
         """(V,) the views to reconstruct: all of a small set, else a core, larger at each attempt."""
         size = self.core_views * 2**attempt if self.core_views else n_views
-        return np.ones(n_views, dtype=bool) if n_views <= size else select_core(pairs, n_views, size)
+        return np.ones(n_views, dtype=bool) if n_views <= size else _model.select_core(pairs, n_views, size)
 
     def _best_model(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, starts: Sequence[TwoView], rng: Generator
@@ -166,7 +153,7 @@ class IncrementalProjective:
         """Add views to a model of two cameras or more in place and remove those that prove wrong."""
         self._grow(model, rng)
         while self._discard_camera(model, pairs):
-            adjust_all(model, self.bundle_iterations, self.outlier_sigmas[0])
+            _model.adjust_all(model, self.bundle_iterations, self.outlier_sigmas[0])
             self._grow(model, rng)
 
     def begin(self, tracks: Tracks, pair: TwoView, sizes: I64) -> ProjectiveModel:
@@ -174,11 +161,11 @@ class IncrementalProjective:
         noise = {"sigma_px": pair.sigma_px, "noise_floor_px": self.noise_floor_px}
         model = ProjectiveModel.empty(tracks, sizes, **noise)
         views = [pair.i, pair.j]
-        model.P[views] = initial_cameras(pair, sizes[views])
+        model.P[views] = _model.initial_cameras(pair, sizes[views])
         model.registered[views] = True
         for _ in range(2):
-            retriangulate_points(model, self.outlier_sigmas[0])
-            adjust_all(model, 2 * self.bundle_iterations, self.outlier_sigmas[0])
+            _model.retriangulate_points(model, self.outlier_sigmas[0])
+            _model.adjust_all(model, 2 * self.bundle_iterations, self.outlier_sigmas[0])
         return model
 
     def _grow(self, model: ProjectiveModel, rng: Generator) -> None:
@@ -187,12 +174,14 @@ class IncrementalProjective:
         adjusted = int(model.registered.sum())
         while (view := self.add_next_camera(model, rng)) is not None:
             if model.registered.sum() >= self.global_bundle_growth * adjusted:
-                adjust_all(model, self.bundle_iterations, early)
+                _model.adjust_all(model, self.bundle_iterations, early)
                 adjusted = int(model.registered.sum())
             else:
-                adjust_locally(model, view, self.bundle_iterations, early, n_views=self.local_bundle_views)
+                _model.adjust_locally(
+                    model, view, self.bundle_iterations, early, n_views=self.local_bundle_views
+                )
         for round_number in range(self.final_rounds):
-            adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
+            _model.adjust_all(model, 2 * self.bundle_iterations, late if round_number else early)
 
     def add_next_camera(self, model: ProjectiveModel, rng: Generator) -> int | None:
         """Resect the view best covered by model points that passes the covariance test; None if none does."""
@@ -200,7 +189,7 @@ class IncrementalProjective:
         ready = model.valid[t.point_index]
         counts = np.bincount(t.view_index[ready], minlength=t.n_views)
         waiting = ~model.registered & ~model.rejected
-        coverage = np.where(waiting, coverage_of_views(model.cell, ready, t.n_views), 0.0)
+        coverage = np.where(waiting, _model.coverage_of_views(model.cell, ready, t.n_views), 0.0)
         for view in np.argsort(-coverage, kind="stable"):
             if coverage[view] <= 0.0:
                 return None
@@ -227,14 +216,16 @@ class IncrementalProjective:
         model.registered[view] = True
         model.reasons[view] = ""
         seen = np.bincount(t.point_index[t.view_index == view], minlength=t.n_points) > 0
-        retriangulate_points(model, early, points=seen)
+        _model.retriangulate_points(model, early, points=seen)
         return True
 
     def _covariance_test(
         self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64
     ) -> tuple[bool, F64]:
         """Return whether to defer the camera, and the refined camera with positive depths."""
-        refined, covariance = refine_camera(P, X, xy, loss_px=LOSS_SIGMAS * model.sigma_px, iterations=20)
+        refined, covariance = refine_camera(
+            P, X, xy, loss_px=_model.LOSS_SIGMAS * model.sigma_px, iterations=20
+        )
         P = refined * np.sign(np.median(X @ refined[2]))
         if self.max_projection_std_rel is None:
             return False, P
@@ -264,7 +255,7 @@ class IncrementalProjective:
         model.registered[view] = False
         model.rejected[view] = True
         model.reasons[view] = reason
-        retriangulate_points(model, self.outlier_sigmas[0])
+        _model.retriangulate_points(model, self.outlier_sigmas[0])
         return True
 
 
@@ -288,7 +279,7 @@ class SequentialProjective:
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0
     ) -> Reconstruction:
         """See `thesisrecon.config.ProjectiveReconstructor.reconstruct`."""
-        require_pair_with_parallax(pairs)
+        _model.require_pair_with_parallax(pairs)
         accepted = [p for p in pairs if p.accepted]
         neighbours = [p for p in accepted if p.j == p.i + 1]
         candidates = sorted(neighbours or accepted, key=lambda p: (-p.inliers, p.i, p.j))
@@ -299,5 +290,5 @@ class SequentialProjective:
         model = incremental.begin(tracks, candidates[attempt], sizes)
         while incremental.add_next_camera(model, rng) is not None:
             pass
-        adjust_all(model, 10, incremental.outlier_sigmas[1])
-        return to_reconstruction(model, incremental.min_points)
+        _model.adjust_all(model, 10, incremental.outlier_sigmas[1])
+        return _model.to_reconstruction(model, incremental.min_points)

@@ -12,7 +12,8 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import pixel_from_unit
+from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
 # Error of a unit-free infinite homography: the weight of linear constraints from approximate intrinsics.
@@ -184,9 +185,8 @@ class SolverUnknowns:
 
     def calibration_std(self, unknowns: F64, covariance: F64) -> F64:
         """Propagate a covariance (D, D) of unknowns (D,) to the entries of K (R, 3, 3), to first order."""
-        steps = np.diag(np.full(len(unknowns), 1e-6))
-        slope = (self.calibrations(unknowns + steps) - self.calibrations(unknowns - steps)) / 2e-6
-        variance = np.einsum("drij,de,erij->rij", slope, covariance, slope)
+        slope = central_differences(lambda x: self.calibrations(x[None])[0], unknowns)
+        variance = np.einsum("rijd,de,rije->rij", slope, covariance, slope)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def prior_residuals(self, unknowns: F64) -> F64:

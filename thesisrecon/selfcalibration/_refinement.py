@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.optimize.noise import soft_l1
+from thesisrecon.optimize.least_squares import central_differences, soft_l1
 from thesisrecon.selfcalibration._frame import ReferenceFrame
 
 UPPER = np.triu_indices(3)
@@ -87,7 +87,7 @@ class RotationCriterion:
             priors = self._focal_prior_residuals(frame, x[:, 3:])
             return np.concatenate([cameras.reshape(len(x), -1), priors], axis=1)
 
-        return residuals(theta), numerical_jacobian(residuals, theta)
+        return residuals(theta), central_differences(residuals, theta)
 
 
 def _descend(
@@ -162,7 +162,7 @@ def minimize_batch(
     """Minimize residuals, (B, D) to (B, M) row by row, from many starts; return minima and mean losses."""
 
     def normal_equations(x: F64) -> tuple[F64, F64]:
-        r, J = residuals(x), numerical_jacobian(residuals, x)
+        r, J = residuals(x), central_differences(residuals, x)
         weight = (1.0 + (r / loss_scale) ** 2) ** -0.5
         return np.einsum("bmi,bm,bmj->bij", J, weight, J), np.einsum("bmi,bm->bi", J, weight * r)
 
@@ -176,14 +176,3 @@ def minimize_batch(
         normal_equations, cost_of, starts, iterations,
         damping=1e-2, decrease=6.0, max_damping=1e10, tolerance=1e-14,
     )  # fmt: skip
-
-
-def numerical_jacobian(residuals: Callable[[F64], F64], x: F64) -> F64:
-    """Return the derivatives (B, M, D) at x (B, D) by central differences, one unknown after the other."""
-    if x.shape[1] == 0:
-        return np.empty((*residuals(x).shape, 0))
-    steps, columns = 1e-6 * (1.0 + np.abs(x)), []
-    for k in range(x.shape[1]):
-        shift = steps * (np.arange(x.shape[1]) == k)
-        columns.append((residuals(x + shift) - residuals(x - shift)) / (2.0 * steps[:, k, None]))
-    return np.stack(columns, axis=-1)

@@ -15,6 +15,7 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.strata import calibration_from_image
+from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.selfcalibration._frame import (
     HOMOGRAPHY_NOISE,
     ConicConstraints,
@@ -28,7 +29,6 @@ from thesisrecon.selfcalibration._refinement import (
     UPPER,
     dual_image_residuals,
     minimize_batch,
-    numerical_jacobian,
     quadratic_rows,
 )
 
@@ -37,10 +37,9 @@ _REWEIGHTINGS = 4
 
 
 def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
-    """Solve w* = H w* H' for the dual conic of a constant K (R. Hartley, ECCV 1994), H (R, 3, 3) with det 1.
+    """Solve w* = H w* H' for w* ~ K K' of a constant K (R. Hartley, ECCV 1994), H (R, 3, 3) with det 1.
 
-    Return w* ~ K K' and the singular values (6,): the last is 0 for exact homographies; if the fifth is 0
-    too, w* is one of a family.
+    Also singular values (6,): the last is 0 for exact homographies, the fifth too for a family of w*.
     """
     equations = _transfer_matrix(H.swapaxes(-1, -2)) - np.eye(6)
     _, s, Vt = np.linalg.svd((ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False)
@@ -212,7 +211,7 @@ class FixedPlaneQuadric:
         nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
         found, cost = minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
         best = found[cost.argmin()]
-        s = np.linalg.svd(numerical_jacobian(residuals, best[None])[0], compute_uv=False)
+        s = np.linalg.svd(central_differences(residuals, best[None])[0], compute_uv=False)
         if len(s) and not s[-1] > 1e-5 * s[0]:
             raise _undetermined_failure(frame, H, None)
         return np.asarray(unknown.calibrations(best[None])[0], dtype=np.float64)

@@ -84,8 +84,7 @@ class CheiralityRegion:
     ) -> CheiralityRegion:
         """Compute the region by up to ``MAX_POINTS`` points of three views or more; no polytopes below eight.
 
-        A single wrong two-view point, which no other view can contradict, would exclude the true plane.
-        Points whose depths have no consistent sign are omitted.
+        A wrong point of two views would exclude the true plane; points without consistent depths are omitted.
         """
         tracks, inlier = reconstruction.tracks, reconstruction.inlier
         view, point = tracks.view_index[inlier], tracks.point_index[inlier]
@@ -184,8 +183,8 @@ def _plane_box(rows: F64) -> F64 | None:
 class CheiralitySearch:
     """Grid search for the plane at infinity (R. Hartley, E. Hayman, L. de Agapito, I. Reid, ICCV 1999).
 
-    Each plane of the grid gives infinite homographies and, linearly, the image of the absolute conic; planes
-    whose equations have exactly one solution are the candidates.
+    Each plane of the grid gives infinite homographies and linear equations of the image of the conic.
+    Candidates are the minima of their residual over the second singular value, 0 for the true plane.
     """
 
     steps = 16  # grid steps per axis of the bounding box

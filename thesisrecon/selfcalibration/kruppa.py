@@ -19,26 +19,14 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.conditioning import pixel_from_unit, unit_norm
+from thesisrecon.geometry.homogeneous import pixel_from_unit, unit_norm
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.optimize.least_squares import minimize_residuals
-from thesisrecon.optimize.noise import soft_l1
+from thesisrecon.optimize.least_squares import minimize_residuals, soft_l1
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration._candidates import (
-    Candidate,
-    as_stage_failure,
-    group_log_focals,
-    plane_from_focals,
-    select_candidate,
-    square_pixel_calibrations,
-)
-from thesisrecon.selfcalibration._frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
-from thesisrecon.selfcalibration._refinement import RotationCriterion, numerical_jacobian, refine_hypotheses
+from thesisrecon.selfcalibration import _frame, _upgrade
+from thesisrecon.selfcalibration._frame import ReferenceFrame, SolverUnknowns
+from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration._upgrade import Candidate
 
 _ROOT2 = np.sqrt(2.0)
 _MAX_PLANES = 8  # number of planes to refine for each calibration
@@ -115,7 +103,6 @@ def _minimize_kruppa(
 
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], start,
-        jacobian=lambda x: numerical_jacobian(residuals, x[None])[0],
         loss=lambda s: soft_l1(s, loss_scale), max_iterations=80, tolerance=1e-14,
     )  # fmt: skip
     return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
@@ -158,23 +145,23 @@ class KruppaEquations:
     min_common_points = 20  # minimum number of common observations of a pair
     criterion = RotationCriterion()  # criterion that selects the candidate
 
-    @as_stage_failure
+    @_upgrade.as_stage_failure
     def calibrate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
     ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
-        frame = normalized_frame(reconstruction, prior)
+        frame = _frame.normalized_frame(reconstruction, prior)
         pairs = _overlapping_pairs(frame, reconstruction, self.min_common_points)
         if len(pairs.i) < 2:
             needed = "the Kruppa equations need at least 2 pairs of images"
             found = f"{counted(len(pairs.i), 'pair')} with at least {self.min_common_points} common points"
             raise StageFailure(needed, found, "add images with more overlap")
-        unknown = solver_unknowns(frame, prior)
+        unknown = _frame.solver_unknowns(frame, prior)
         candidates = []
         for K, K_std, _ in self._solutions(pairs, unknown, len(frame.views)):
-            plane, cost = _plane_for_focals(frame, self.criterion, group_log_focals(frame, K))
+            plane, cost = _plane_for_focals(frame, self.criterion, _upgrade.group_log_focals(frame, K))
             candidates.append(Candidate(plane, K, cost, "Kruppa equations", K_std))
-        return select_candidate(frame, reconstruction, self.criterion, candidates)
+        return _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
 
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
         """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
@@ -200,7 +187,7 @@ class KruppaEquations:
     def _scan(self, pairs: _Pairs, n: int) -> list[float]:
         """Return the best local minima of one common log focal length."""
         grid = np.linspace(np.log(self.focal_range[0]), np.log(self.focal_range[1]), self.focal_steps)
-        K = square_pixel_calibrations(np.repeat(grid[:, None], n, axis=1))
+        K = _upgrade.square_pixel_calibrations(np.repeat(grid[:, None], n, axis=1))
         cost = _kruppa_cost(pairs, K, loss_scale=self.loss_scale)
         padded = np.pad(cost, 1, constant_values=np.inf)
         minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
@@ -212,7 +199,9 @@ def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f
     f = np.exp(log_f[frame.group])
     reference = np.array([f[frame.reference]])
     others = np.delete(np.arange(len(f)), frame.reference)
-    planes = np.concatenate([plane_from_focals(frame, int(k), reference, f[k : k + 1]) for k in others])
+    planes = np.concatenate(
+        [_upgrade.gherardi_fusiello_planes(frame, int(k), reference, f[k : k + 1]) for k in others]
+    )
     planes = planes[np.isfinite(planes).all(axis=1)]
     if not len(planes):
         return np.full(3, np.nan), np.inf

@@ -19,7 +19,7 @@ import scipy
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.optimize.noise import MAD_FACTOR
+from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import Image
 from thesisrecon.selfcalibration._frame import (
     PlaneCandidates,
@@ -266,9 +266,8 @@ def _refine_plane(
 ) -> tuple[F64, F64, float]:
     """Return plane p (3,) and vanishing points v (D, 3) fitted to all segments, and the noise (px).
 
-    A direction at v in the reference view is at H_i v in view i, so all share one least-squares problem. In
-    each of four passes the noise is estimated robustly, and segments beyond 2.5 times it are left out of the
-    next.
+    A direction at v in the reference view is at H_i v in view i. In each of four passes segments beyond 2.5
+    times the robust noise are left out.
     """
     kept, noise = direction >= 0, _FIRST_NOISE_PX
     for _ in range(4):

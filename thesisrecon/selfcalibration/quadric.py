@@ -1,40 +1,30 @@
-"""Self-calibration by the absolute dual quadric, linear and nonlinear (section 7.3, direct; HZ 19.3).
+"""Self-calibration by the absolute dual quadric (section 7.3; HZ 19.3), and by hypotheses of all methods.
 
 Linear: M. Pollefeys, F. Verbiest, L. Van Gool, ECCV 2002. A camera with square pixels, no skew and a central
 principal point gives six equations linear in the quadric, whose weights assume a focal length near 1.
 Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999, over the plane and all unknown intrinsics.
+Each closed form fails on some image sets, so that the default method refines the hypotheses of all.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.optimize.least_squares import minimize_residuals
-from thesisrecon.optimize.noise import huber
+from thesisrecon.optimize.least_squares import huber, minimize_residuals
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration._candidates import (
-    FOCAL_LIMITS,
-    Candidate,
-    as_stage_failure,
-    candidates_from_parameters,
-    group_focals_from_planes,
-    select_candidate,
-)
-from thesisrecon.selfcalibration._frame import (
-    ReferenceFrame,
-    SolverUnknowns,
-    normalized_frame,
-    solver_unknowns,
-)
+from thesisrecon.selfcalibration import _frame, _upgrade
+from thesisrecon.selfcalibration._frame import ReferenceFrame, SolverUnknowns
 from thesisrecon.selfcalibration._refinement import (
     RotationCriterion,
     dual_image_residuals,
-    numerical_jacobian,
     quadratic_rows,
+    refine_hypotheses,
 )
+from thesisrecon.selfcalibration._upgrade import Candidate
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 
 _MIN_NOISE = 1e-9
 _REWEIGHTINGS = 4
@@ -90,7 +80,7 @@ def quadric_hypotheses(frame: ReferenceFrame, focals: F64) -> tuple[F64, F64]:
         f2 = (Q[:, 0, 0] + Q[:, 1, 1]) / (2.0 * Q[:, 2, 2])
     f = np.sqrt(np.where(np.isfinite(f2) & (f2 > 0), f2, focals**2))
     good = np.isfinite(p).all(axis=1)
-    return p[good], np.clip(f[good], *FOCAL_LIMITS)
+    return p[good], np.clip(f[good], *_upgrade.FOCAL_LIMITS)
 
 
 def minimize_quadric(
@@ -125,7 +115,6 @@ def _minimize(
 
     found = minimize_residuals(
         lambda x: residuals(x[None])[0], theta,
-        jacobian=lambda x: numerical_jacobian(residuals, x[None])[0],
         loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]
@@ -164,18 +153,18 @@ class LinearQuadric:
 
     criterion = RotationCriterion()  # criterion that orders the candidates
 
-    @as_stage_failure
+    @_upgrade.as_stage_failure
     def calibrate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
     ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
-        frame = normalized_frame(reconstruction, prior)
+        frame = _frame.normalized_frame(reconstruction, prior)
         p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
-        log_f = group_focals_from_planes(frame, p, f)
+        log_f = _upgrade.group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
         theta = np.concatenate([p, log_f], axis=1)
-        candidates = candidates_from_parameters(frame, theta, cost, "linear quadric")
-        found = select_candidate(frame, reconstruction, self.criterion, candidates)
+        candidates = _upgrade.candidates_from_parameters(frame, theta, cost, "linear quadric")
+        found = _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
         # The error is a bias, not noise: it has no standard deviation.
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
@@ -199,15 +188,15 @@ class NonlinearQuadric:
     loss_scale = 0.05  # residual beyond which an entry counts linearly (Huber)
     criterion = RotationCriterion()  # criterion that selects the starts
 
-    @as_stage_failure
+    @_upgrade.as_stage_failure
     def calibrate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
     ) -> SelfCalibration:  # fmt: skip
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
-        frame = normalized_frame(reconstruction, prior)
-        unknown = solver_unknowns(frame, prior)
+        frame = _frame.normalized_frame(reconstruction, prior)
+        unknown = _frame.solver_unknowns(frame, prior)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
-        log_f = group_focals_from_planes(frame, p, f)
+        log_f = _upgrade.group_focals_from_planes(frame, p, f)
         cost = self.criterion.cost(frame, p, log_f)
         best = np.argsort(cost, kind="stable")[: self.starts]
         candidates = [
@@ -217,4 +206,98 @@ class NonlinearQuadric:
             )
             for b in best[np.isfinite(cost[best])]
         ]  # fmt: skip
-        return select_candidate(frame, reconstruction, self.criterion, candidates)
+        return _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
+
+
+# Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
+# alone is insufficient.
+_MAX_OFFSET_STD = 0.02
+
+
+@dataclass(frozen=True)
+class HypothesesAndRefinement:
+    """Self-calibration by hypotheses of all methods, a common refinement and a cheirality test.
+
+    The refinement estimates focal lengths of cameras without skew. If the prior has a skew, or leaves more
+    undetermined than a small offset of the principal point, the best candidates are refined by the nonlinear
+    quadric over all unknown intrinsics.
+
+    Parameters
+    ----------
+    focal_range : (float, float)
+        Range of the scanned focal lengths in long sides.
+    search : CheiralitySearch, optional
+        Hartley's search; None to omit it.
+    """
+
+    focal_range: tuple[float, float] = (0.2, 40.0)
+    search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
+
+    focal_steps = 45  # number of scanned focal lengths
+    camera_subsets = 6  # number of random camera subsets for the quadric
+    # Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
+    max_refined, max_full_refined = 40, 8
+    max_candidates = 3  # maximum number of candidates for bundle adjustment
+    # Required share of observations with positive depth.
+    min_in_front_ratio = 0.95
+    criterion = RotationCriterion()
+
+    @_upgrade.as_stage_failure
+    def calibrate(
+        self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
+    ) -> SelfCalibration:
+        """See `thesisrecon.config.SelfCalibrator.calibrate`."""
+        frame = _frame.normalized_frame(reconstruction, prior)
+        planes, log_f = self._propose(frame, reconstruction, rng)
+        cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
+        best = np.argsort(cost, kind="stable")[: self.max_refined]
+        theta = np.concatenate([planes[best], log_f[best]], axis=1)
+        theta, cost = refine_hypotheses(self.criterion, frame, theta)
+        candidates = _upgrade.candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
+        unknown = _frame.solver_unknowns(frame, prior)
+        others = np.setdiff1d(np.arange(len(unknown.std)), unknown.focals)
+        if unknown.std[others].max(initial=0.0) > _MAX_OFFSET_STD or unknown.known[:, 2].any():
+            candidates = [
+                minimize_quadric(
+                    frame, unknown, one.plane, _upgrade.group_log_focals(frame, one.K)[frame.group],
+                    method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
+                )
+                for one in _upgrade.distinct_candidates(frame, candidates, self.max_full_refined)
+            ]  # fmt: skip
+        return _upgrade.select_candidate(
+            frame, reconstruction, self.criterion, candidates,
+            max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
+        )  # fmt: skip
+
+    def _propose(
+        self, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
+    ) -> tuple[F64, F64]:
+        """Return planes (B, 3) and log focal lengths (B, G) of all methods."""
+        focals = np.geomspace(*self.focal_range, self.focal_steps)
+        found = [quadric_hypotheses(frame, focals)]
+        others = np.delete(np.arange(len(frame.views)), frame.reference)
+        for _ in range(self.camera_subsets if len(others) > 3 else 0):
+            size = int(rng.integers(3, len(others)))
+            chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
+            found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
+        for other in others:
+            f1, f2 = _focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
+            found.append(
+                (_upgrade.gherardi_fusiello_planes(frame, int(other), f1, f2), np.concatenate([f1, f1]))
+            )
+        if self.search is not None:
+            found.append(
+                self.search.search(frame, reconstruction, _frame.square_pixel_constraints(frame), rng)
+            )
+        p = np.concatenate([part[0] for part in found])
+        f = np.concatenate([part[1] for part in found])
+        good = np.isfinite(p).all(axis=1) & np.isfinite(f)
+        return p[good], _upgrade.group_focals_from_planes(frame, p[good], f[good])
+
+
+def _focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
+    """Return pairs to scan: equal focal lengths of one camera, else all pairs of every other value."""
+    if same_camera:
+        return focals, focals
+    first, second = np.meshgrid(focals[::2], focals[::2])
+    return first.ravel(), second.ravel()

@@ -10,12 +10,12 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.conditioning import pixel_from_unit
+from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.records import Image, IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration._candidates import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
+from thesisrecon.selfcalibration._upgrade import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.parallel_lines import ParallelLines

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I32, I64
-from thesisrecon.optimize.noise import MAD_FACTOR
+from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import GRAZING_DEG, components, max_depth_slope, same_surface
 

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.arrays import F64
 from thesisrecon.camera import project_camera
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.homogeneous import dehomogenize, scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.optimize.bundle.covariance import gauge_directions
 from thesisrecon.records import MetricResult, Reconstruction

@@ -11,11 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.homogeneous import cross_matrix, scene_frame
 from thesisrecon.optimize.bundle.covariance import gauge_directions
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from validation.references.libraries import pycolmap
 
 

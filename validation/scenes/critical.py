@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import compose_camera, project_camera
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.pose import UP, look_at, turntable

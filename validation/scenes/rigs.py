@@ -13,7 +13,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import Group
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from validation.scenes.pose import perturb
 
 SIZE = (1000, 750)

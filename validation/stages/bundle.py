@@ -10,8 +10,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.records import Reconstruction
 from validation.references.ceres import CeresOptions, ceres_covariances, refine_with_ceres
 from validation.runs.records import (

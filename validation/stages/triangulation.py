@@ -16,7 +16,7 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import Group
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from validation.references.fundamental import colmap_points, opencv_linear, opencv_polynomial
 from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task, read_arrays

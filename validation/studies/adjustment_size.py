@@ -17,8 +17,7 @@ import numpy as np
 from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.records import Tracks
 from validation.references.ceres import CeresOptions, refine_with_ceres
 from validation.runs.processes import call_apart, timed

@@ -20,11 +20,11 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.projective._model import require_pair_with_parallax
 from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
-from thesisrecon.selfcalibration.hypotheses import HypothesesAndRefinement
+from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 from validation.runs.study import Part, pick, report_progress
 from validation.runs.tables import Metric, Rows, text_table
 from validation.scenes.critical import Motion, make_sequence, projective_estimate

@@ -15,8 +15,8 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.bundle.observations import Observations
 from thesisrecon.optimize.bundle.partial import refine_points
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.pipeline.run import stream
 from thesisrecon.projective.incremental import IncrementalProjective

@@ -25,7 +25,7 @@ from thesisrecon.metric._checks import self_check
 from thesisrecon.metric._model import MetricEstimate, camera_rows, retriangulate_tracks
 from thesisrecon.metric._shared_camera import contradicted_focal_priors
 from thesisrecon.metric.refinement import finish_metric, settle_camera_model
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
+from thesisrecon.optimize.bundle.projection import MetricCameras
 from thesisrecon.records import IntrinsicInterval, IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.results import RunResult
 from validation.runs.study import Part, report_progress

@@ -6,8 +6,7 @@ import pytest
 
 from tests.validation.references.conftest import skip_without
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from validation.references.ceres import colmap_model
 from validation.references.colmap import match_with_pycolmap, read_colmap_model
 from validation.references.fundamental import colmap_points

@@ -10,11 +10,9 @@ import scipy
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.optimize.bundle.elimination import BlockIndex
-from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF
-from thesisrecon.optimize.bundle.observations import Jacobians
+from thesisrecon.optimize.bundle.projection import FOCAL, POSE_DOF, Jacobians
 from thesisrecon.optimize.bundle.schur import ReducedSystem, order_views
-from thesisrecon.optimize.least_squares import invert_information
-from thesisrecon.optimize.noise import MAD_FACTOR, trimmed_noise_scale
+from thesisrecon.optimize.least_squares import MAD_FACTOR, invert_information, trimmed_noise_scale
 
 SIMILARITY_DOF = 7
 MAX_DENSE = 1200
@@ -22,11 +20,7 @@ MAX_DENSE = 1200
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
-    """Standard deviation of a coordinate from residuals (K, 2) within 2.5 sigma, corrected for the fit.
-
-    ``leverage`` (K, 2) is the fraction of the variance absorbed by the points, ``dof`` the number of other
-    unknowns.
-    """
+    """Noise from residuals (K, 2) in 2.5 sigma, corrected for ``leverage`` (K, 2) and ``dof`` unknowns."""
     if not len(residual):
         return 0.0
     kept = 1.0 - leverage - max(dof, 0) / residual.size
@@ -40,8 +34,7 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
 def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
     """Return the covariance (n, C + e, C + e) of views ``row`` and the border with ``column`` and the border.
 
-    It is that of the inner gauge: of all solutions that differ by a similarity, the one that moved the
-    cameras least. ``R`` and ``t`` are those of the b views with observations.
+    In the inner gauge, of the solution that moved the cameras R, t (b of them) least.
     """
     (b, C, e), D = reduced.sums.border.shape, len(reduced.sums.rhs)
     if not b:
@@ -84,10 +77,9 @@ def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: 
 
 
 def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64) -> F64:
-    """Return the covariance (N, 3, 3) of the points in the gauge of the cameras' ``blocks``.
+    """Covariance (N, 3, 3) of the points in the gauge of the cameras' ``blocks`` S: V^-1 + V^-1 W' S W V^-1.
 
-    With V = B'B of a point and W' = sum B' [A E], it is V^-1 + V^-1 W' S W V^-1 for the covariance S of the
-    cameras that observe it. ``inverse`` (N, 3, 3) is V^-1; infinite for points in fewer than two views.
+    V = B'B of a point (``inverse``: V^-1), W' = sum B' [A E]; infinite for points in fewer than two views.
     """
     count = np.diff(index.start)
     out, C = inverse.copy(), J.A.shape[2]
@@ -126,8 +118,7 @@ def invert_in_inner_gauge(information: F64, N: F64) -> F64:
 def sparse_inverse(S: scipy.sparse.csc_matrix, width: int, R: F64, t: F64) -> Callable[[F64], F64]:
     """Return B -> C B for the inverse C of sparse information S (D, D) in the inner gauge, which is dense.
 
-    A pose, the first six of ``width`` columns, and the distance to the farthest camera are fixed; Baarda's
-    S-transformation leads from there to the inner gauge.
+    A pose and a distance are fixed; Baarda's S-transformation leads from there to the inner gauge.
     """
     N, centres = gauge_basis(S.shape[0], width, R, t), -np.einsum("vba,vb->va", R, t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))

@@ -1,9 +1,9 @@
-"""Elimination of the points from the normal equations, and their steps for given camera steps.
+"""Elimination of the points from the normal equations [[U, W], [W', V]], and their steps (HZ A6.3).
 
 A Jacobian has columns A of its view, E that views have in common, and B of its point. The reduced system has
 blocks for pairs of views with a common point, a border between views and common columns, and a corner. With
-V = sum B'B + damping = L L' of one point, B~ = B L^-T, Q_kl = delta_kl I - B~_k B~_l' (2 x 2) and W = B~' A
-(3 x C), the block of two observations is S_kl = A_k' Q_kl A_l = delta_kl A_k' A_k - W_k' W_l.
+V = sum B'B + damping = L L' of one point, B~ = B L^-T, Q_kl = delta_kl I - B~_k B~_l' (2 x 2) and Z = B~' A =
+L^-1 W' (3 x C), two observations add S_kl = A_k' Q_kl A_l = delta_kl A_k' A_k - Z_k' Z_l to U - W V^-1 W'.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon._numba import copy_to, empty, full, kernel, zeros
+from thesisrecon._numba import copy_to, empty, full, kernel
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import invert_cholesky_3x3, multiply_transposed_3x3
-from thesisrecon.optimize.bundle.observations import Jacobians
+from thesisrecon.optimize.bundle.projection import Jacobians
 
 
 class BlockIndex(NamedTuple):
@@ -54,19 +54,19 @@ class PointSums(NamedTuple):
 
 
 class _Elimination(NamedTuple):
-    """B~ (k, 2, 3), W (k, 3, 6) and residuals (k, 2) after the points' own steps, from ``first`` on.
+    """B~ (k, 2, 3), Z (k, 3, 6) and residuals (k, 2) after the points' own steps, from ``first`` on.
 
-    g = L^-1 h (n, 3). W is empty unless a view has six columns.
+    g = L^-1 h (n, 3). Z is empty unless a view has six columns.
     """
 
     first: int
     Bt: F64
-    W: F64
+    Z: F64
     residual: F64
     g: F64
 
 
-class _ByView(NamedTuple):
+class ByView(NamedTuple):
     """Observations ``order`` of free views by view; block of the view and end of the point of each (k,)."""
 
     order: I64
@@ -74,18 +74,26 @@ class _ByView(NamedTuple):
     end: I64
 
 
+def sort_by_view(first: int, last: int, index: BlockIndex) -> ByView:
+    """Sort the observations of a range of points; those of one view stay in their order."""
+    bounds = index.start[first : last + 1]
+    block = index.block[index.view_index[bounds[0] : bounds[-1]]]
+    order = np.argsort(block, kind="stable")[np.count_nonzero(block < 0) :]
+    return ByView(bounds[0] + order, block, np.repeat(bounds[1:], np.diff(bounds)))
+
+
 @kernel
 def eliminate_points(
-    first: int, last: int, damping: float, J: Jacobians, index: BlockIndex, sums: ReducedSums,
-    points: PointSums,
+    first: int, last: int, damping: float, J: Jacobians, index: BlockIndex, by_view: ByView,
+    sums: ReducedSums, points: PointSums,
 ) -> None:  # fmt: skip
     """Add the eliminated points to the sums; a point whose block is not positive does not move."""
     k = index.start[first]
     n = index.start[last] - k
-    W = empty((n if J.A.shape[2] == 6 else 0, 3, 6))
-    left = _Elimination(k, empty((n, 2, 3)), W, empty((n, 2)), empty((last - first, 3)))
+    Z = empty((n if J.A.shape[2] == 6 else 0, 3, 6))
+    left = _Elimination(k, empty((n, 2, 3)), Z, empty((n, 2)), empty((last - first, 3)))
     _sum_points(first, last, damping, J, index, points, left)
-    _add_views(first, last, J, index, sums, left)
+    _add_views(J, index.pair, by_view, sums, left)
     if len(sums.corner) > 0:
         _add_common(first, last, J, index, sums, left)
 
@@ -129,41 +137,13 @@ def _sum_points(
                 for i in range(3):
                     t0, t1 = left.Bt[o, 0, i], left.Bt[o, 1, i]
                     for c in range(6):
-                        left.W[o, i, c] = t0 * J.A[k, 0, c] + t1 * J.A[k, 1, c]
-
-
-@kernel
-def _sort_by_view(first: int, last: int, index: BlockIndex) -> _ByView:
-    """Sort the observations of a range of points; those of one view stay in their order."""
-    base = index.start[first]
-    n = index.start[last] - base
-    order, end, block = empty(n, np.int64), empty(n, np.int64), empty(n, np.int64)
-    next_of = zeros(len(index.pair) + 1, np.int64)
-    for j in range(first, last):
-        for k in range(index.start[j], index.start[j + 1]):
-            b = index.block[index.view_index[k]]
-            end[k - base], block[k - base] = index.start[j + 1], b
-            next_of[b + 1] += 1
-    next_of[0] = 0
-    for b in range(len(index.pair)):
-        next_of[b + 1] += next_of[b]
-    for k in range(n):
-        b = block[k]
-        if b >= 0:
-            order[next_of[b]] = base + k
-            next_of[b] += 1
-    return _ByView(order[: next_of[len(index.pair) - 1] if len(index.pair) > 0 else 0], block, end)
+                        left.Z[o, i, c] = t0 * J.A[k, 0, c] + t1 * J.A[k, 1, c]
 
 
 @kernel(forceinline=True)
-def _add_views(
-    first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
-) -> None:
-    """Add the blocks of all pairs of views that observe a point, and the views' right-hand side.
-
-    View by view: the blocks of one stay in the cache.
-    """
-    C, by_view = J.A.shape[2], _sort_by_view(first, last, index)
+def _add_views(J: Jacobians, pair: I64, by_view: ByView, sums: ReducedSums, left: _Elimination) -> None:
+    """Add the blocks of all pairs of views that observe a point, and right sides, view by view (cache)."""
+    C = J.A.shape[2]
     for k in by_view.order:
         o = k - left.first
         v = by_view.block[o]
@@ -175,17 +155,14 @@ def _add_views(
             sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
             sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
     if C == 6:
-        _add_blocks_of_six(left.first, by_view, index.pair, J.A, left.W, sums.blocks)
+        _add_blocks_of_six(left.first, by_view, pair, J.A, left.Z, sums.blocks)
     else:
-        _add_blocks(left.first, by_view, index.pair, J.A, left.Bt, sums.blocks)
+        _add_blocks(left.first, by_view, pair, J.A, left.Bt, sums.blocks)
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def _add_blocks(first: int, by_view: _ByView, pair: I64, A: F64, Bt: F64, blocks: F64) -> None:
-    """Add A_k' Q_km A_m of each observation k and the later ones m of its point to their blocks.
-
-    Those of two observations of one view are transposed too.
-    """
+def _add_blocks(first: int, by_view: ByView, pair: I64, A: F64, Bt: F64, blocks: F64) -> None:
+    """Add A_k' Q_km A_m of observations k <= m of a point to their blocks, within one view transposed too."""
     order, block, end = by_view
     for i in range(len(order)):
         k = order[i] - first
@@ -217,12 +194,8 @@ def _add_block(blocks: F64, n: int, A: F64, k: int, m: int, Q: tuple[float, floa
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def _add_blocks_of_six(first: int, by_view: _ByView, pair: I64, A: F64, W: F64, blocks: F64) -> None:
-    """:func:`_add_blocks` for C = 6, the width of most adjustments, as A_k' A_k - W_k' W_m.
-
-    More products, but three times as fast: rows are read before they are written, so that the compiler makes
-    vectors of them.
-    """
+def _add_blocks_of_six(first: int, by_view: ByView, pair: I64, A: F64, Z: F64, blocks: F64) -> None:
+    """As :func:`_add_blocks` for C = 6: A_k' A_k - Z_k' Z_m, three times as fast (vectors)."""
     order, block, end = by_view
     for i in range(len(order)):
         k = order[i] - first
@@ -232,19 +205,19 @@ def _add_blocks_of_six(first: int, by_view: _ByView, pair: I64, A: F64, W: F64, 
             w = block[m]
             if w < 0:
                 continue
-            _subtract_product_of_six(blocks, pair[v, w], W, k, m)
+            _subtract_product_of_six(blocks, pair[v, w], Z, k, m)
             if m > k and v == w:
-                _subtract_product_of_six(blocks, pair[v, w], W, m, k)
+                _subtract_product_of_six(blocks, pair[v, w], Z, m, k)
 
 
 @kernel(inline="always", fastmath={"contract"}, forceinline=True)
-def _subtract_product_of_six(blocks: F64, n: int, W: F64, k: int, m: int) -> None:
+def _subtract_product_of_six(blocks: F64, n: int, Z: F64, k: int, m: int) -> None:
     """Subtract W_k' W_m from block n."""
-    x0, x1, x2, x3, x4, x5 = W[m, 0, 0], W[m, 0, 1], W[m, 0, 2], W[m, 0, 3], W[m, 0, 4], W[m, 0, 5]
-    y0, y1, y2, y3, y4, y5 = W[m, 1, 0], W[m, 1, 1], W[m, 1, 2], W[m, 1, 3], W[m, 1, 4], W[m, 1, 5]
-    z0, z1, z2, z3, z4, z5 = W[m, 2, 0], W[m, 2, 1], W[m, 2, 2], W[m, 2, 3], W[m, 2, 4], W[m, 2, 5]
+    x0, x1, x2, x3, x4, x5 = Z[m, 0, 0], Z[m, 0, 1], Z[m, 0, 2], Z[m, 0, 3], Z[m, 0, 4], Z[m, 0, 5]
+    y0, y1, y2, y3, y4, y5 = Z[m, 1, 0], Z[m, 1, 1], Z[m, 1, 2], Z[m, 1, 3], Z[m, 1, 4], Z[m, 1, 5]
+    z0, z1, z2, z3, z4, z5 = Z[m, 2, 0], Z[m, 2, 1], Z[m, 2, 2], Z[m, 2, 3], Z[m, 2, 4], Z[m, 2, 5]
     for a in range(6):
-        p, q, r = W[k, 0, a], W[k, 1, a], W[k, 2, a]
+        p, q, r = Z[k, 0, a], Z[k, 1, a], Z[k, 2, a]
         s0 = blocks[n, a, 0] - p * x0 - q * y0 - r * z0
         s1 = blocks[n, a, 1] - p * x1 - q * y1 - r * z1
         s2 = blocks[n, a, 2] - p * x2 - q * y2 - r * z2

@@ -18,8 +18,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.optimize.bundle.metric import BundleOptions, MetricBundleResult, refine_metric_bundle
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior
 
 PLANE = "planar scene"
@@ -117,10 +116,7 @@ class UpgradedCameras:
 
 
 def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
-    """Return the measures of ``TOLERANCES`` by name, and the largest rotation (chapter 7).
-
-    Of more than ``MAX_CAMERAS`` cameras, evenly many are used: all pairs are compared.
-    """
+    """Return the measures of ``TOLERANCES`` by name and the largest rotation, of ``MAX_CAMERAS`` cameras."""
     if len(metric.R) > MAX_CAMERAS:
         few = np.unique(np.rint(np.linspace(0, len(metric.R) - 1, MAX_CAMERAS)).astype(np.int64))
         metric = UpgradedCameras(metric.focal[few], metric.R[few], metric.C[few], metric.X)
@@ -189,9 +185,7 @@ def _dehomogenized(x: F64) -> F64:
 def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
     """Return lower bounds of the shifts of points at infinity from projective cameras [A | a] alone.
 
-    The plane at infinity is chosen such that the cameras come nearest to having no rotation: A_i - a_i p' =
-    diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]], linear in p, g, k, h. Small shifts are
-    necessary but not sufficient for a camera without rotation.
+    For the plane p with A_i - a_i p' nearest to diag(g, g, h), with roll [[g, -k, 0], [k, g, 0], [0, 0, h]].
     """
     identity = np.zeros((3, 3, 3))
     identity[0, 0, 0] = identity[0, 1, 1] = identity[1, 2, 2] = identity[2, 1, 0] = 1.0
@@ -222,10 +216,7 @@ def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
 
 
 def _planarity_ratio(X: F64) -> float:
-    """Rms thickness of 95 % of the points (N, 3) about their best plane over their rms extent in it.
-
-    Before, the farthest 5 % of the points are left out.
-    """
+    """Rms thickness of the nearest 95 % of points (N, 3) about their plane over their rms extent in it."""
 
     def nearest(distance: F64) -> I64:
         return np.argsort(distance, kind="stable")[: max(int(0.95 * len(distance)), 4)]
@@ -240,7 +231,7 @@ def _planarity_ratio(X: F64) -> float:
 
 
 def excess_equations(prior: IntrinsicsPrior, registered: B8) -> int:
-    """Equations beyond the 8 needed: m n_known + (m - 1) n_constant - 8 (Pollefeys et al. 1999)."""
+    """The counting argument: m n_known + (m - 1) n_constant - 8 (Pollefeys et al. 1999)."""
     unknown = 0
     for column in range(5):
         open_ = registered & ~np.isfinite(prior.std[:, column])
@@ -418,10 +409,7 @@ def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, foca
 
 
 def _has_excess_noise(evidence: Mapping[str, float]) -> bool:
-    """Whether the noise of metric over projective cameras means a wrong prior.
-
-    A principal point or distortion that only the projective cameras can absorb gives a smaller ratio.
-    """
+    """Whether the noise of metric over projective cameras means a wrong prior (distortion gives less)."""
     return evidence.get("noise_ratio_to_projective", 0.0) >= 3.0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.optimize.bundle.metric_kernels import FOCAL, POSE_DOF, MetricCameras
+from thesisrecon.optimize.bundle.projection import FOCAL, POSE_DOF, MetricCameras
 from thesisrecon.records import IntrinsicsPrior
 
 NONE = -1
@@ -77,8 +77,7 @@ def number_unknowns(
 ) -> tuple[IntrinsicUnknowns, F64, F64]:
     """Return the unknowns, their start (n,), and the table (G, C) with known values put in.
 
-    A value starts at the mean of the ``used`` rows (G,) that share it; one that no image observes is not an
-    unknown. ``free`` (C,) are the intrinsics that move.
+    Starts are means of the ``used`` rows (G,) that share a value; ``free`` (C,) intrinsics move.
     """
     table = _log_focal(cameras.intrinsics)
     prior = prior or IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
@@ -142,10 +141,7 @@ class _Parts:
 def _number_column(
     c: int, value: I64, rows: tuple[F64, B8], prior: IntrinsicsPrior, parts: _Parts
 ) -> tuple[F64, I64]:
-    """Return start and unknown of each row for one intrinsic; rows of equal ``value`` (G,) share it.
-
-    The prior of a shared value is the narrowest of its rows, with the average mean of equally narrow ones.
-    """
+    """Start and unknown of the rows of an intrinsic; equal ``value`` (G,) share the narrowest prior."""
     at, used = rows
     std = prior.std[:, c]
     tightest = np.lexsort((std, value))

@@ -7,43 +7,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.conditioning import scene_frame
-from thesisrecon.optimize.bundle.covariance import (
-    SIMILARITY_DOF,
-    bundle_covariances,
-    camera_blocks,
-    point_covariances,
-    robust_sigma,
-)
+from thesisrecon.geometry.homogeneous import scene_frame
+from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
-from thesisrecon.optimize.bundle.intrinsic_unknowns import (
-    IntrinsicColumns,
-    IntrinsicUnknowns,
-    assign_columns,
-    number_unknowns,
-)
-from thesisrecon.optimize.bundle.metric_kernels import (
+from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicColumns, IntrinsicUnknowns
+from thesisrecon.optimize.bundle.projection import (
     POSE_DOF,
+    Jacobians,
     MetricCameras,
     MetricModel,
+    Observations,
+    SortedObservations,
+    Weighting,
     linearize_metric,
     metric_cost,
     move_poses,
     project_metric,
-)
-from thesisrecon.optimize.bundle.observations import (
-    Jacobians,
-    Observations,
-    SortedObservations,
-    Weighting,
     sort_observations,
 )
-from thesisrecon.optimize.bundle.schur import (
-    BundleLayout,
-    BundleStep,
-    BundleSystem,
-    build_layout,
-)
+from thesisrecon.optimize.bundle.schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
 from thesisrecon.records import IntrinsicsPrior
 
@@ -159,8 +141,8 @@ class _MetricProblem:
         leverage = np.empty_like(residual)
         self.linearize(state)
         sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        dof = POSE_DOF * int(self.moves.sum()) + self.values.size - SIMILARITY_DOF
-        return robust_sigma(residual, leverage, dof)
+        dof = POSE_DOF * int(self.moves.sum()) + self.values.size - covariance.SIMILARITY_DOF
+        return covariance.robust_sigma(residual, leverage, dof)
 
 
 def refine_metric_bundle(
@@ -211,20 +193,17 @@ def refine_metric_bundle(
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
-    """Return the minimum: by reweighting, which is safe far from it, then by steps close to Newton's.
-
-    Below a relative gain of 0.001 the second derivative of the loss is used; at least 0.3 of the curvature
-    along a residual is kept.
-    """
+    """Return the minimum: by reweighting, then by steps close to Newton's that keep 0.3 of the curvature."""
     most, settled = options.max_iterations, options.settled
     found = run_levenberg_marquardt(
-        problem, state, max_iterations=most, tolerance=1e-3, min_camera_gain=settled
-    )
+        problem.linearize, problem.retract, problem.cost, state,
+        max_iterations=most, tolerance=1e-3, min_camera_gain=settled,
+    )  # fmt: skip
     if found.iterations < most:
         near = replace(problem, weighting=problem.weighting._replace(min_curvature=0.3))
         found = run_levenberg_marquardt(
-            near, found.state, max_iterations=most - found.iterations, min_camera_gain=settled,
-            initial_damping=found.damping,
+            near.linearize, near.retract, near.cost, found.state,
+            max_iterations=most - found.iterations, min_camera_gain=settled, initial_damping=found.damping,
         )  # fmt: skip
     return found
 
@@ -239,8 +218,8 @@ def _metric_problem(
     """
     group, (moves, free) = np.asarray(cameras.group, dtype=np.int64), unknown
     used = np.bincount(group[moves], minlength=len(cameras.intrinsics)) > 0
-    values, start, table = number_unknowns(cameras, used, free, prior)
-    columns = assign_columns(values, group, np.flatnonzero(free), moves)
+    values, start, table = intrinsic_unknowns.number_unknowns(cameras, used, free, prior)
+    columns = intrinsic_unknowns.assign_columns(values, group, np.flatnonzero(free), moves)
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
         threads=options.threads,
@@ -262,12 +241,12 @@ def _covariances(
     number = problem.columns.columns_of(problem.values.number)
     own = np.arange(int(seen.sum()))
     row, column = (layout.row, layout.column) if points else (own, own)
-    blocks = camera_blocks(reduced, m.R[seen], m.t[seen], row, column)
+    blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column)
     poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
-    intrinsics, poses[seen] = bundle_covariances(
+    intrinsics, poses[seen] = covariance.bundle_covariances(
         blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
     )
     if not points:
         return intrinsics, poses, None
-    of_points = point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
+    of_points = covariance.point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
     return intrinsics, poses, of_points / scale**2

@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.conditioning import (
+from thesisrecon.geometry.homogeneous import (
     SpaceFrame,
     centring_transform,
     pixel_conditioning,
@@ -22,21 +22,19 @@ from thesisrecon.geometry.conditioning import (
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.triangulation import PASSES, sort_by_point, triangulate_linear, triangulate_midpoint
-from thesisrecon.optimize.bundle.metric_kernels import (
-    MetricModel,
-    linearize_metric,
-    metric_cost,
-    move_poses,
-    project_metric,
-)
-from thesisrecon.optimize.bundle.observations import (
+from thesisrecon.optimize.bundle.projection import (
     Jacobians,
+    MetricModel,
     Observations,
     SortedObservations,
     Weighting,
     away_from_zero,
+    linearize_metric,
     loss_value,
     loss_weight,
+    metric_cost,
+    move_poses,
+    project_metric,
     sort_observations,
 )
 from thesisrecon.optimize.bundle.projective import (
@@ -46,12 +44,7 @@ from thesisrecon.optimize.bundle.projective import (
     tangent_reflectors,
     tangent_step,
 )
-from thesisrecon.optimize.least_squares import (
-    DenseProblem,
-    DenseSystem,
-    invert_information,
-    run_levenberg_marquardt,
-)
+from thesisrecon.optimize.least_squares import DenseSystem, invert_information, run_levenberg_marquardt
 
 TriangulationMethod = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
@@ -193,10 +186,7 @@ def refine_points(
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
-    """Move each point to a minimum of its squared reprojection errors; points may cross focal planes.
-
-    Works in a frame in which the cameras' rows are orthonormal.
-    """
+    """Move each point to a minimum of its squared reprojection errors, in a frame of orthonormal cameras."""
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
@@ -285,10 +275,10 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
         tangent_step(state, s.vP, s.bP, step[None], moved)
         return moved
 
-    problem = DenseProblem(
-        linearize, retract, lambda s: float(projective_cost(UnitState.at(s, points), obs, weighting))
-    )
-    end = run_levenberg_marquardt(problem, start / np.linalg.norm(start), max_iterations=iterations).state
+    end = run_levenberg_marquardt(
+        linearize, retract, lambda s: float(projective_cost(UnitState.at(s, points), obs, weighting)),
+        start / np.linalg.norm(start), max_iterations=iterations,
+    ).state  # fmt: skip
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), (frame.S @ frame.N).T)
     raw = frame.cameras_back(np.linalg.inv(T) @ end.reshape(3, 4)).ravel()
@@ -331,8 +321,10 @@ def refine_pose(
         intrinsics[0, 0] = state.intrinsics[0, 0] * np.exp(np.clip(moves[0], -3.0, 3.0))
         return state._replace(R=R, t=t, intrinsics=intrinsics)
 
-    problem = DenseProblem(linearize, retract, lambda state: float(metric_cost(state, obs, weighting)))
-    end = run_levenberg_marquardt(problem, start, max_iterations=iterations).state
+    end = run_levenberg_marquardt(
+        linearize, retract, lambda state: float(metric_cost(state, obs, weighting)),
+        start, max_iterations=iterations,
+    ).state  # fmt: skip
     units = np.ones(6 + len(columns))
     units[3:6] = 1.0 / scale
     covariance = invert_information(linearize(end).hessian) * units * units[:, None]

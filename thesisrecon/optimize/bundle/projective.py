@@ -12,9 +12,9 @@ import numpy as np
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64
-from thesisrecon.geometry.conditioning import pixel_conditioning, whitened_frame
+from thesisrecon.geometry.homogeneous import pixel_conditioning, whitened_frame
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points
-from thesisrecon.optimize.bundle.observations import (
+from thesisrecon.optimize.bundle.projection import (
     TINY,
     Jacobians,
     Observations,
@@ -84,10 +84,7 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
 
 @kernel
 def linearize_projective(state: UnitState, obs: Observations, weighting: Weighting, J: Jacobians) -> float:
-    """Fill weighted residuals and their Jacobians, A (K, 2, 11) and B (K, 2, 3); return the cost.
-
-    With u = P X: d pi = (1 / u2) [[1, 0, -x], [0, 1, -y]] du (methods 6.7).
-    """
+    """Fill weighted residuals, A (K, 2, 11), B (K, 2, 3): d pi = [[1, 0, -x], [0, 1, -y]] du / u2; cost."""
     cost = 0.0
     for k in range(len(obs.xy)):
         i, j = obs.view_index[k], obs.point_index[k]
@@ -210,8 +207,9 @@ def refine_projective_bundle(
     points, X_norms = _unit_rows(frame.points(X), seen_points)
     start = UnitState.at(cameras, points)
     end = run_levenberg_marquardt(
-        problem, start, max_iterations=max_iterations, min_camera_gain=settled * (loss_px * scale) ** 2
-    ).state
+        problem.linearize, problem.retract, problem.cost, start,
+        max_iterations=max_iterations, min_camera_gain=settled * (loss_px * scale) ** 2,
+    ).state  # fmt: skip
 
     P_back = frame.cameras_back(np.linalg.inv(T) @ (end.P * P_norms[:, None]).reshape(-1, 3, 4))
     X_back = frame.points_back(end.X * X_norms[:, None])

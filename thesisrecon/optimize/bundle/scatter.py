@@ -14,7 +14,7 @@ import scipy
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I32, I64
-from thesisrecon.geometry.conditioning import scene_frame
+from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle.covariance import (
     gauge_basis,
     invert_in_inner_gauge,
@@ -22,8 +22,15 @@ from thesisrecon.optimize.bundle.covariance import (
     unit_columns,
 )
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
-from thesisrecon.optimize.bundle.metric_kernels import POSE_DOF, MetricCameras, MetricModel, linearize_metric
-from thesisrecon.optimize.bundle.observations import Jacobians, Observations, Weighting
+from thesisrecon.optimize.bundle.projection import (
+    POSE_DOF,
+    Jacobians,
+    MetricCameras,
+    MetricModel,
+    Observations,
+    Weighting,
+    linearize_metric,
+)
 from thesisrecon.records import IntrinsicsPrior
 
 # Errors are correlated over large parts of the scene: their scatter is that of few large blocks.

@@ -1,8 +1,8 @@
 """Schur complement of bundle adjustment: points are eliminated, cameras are solved together.
 
-[[H, W], [W', V]] (a, b) = -(g, h) with V block-diagonal: (H - W V^-1 W') a = -g + W V^-1 h, then b = -V^-1 (h
-+ W' a). Points are eliminated in chunks: the sum of their sums loses fewer digits than one long sum. A banded
-Cholesky factor is linear in the views if an order keeps neighbours together (corridors, streets).
+[[U, W], [W', V]] (a, b) = (e_a, e_b) with V block-diagonal: (U - W V^-1 W') a = e_a - W V^-1 e_b, then b =
+V^-1 (e_b - W' a) (HZ A6.3). Points are eliminated in chunks, whose sums lose fewer digits than a long sum. A
+banded Cholesky factor is linear in the views if an order keeps neighbours together (streets).
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 from thesisrecon.optimize.bundle.elimination import (
     BlockIndex,
+    ByView,
     PointSums,
     ReducedSums,
     eliminate_points,
+    sort_by_view,
     substitute_points,
 )
-from thesisrecon.optimize.bundle.observations import Jacobians, Observations, SortedObservations
+from thesisrecon.optimize.bundle.projection import Jacobians, Observations, SortedObservations
 
 CHUNK = 4096
 
@@ -141,6 +143,7 @@ class BundleLayout:
     row: I64
     column: I64
     chunks: tuple[tuple[int, int], ...]
+    by_view: tuple[ByView, ...]
     solver: BandedCholesky | None
     threads: int = 1
 
@@ -203,7 +206,8 @@ def build_layout(
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
     index = BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
     solver = choose_solver(row, column, n, width, border)
-    return BundleLayout(observations, index, width, border, row, column, chunks, solver, threads)
+    by_view = tuple(sort_by_view(*chunk, index) for chunk in chunks)
+    return BundleLayout(observations, index, width, border, row, column, chunks, by_view, solver, threads)
 
 
 # Rows, columns and values of the information on the camera columns, of which pairs are in the border, and
@@ -230,7 +234,8 @@ class BundleSystem:
 
         def eliminate(n: int) -> ReducedSums:
             part = layout.sums()
-            eliminate_points(*layout.chunks[n], damping, self.jacobians, layout.index, part, points)
+            by_view = layout.by_view[n]
+            eliminate_points(*layout.chunks[n], damping, self.jacobians, layout.index, by_view, part, points)
             return part
 
         total, *others = layout.map_chunks(eliminate)
@@ -248,8 +253,8 @@ class BundleSystem:
     def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
         """Return the damped step, its predicted gain of cost, and that of the cameras; None if singular.
 
-        The gain of the cameras is the criterion of convergence: points whose observations contradict each
-        other move for many iterations without any effect on the cameras.
+        The gain of the cameras is the criterion: points with contradictory observations move for long without
+        effect.
         """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver

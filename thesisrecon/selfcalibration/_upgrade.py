@@ -1,4 +1,4 @@
-"""Candidates of self-calibration: from plane at infinity and calibrations to the selected upgrade.
+"""The upgrade to a metric frame from plane at infinity and K (HZ 19.2): candidates, selection and check.
 
 The identifiability is that of the upgraded cameras, or of projective ones where self-calibration failed.
 """
@@ -14,19 +14,12 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry.conditioning import pixel_from_unit
+from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
-from thesisrecon.optimize.bundle.identifiability import (
-    CalibrationProblem,
-    excess_equations,
-    identifiability_report,
-    identifiability_sentences,
-    nearest_critical_motion,
-    projective_infinity_shifts,
-)
-from thesisrecon.optimize.bundle.metric_kernels import MetricCameras
-from thesisrecon.optimize.bundle.observations import Observations
-from thesisrecon.optimize.noise import noise_from_distances
+from thesisrecon.optimize.bundle import identifiability
+from thesisrecon.optimize.bundle.identifiability import CalibrationProblem
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
+from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import (
     IdentifiabilityReport,
     IntrinsicsPrior,
@@ -48,9 +41,8 @@ def check_identifiability(
 ) -> IdentifiabilityReport:
     """Check whether a self-calibration is determined by the images and the prior (chapter 7).
 
-    A metric bundle adjustment of a subset of the observations gives cameras and the covariance of their focal
-    lengths under the prior; a second covariance, with free aspect ratio and principal point, shows the effect
-    of the prior of these.
+    Bundle adjustment of some observations gives the covariance of the focal lengths under the prior; a second
+    one, with free aspect ratio and principal point, shows the effect of the prior of these.
     """
     if reconstruction.inlier.any():
         problem = _bundle_problem(reconstruction, upgrade, prior)
@@ -58,8 +50,8 @@ def check_identifiability(
         problem = _virtual_problem(reconstruction, upgrade, prior)
     if problem is None:
         return identifiability_without_calibration(reconstruction, prior)
-    excess = excess_equations(prior, reconstruction.registered)
-    return identifiability_report(problem, excess, iterations=_MAX_ITERATIONS)
+    excess = identifiability.excess_equations(prior, reconstruction.registered)
+    return identifiability.identifiability_report(problem, excess, iterations=_MAX_ITERATIONS)
 
 
 def _virtual_problem(
@@ -81,13 +73,15 @@ def identifiability_without_calibration(
 ) -> IdentifiabilityReport:
     """Report the nearest critical motion of the projective cameras alone, after self-calibration failed."""
     frame = build_frame(reconstruction, prior, pixel_from_unit(reconstruction.sizes))
-    evidence = projective_infinity_shifts(frame.A, frame.a)
-    motion, distance = nearest_critical_motion(evidence)
+    evidence = identifiability.projective_infinity_shifts(frame.A, frame.a)
+    motion, distance = identifiability.nearest_critical_motion(evidence)
     motion = motion if distance < 1.0 else ""
     evidence["critical_motion_distance"] = distance
-    evidence["excess_equations"] = float(excess_equations(prior, reconstruction.registered))
+    evidence["excess_equations"] = float(identifiability.excess_equations(prior, reconstruction.registered))
     given = float(prior.std[reconstruction.registered, 0].max())
-    sentences = identifiability_sentences(motion, evidence, identifiable=False, focal_std=given)
+    sentences = identifiability.identifiability_sentences(
+        motion, evidence, identifiable=False, focal_std=given
+    )
     return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
 
 
@@ -243,10 +237,11 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
     return groups
 
 
-def plane_from_focals(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Planes (2 B, 3) from focals (B,) of the reference and of another camera, for both of its signs.
+def gherardi_fusiello_planes(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
+    """Planes at infinity (2 B, 3) of the focals (B,) of two views (Gherardi and Fusiello, ECCV 2010).
 
-    Gherardi and Fusiello, ECCV 2010: two calibrated views determine the plane at infinity.
+    For both signs of the other camera. Bougnoux's formula (ICCV 1998) gives two focals from F alone, but has
+    no solution if the optical axes meet, which is usual: focals are scanned instead.
     """
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
@@ -310,7 +305,7 @@ def select_candidate(
         if len(chosen) == max_candidates or not np.isfinite(tried.cost):
             break
         if not any(_same_focals(frame, tried, other) for other, _ in chosen):
-            upgrade = _upgrade_of_candidate(frame, reconstruction, tried, min_in_front_ratio)
+            upgrade = _hartley_zisserman_upgrade(frame, reconstruction, tried, min_in_front_ratio)
             chosen += [(tried, upgrade)] if upgrade is not None else []
     if not chosen:
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
@@ -378,10 +373,10 @@ def _calibration_std(frame: ReferenceFrame, K: F64, candidate: Candidate, focal_
     return K_std
 
 
-def _upgrade_of_candidate(
+def _hartley_zisserman_upgrade(
     frame: ReferenceFrame, reconstruction: Reconstruction, candidate: Candidate, min_in_front_ratio: float
 ) -> Upgrade | None:
-    """Return the upgrade, mirrored if most points are behind; None if singular or with too few in front."""
+    """The upgrade (HZ 19.2), mirrored if most points are behind; None if singular or too few in front."""
     H, K_reference = np.eye(4), candidate.K[frame.reference]
     H[:3, :3], H[3, :3] = K_reference, -candidate.plane @ K_reference  # HZ 19.2
     if not (np.isfinite(candidate.K).all() and np.isfinite(H).all() and abs(np.linalg.det(H)) > 1e-300):
