@@ -32,13 +32,9 @@ FEW_SAMPLES = Budget(confidence=0.9999, max_samples=2000)
 
 
 def _pose_and_focal(
-    model: MetricEstimate,
-    k: I64,
-    row: int,
-    threshold_px: float,
-    zooms: tuple[float, ...],
+    model: MetricEstimate, k: I64, row: int, threshold_px: float, zooms: tuple[float, ...],
     rng: np.random.Generator,
-) -> tuple[F64, F64, F64, B8] | None:
+) -> tuple[F64, F64, F64, B8] | None:  # fmt: skip
     """R, t, intrinsics and inliers with most support of observations ``k`` over the tried focal lengths."""
     t, best = model.tracks, None
     for zoom in zooms:

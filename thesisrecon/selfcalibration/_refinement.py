@@ -64,53 +64,27 @@ class RotationCriterion:
         E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
         return _weighted_entries(E)
 
+    def residuals(self, frame: ReferenceFrame, theta: F64) -> F64:
+        """Residuals (B, 6 R + G) of cameras and focal priors for hypotheses (p, log f) (B, 3 + G)."""
+        cameras = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]).reshape(len(theta), -1)
+        return np.concatenate([cameras, self._focal_prior_residuals(frame, theta[:, 3:])], axis=1)
+
+    def loss(self, frame: ReferenceFrame, r: F64) -> tuple[F64, F64]:
+        """Costs (B,) per camera and weights (B, 6 R + G) of residuals, soft-L1 of each camera's norm."""
+        cameras, priors = np.split(r, [6 * len(frame.views)], axis=1)
+        robust, weight = soft_l1(np.sum(cameras.reshape(len(r), -1, 6) ** 2, axis=-1), self.scale)
+        cost = (robust.sum(axis=1) + np.sum(priors**2, axis=1)) / len(frame.views)
+        return cost, np.concatenate([np.repeat(weight, 6, axis=1), np.ones_like(priors)], axis=1)
+
     def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
         """Return the robust cost (B,) per camera of planes (B, 3) with log focal lengths (B, G)."""
-        norm2 = np.sum(self.camera_residuals(frame, p, log_f) ** 2, axis=-1)
-        robust = soft_l1(norm2, self.scale)[0]
-        pull = self._focal_prior_residuals(frame, log_f)
-        return np.asarray((robust.sum(axis=1) + np.sum(pull**2, axis=1)) / len(frame.views), dtype=np.float64)
+        return self.loss(frame, self.residuals(frame, np.concatenate([p, log_f], axis=1)))[0]
 
     def _focal_prior_residuals(self, frame: ReferenceFrame, log_f: F64) -> F64:
         weak = self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
         known = np.isfinite(frame.focal_std)
         scale = np.where(known, frame.focal_std, 1.0)
         return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
-
-    def _linearized(self, frame: ReferenceFrame, theta: F64) -> tuple[F64, F64]:
-        """Return residuals (B, 6 R + G) of cameras and focal priors, soft-L1 weighted, and derivatives."""
-        norm2 = np.sum(self.camera_residuals(frame, theta[:, :3], theta[:, 3:]) ** 2, axis=-1)
-        root_weights = (1.0 + norm2 / self.scale**2) ** -0.25
-
-        def residuals(x: F64) -> F64:
-            cameras = self.camera_residuals(frame, x[:, :3], x[:, 3:]) * root_weights[..., None]
-            priors = self._focal_prior_residuals(frame, x[:, 3:])
-            return np.concatenate([cameras.reshape(len(x), -1), priors], axis=1)
-
-        return residuals(theta), central_differences(residuals, theta)
-
-
-def _descend(
-    normal_equations: Callable[[F64], tuple[F64, F64]], cost_of: Callable[[F64], F64], x: F64,
-    iterations: int, *, damping: float, decrease: float, max_damping: float, tolerance: float,
-    project: Callable[[F64], F64] = lambda x: x,
-) -> tuple[F64, F64]:  # fmt: skip
-    """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; return x and costs (B,)."""
-    cost, damped = cost_of(x), np.full(len(x), damping)
-    for _ in range(iterations):
-        N, g = normal_equations(x)
-        diagonal = np.einsum("bii->bi", N)
-        # Products with an identity matrix would be NaN where the diagonal is infinite.
-        diagonal += damped[:, None] * (diagonal + 1e-12)
-        trial = project(x - _solve_batch(N, g))
-        trial_cost = cost_of(trial)
-        better = np.asarray(trial_cost < cost)
-        finished = (better & (cost - trial_cost <= tolerance * cost)) | ~np.isfinite(cost)
-        x, cost = np.where(better[:, None], trial, x), np.where(better, trial_cost, cost)
-        damped = np.where(better, damped / decrease, damped * 4.0)
-        if (finished | (damped > max_damping)).all():
-            break
-    return x, cost
 
 
 def _solve_batch(N: F64, g: F64) -> F64:
@@ -126,53 +100,69 @@ def _solve_batch(N: F64, g: F64) -> F64:
         return np.zeros_like(g)
 
 
+def minimize_batch(
+    residuals: Callable[[F64], F64], x: F64, *, iterations: int, loss_scale: float = np.inf,
+    loss: Callable[[F64], tuple[F64, F64]] | None = None, project: Callable[[F64], F64] = lambda x: x,
+    damping: float = 1e-2, decrease: float = 6.0, max_damping: float = 1e10, tolerance: float = 1e-14,
+) -> tuple[F64, F64]:  # fmt: skip
+    """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; minima and costs (B,).
+
+    ``residuals`` maps (B, D) to (B, M) row by row, ``loss`` these to costs and weights, by default means of
+    soft-L1 losses.
+    """
+    loss = loss or (lambda r: _mean_loss(r, loss_scale))
+    cost, damped = loss(residuals(x))[0], np.full(len(x), damping)
+    for _ in range(iterations):
+        r, J = residuals(x), central_differences(residuals, x)
+        weight = loss(r)[1]
+        N, g = np.einsum("bmi,bm,bmj->bij", J, weight, J), np.einsum("bmi,bm->bi", J, weight * r)
+        diagonal = np.einsum("bii->bi", N)
+        # Products with an identity matrix would be NaN where the diagonal is infinite.
+        diagonal += damped[:, None] * (diagonal + 1e-12)
+        trial = project(x - _solve_batch(N, g))
+        trial_cost = loss(residuals(trial))[0]
+        better = np.asarray(trial_cost < cost)
+        finished = (better & (cost - trial_cost <= tolerance * cost)) | ~np.isfinite(cost)
+        x, cost = np.where(better[:, None], trial, x), np.where(better, trial_cost, cost)
+        damped = np.where(better, damped / decrease, damped * 4.0)
+        if (finished | (damped > max_damping)).all():
+            break
+    return x, cost
+
+
+def _mean_loss(r: F64, scale: float) -> tuple[F64, F64]:
+    """Means (B,) of the soft-L1 losses of residuals (B, M), inf where NaN, and their weights."""
+    losses, weight = (r**2, np.ones_like(r)) if np.isinf(scale) else soft_l1(r**2, scale)
+    return np.nan_to_num(losses.mean(axis=1), nan=np.inf), weight
+
+
 def refine_hypotheses(
     criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, *, planes_only: bool = False
 ) -> tuple[F64, F64]:
     """Refine hypotheses (p, log f) (B, 3 + G) at once; return them with their costs (B,)."""
+    moving = 3 if planes_only else theta.shape[1]
 
-    def normal_equations(x: F64) -> tuple[F64, F64]:
-        r, J = criterion._linearized(frame, x)
-        if planes_only:
-            J[:, :, 3:] = 0.0
-        return np.einsum("bri,brj->bij", J, J), np.einsum("bri,br->bi", J, r)
+    def with_fixed(x: F64) -> F64:
+        return np.concatenate([x, theta[:, moving:]], axis=1)
 
-    return _descend(
-        normal_equations, lambda x: criterion.cost(frame, x[:, :3], x[:, 3:]), theta, 25,
-        damping=1e-3, decrease=5.0, max_damping=1e8, tolerance=1e-10,
+    x, cost = minimize_batch(
+        lambda x: criterion.residuals(frame, with_fixed(x)), theta[:, :moving], iterations=25,
+        loss=lambda r: criterion.loss(frame, r), damping=1e-3, decrease=5.0, max_damping=1e8, tolerance=1e-10,
         project=lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
     )  # fmt: skip
+    return with_fixed(x), cost
 
 
 def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
     """Standard deviations (G,) of the log focals at a minimum (p, log f) by (J'J)^-1; inf if singular."""
-    r, J = (part[0] for part in criterion._linearized(frame, theta[None]))
+    r = criterion.residuals(frame, theta[None])
+    J = central_differences(lambda x: criterion.residuals(frame, x), theta[None])[0]
+    root = np.sqrt(criterion.loss(frame, r)[1][0])
     dof = max(5 * len(frame.views) - len(theta), 1)
-    noise = float(np.sqrt(np.sum(r**2) / dof))
+    noise = float(np.sqrt(np.sum((root * r[0]) ** 2) / dof))
+    J = root[:, None] * J
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
     S, Vt = np.linalg.svd(J / scale)[1:]
     with np.errstate(divide="ignore"):
         variance = np.sum((Vt / np.maximum(S, 1e-300)[:, None]) ** 2, axis=0) / scale**2
     return np.asarray(noise * np.sqrt(variance[3:]), dtype=np.float64)
-
-
-def minimize_batch(
-    residuals: Callable[[F64], F64], starts: F64, *, iterations: int, loss_scale: float = np.inf
-) -> tuple[F64, F64]:
-    """Minimize residuals, (B, D) to (B, M) row by row, from many starts; return minima and mean losses."""
-
-    def normal_equations(x: F64) -> tuple[F64, F64]:
-        r, J = residuals(x), central_differences(residuals, x)
-        weight = (1.0 + (r / loss_scale) ** 2) ** -0.5
-        return np.einsum("bmi,bm,bmj->bij", J, weight, J), np.einsum("bmi,bm->bi", J, weight * r)
-
-    def cost_of(x: F64) -> F64:
-        squares = residuals(x) ** 2
-        if np.isfinite(loss_scale):
-            squares = soft_l1(squares, loss_scale)[0]
-        return np.asarray(np.nan_to_num(squares.mean(axis=1), nan=np.inf))
-
-    return _descend(
-        normal_equations, cost_of, starts, iterations,
-        damping=1e-2, decrease=6.0, max_damping=1e10, tolerance=1e-14,
-    )  # fmt: skip
