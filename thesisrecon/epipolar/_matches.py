@@ -121,8 +121,7 @@ def check_start(F: F64, frame: PairFrame) -> F64:
     return f
 
 
-# Standard deviation of the noise's tail relative to the noise.
-TAIL = 4.0
+TAIL = 4.0  # standard deviation of the noise's tail relative to the noise
 
 
 @kernel

@@ -18,10 +18,8 @@ LANES = 32
 # matches, 21 and 30 the last three points of either image (9 each), 39 and 45 the two members (6 each) of
 # the pencil basis, 51 the three coefficients of the monic cubic.
 TO_BASIS_1, TO_BASIS_2, FIRST, SECOND, ROWS = 0, 9, 39, 45, 54
-# Points scored between two tests.
-STRIDE = 16
-# The sequential test rejects at most one correct F in a thousand.
-LOG_REJECTION_RATIO = np.log(1e3)
+STRIDE = 16  # points scored between two tests
+LOG_REJECTION_RATIO = np.log(1e3)  # the sequential test rejects at most one correct F in a thousand
 LARGEST = 1 << 40
 
 Three = tuple[float, float, float]

@@ -34,8 +34,7 @@ MINIMUM = 8
 # Standard errors by which a competing model must be worse: right models of facades reach 7, wrong ones 2.
 # Not a probability, since matches of repeated structure are dependent.
 MIN_MARGIN = 3.0
-# Inliers of which the covariance and the contradictions are tested.
-SAMPLED = 60
+SAMPLED = 60  # inliers of which the covariance and the contradictions are tested
 
 
 def _select_distinct(order: I64, agree: F64, weights: F64, chosen: list[int], most: int) -> None:

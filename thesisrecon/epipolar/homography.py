@@ -197,12 +197,9 @@ def _plane_inliers(F: F64, columns: F64, gate: float) -> F64:
 
 
 _SAMPLE, _PARAMETERS = 4, 8
-# Rounds to find the inliers.
-_ROUNDS = 8
-# Residuals in units of the frame below which they are rounding errors.
-_EXACT = 1e-9
-# Ratio of singular values of the equations below which they are dependent.
-_DEPENDENT = 1e-9
+_ROUNDS = 8  # rounds to find the inliers
+_EXACT = 1e-9  # residuals in units of the frame below which they are rounding errors
+_DEPENDENT = 1e-9  # ratio of singular values of the equations below which they are dependent
 
 
 @dataclass(frozen=True)

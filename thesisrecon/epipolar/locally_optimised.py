@@ -17,10 +17,8 @@ from thesisrecon.records import FundamentalFit
 
 MINIMUM = 8
 PARAMETERS = 7
-# Prior of wrong matrices: of 100 points 5 lie within the gate.
-PRIOR = (100.0, 5.0)
-# Prior spread of wrong matches in units of the frame.
-SPREAD = 1.0
+PRIOR = (100.0, 5.0)  # prior of wrong matrices: of 100 points 5 lie within the gate
+SPREAD = 1.0  # prior spread of wrong matches in units of the frame
 
 
 @dataclass(frozen=True)

@@ -113,8 +113,7 @@ def distinct_real_roots(roots: F64) -> F64:
 # 95 % quantiles of the chi-square distribution with one and two degrees of freedom.
 CHI2_1_95, CHI2_2_95 = 3.841458820694124, 5.991464547107979
 MINIMUM = 8
-# Samples solved at once.
-_BATCH = 50
+_BATCH = 50  # samples solved at once
 
 
 class _InlierTest(NamedTuple):

@@ -25,8 +25,7 @@ SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
 CORRECTIONS = 8
 BLOCK = 128
-# Stands for an infinite width of the loss; its square is still finite.
-UNBOUNDED = 1e150
+UNBOUNDED = 1e150  # stands for an infinite width of the loss; its square is still finite
 # Smallest curvature relative to the largest: the F of a plane stays uncertain but finite.
 FLATTEST_REL = 1e-14
 

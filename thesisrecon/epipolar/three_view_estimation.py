@@ -24,8 +24,7 @@ from thesisrecon.optimize.least_squares import (
     run_levenberg_marquardt,
 )
 
-# Seven points, thirteen lines, or a mixture (HZ 16.1).
-NEEDED_EQUATIONS = 26
+NEEDED_EQUATIONS = 26  # seven points, thirteen lines, or a mixture (HZ 16.1)
 # Largest relative standard deviation of T. Planes, rotations and random matches give 0.5 to 1.5 at any noise;
 # scenes with depth and noise of a hundredth of the parallax below 0.1.
 WEAK = 0.4
@@ -33,8 +32,7 @@ WEAK = 0.4
 # lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
 # constraints of the cameras resolve.
 SAME_NOISE, FAMILY = 1.25, 6
-# Minimum number of points for the search for wrong ones.
-_SEARCHED = 12
+_SEARCHED = 12  # minimum number of points for the search for wrong ones
 NO_POINTS, NO_SEGMENTS = np.zeros((0, 2)), np.zeros((3, 0, 2, 2))
 UNDETERMINED = "the matches do not determine the trifocal tensor"
 REMEDY = "use matches off one plane from three different positions, and check for wrong matches"

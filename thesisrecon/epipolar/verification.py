@@ -34,15 +34,12 @@ from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit, Matches, TwoView
 
 MINIMUM = 12
-# Squared distance in sigma^2 of the matches near a homography.
-NEAR = 11.0
+NEAR = 11.0  # squared distance in sigma^2 of the matches near a homography
 # Squared distance in sigma^2 beyond which a match is off the homography; noise exceeds it once in 3000.
 FAR = 16.0
-# Maximum log10 of the false alarms of the matches off the simpler model.
-MAX_CHANCE = -3.0
+MAX_CHANCE = -3.0  # maximum log10 of the false alarms of the matches off the simpler model
 BAND = 2.5
-# Degrees of freedom of F beyond a homography and beyond [e]x.
-EPIPOLE, BEYOND_TRANSLATION = 2, 5
+EPIPOLE, BEYOND_TRANSLATION = 2, 5  # degrees of freedom of F beyond a homography and beyond [e]x
 # Probability of rejecting a rotation by its eigenvalues (two-sided) and by the camera test.
 ROTATION_RISK = 1e-3
 CORRECTIONS = 10

@@ -31,8 +31,7 @@ E0, E1, E2, G, kappa."""
 _DEGREE = 6
 _MONOTONE = 3.0
 """If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
-_RANK = 1e-13
-"""Singular values below this fraction of the largest are zero."""
+_RANK = 1e-13  # singular values below this fraction of the largest are zero
 
 
 @kernel

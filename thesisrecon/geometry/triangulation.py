@@ -19,8 +19,7 @@ from thesisrecon.geometry.small_matrices import orthogonalize_columns
 
 PASSES = 10
 """Passes of the iterated linear method; by then those that converge have done so (Hartley and Sturm)."""
-_AT_REST = 1e-6
-"""Relative change of all depths at which the iterated linear method has converged."""
+_AT_REST = 1e-6  # relative change of all depths at which the iterated linear method has converged
 _ONE_CENTRE = 1e-12
 """Distance of two centres, over 1 plus that from the origin, below which they are equal to rounding."""
 _PARALLEL = 1e-14

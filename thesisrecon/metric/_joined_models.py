@@ -21,13 +21,11 @@ from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import Reconstruction, Similarity
 
-MIN_COMMON, MIN_SHARE = 6, 0.6
-"""Common points that must agree, and the smallest share of the common points."""
+MIN_COMMON, MIN_SHARE = 6, 0.6  # common points that must agree, and the smallest share of the common points
 SIGMAS = 15.0
 """Largest distance of two estimates of a point, in standard deviations given the cameras; the errors of the
 cameras, largest at the ends of a row, come on top."""
-MAX_CHANCE = 1e-4
-"""Largest expected number of similarities on which as many wrong points agree."""
+MAX_CHANCE = 1e-4  # largest expected number of similarities on which as many wrong points agree
 MAX_STD = 0.01
 """Largest standard deviation of the rotation in rad and of the relative scale, given the cameras."""
 

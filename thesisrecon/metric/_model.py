@@ -17,8 +17,7 @@ from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
-EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0
-"""Residual gates of the early and the late rounds in noise sigmas."""
+EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0  # residual gates of the early and the late rounds in noise sigmas
 MIN_ANGLE = float(np.radians(0.05))  # smallest triangulation angle of a point
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among

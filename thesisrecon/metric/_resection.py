@@ -22,8 +22,7 @@ from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
 
 WITHOUT_K2_K3 = np.arange(_model.WIDTH) <= _model.K1
 """k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
-MIN_POINTS = 15
-"""Points of the model that a missing camera must see, unless other matches confirm its pose."""
+MIN_POINTS = 15  # points of the model that a missing camera must see, unless other matches confirm its pose
 FEWEST_POINTS, MIN_MATCHES, AGREEING = 5, 15, 0.5
 """Points, and other matches, that must agree with a confirmed pose, and the smallest share of either."""
 MIN_INLIER_RATIO = 0.5

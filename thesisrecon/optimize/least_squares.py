@@ -20,10 +20,8 @@ _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e12
 # Damping below which a step is as good as undamped: the curvature, relative to the diagonal, of the least
 # determined combination of unknowns that must converge.
 _WEAKEST = 1e-8
-# Gain relative to the cost that is below its rounding.
-_ROUNDING = 1e-15
-# Unknowns above which information is inverted by Cholesky.
-_MANY = 1200
+_ROUNDING = 1e-15  # gain relative to the cost that is below its rounding
+_MANY = 1200  # unknowns above which information is inverted by Cholesky
 
 
 class _LinearSystem(Protocol[StepOut]):
@@ -206,8 +204,7 @@ def soft_l1(s: F64, delta: float) -> tuple[F64, F64]:
     return 2.0 * delta**2 * (root - 1.0), 1.0 / root
 
 
-NORMAL_95 = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
+NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the normal distribution
 # 1 / Phi^-1(0.75); the thesis' text has 1 / Phi(0.75), which is not consistent.
 MAD_FACTOR = 1.4826022185056018
 _RAYLEIGH_MEDIAN = 1.1774

@@ -23,8 +23,7 @@ from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_
 FIRST, SCORED = 48, 2000
 # Probability that a good model is rejected by its first data, and the quantile of the normal distribution.
 LOST, LOST_SIGMAS = 0.05, 1.645
-# Residuals of models computed at once.
-AT_ONCE = 2**17
+AT_ONCE = 2**17  # residuals of models computed at once
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
 
@@ -119,14 +118,10 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
 
 
 _SAMPLE = 6
-# Search threshold if all points are inliers.
-_ANY_PX = 1e4
-# Rounds to find the inliers.
-_ROUNDS = 6
-# Residuals below this are rounding errors, not noise.
-_EXACT_PX = 1e-6
-# Ratio of extents below which points lie in one plane.
-_FLAT = 1e-6
+_ANY_PX = 1e4  # search threshold if all points are inliers
+_ROUNDS = 6  # rounds to find the inliers
+_EXACT_PX = 1e-6  # residuals below this are rounding errors, not noise
+_FLAT = 1e-6  # ratio of extents below which points lie in one plane
 
 
 @dataclass(frozen=True)

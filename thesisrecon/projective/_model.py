@@ -195,8 +195,7 @@ def expand_to_all_tracks(
 LOSS_SIGMAS = 2.0  # residual beyond which the loss of bundle adjustment is linear, in noise sigmas
 # Predicted gain of the cameras, relative to the square of that residual, at which an adjustment ends.
 SETTLED = 1e-3
-# View pairs tried for a point with a wrong observation: all of them up to five observations.
-_HYPOTHESES = 10
+_HYPOTHESES = 10  # view pairs tried for a point with a wrong observation: all of them up to five observations
 _POINT_ITERATIONS = 4
 
 

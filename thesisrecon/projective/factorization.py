@@ -24,8 +24,7 @@ from thesisrecon.records import Reconstruction, Tracks, TwoView
 
 _BALANCING_ITERATIONS = 10
 _MIN_GAIN_REL = 1e-4  # relative gain of an iteration below which the factors have converged
-# Minimum number of complete tracks.
-_MIN_POINTS = 16
+_MIN_POINTS = 16  # minimum number of complete tracks
 _MAX_ROUNDS = 5
 _PLANE_SIGMAS = 3.0  # distances from a homography, in noise sigmas, of the points that it explains
 

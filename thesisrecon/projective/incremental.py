@@ -60,8 +60,7 @@ def _find_inconsistent_view(
 
 
 _MIN_INLIER_RATIO = 0.3  # required share of inliers among the points that a camera sees
-# Quantile over all points of the projection standard deviations that is tested.
-_STD_QUANTILE = 0.8
+_STD_QUANTILE = 0.8  # quantile over all points of the projection standard deviations that is tested
 OUTSIDE_CORE = Notice("outside-core")
 
 

@@ -23,8 +23,7 @@ from thesisrecon.selfcalibration.quadric import minimize_quadric
 
 M = TypeVar("M")
 
-# Number of closed-form candidates to refine.
-_MAX_REFINED = 3
+_MAX_REFINED = 3  # number of closed-form candidates to refine
 _NEAR_INFINITY = 1e-9
 
 

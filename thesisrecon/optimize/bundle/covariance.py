@@ -15,8 +15,7 @@ from thesisrecon.optimize.bundle.schur import ReducedSystem, order_views
 from thesisrecon.optimize.least_squares import MAD_FACTOR, invert_information, trimmed_noise_scale
 
 SIMILARITY_DOF = 7
-MAX_DENSE = 1200
-"""Largest number of unknowns for dense inversion."""
+MAX_DENSE = 1200  # largest number of unknowns for dense inversion
 
 
 def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:

@@ -44,8 +44,7 @@ TOLERANCES: Mapping[str, float] = {
 }
 
 MAX_CAMERAS = 1000
-# Long sides; also used for points that rotate behind the camera.
-_MAX_SHIFT = 10.0
+_MAX_SHIFT = 10.0  # long sides; also used for points that rotate behind the camera
 
 # Sorted by how much the motion leaves undetermined. A motion is critical if all its measures are within
 # tolerance.
@@ -70,8 +69,7 @@ _ALTERNATIVE: Mapping[str, str] = {
     "infinity_shift_beyond_roll": "optical_axis_rms_deg",
 }
 
-# A focal length with a larger relative standard deviation is undetermined.
-MAX_FOCAL_STD = 0.15
+MAX_FOCAL_STD = 0.15  # A focal length with a larger relative standard deviation is undetermined
 # Image noise can be mistaken for a small rotation, which makes the covariance too small: a rotation counts if
 # it exceeds its standard deviation by this factor.
 MIN_ROTATION_SIGNIFICANCE = 4.0

@@ -16,8 +16,7 @@ from thesisrecon.optimize.bundle.projection import FOCAL, POSE_DOF, MetricCamera
 from thesisrecon.records import IntrinsicsPrior
 
 NONE = -1
-# Larger steps of log f are rejected anyway; the bound avoids overflow.
-MAX_LOG_STEP = 3.0
+MAX_LOG_STEP = 3.0  # larger steps of log f are rejected anyway; the bound avoids overflow
 
 
 @dataclass(frozen=True)
