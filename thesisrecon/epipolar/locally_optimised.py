@@ -57,15 +57,12 @@ class LocallyOptimisedRansac:
     starts: int = 3
     inlier_sigmas: float = np.inf
 
-    # Maximum number of searches.
-    max_starts = 10
+    max_starts = 10  # maximum number of searches
     # Minimum number of samples of six searches together, for any inlier ratio, because a wrong F of a
     # dominant plane also has many inliers; and maximum number of samples of all searches together.
     min_samples, max_samples = 4000, 60000
-    # Residual limits of the successive refinements, in units of ``threshold_px``.
-    gates = (2.0, 1.5, 1.0)
-    # Residual up to which a match is always an inlier, in units of ``threshold_px``.
-    inlier_floor = 0.3
+    gates = (2.0, 1.5, 1.0)  # residual limits of the successive refinements, in units of ``threshold_px``
+    inlier_floor = 0.3  # residual up to which a match is always an inlier, in units of ``threshold_px``
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
@@ -256,8 +253,7 @@ def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float)
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:
     """Refine ``f`` in place with the loss fitted to its residuals; noise (None: too few) and loss."""
     loss, rounds = (0.0, 0.0), 2
-    # Smallest width of the loss in units of the frame, for matches without noise.
-    exact = 1e-9
+    exact = 1e-9  # smallest width of the loss in units of the frame, for matches without noise
     for k in range(rounds + 1):
         r = np.sort(sampson_distances(f, points))
         near = r[: np.searchsorted(r, noise_width(r, gate))]

@@ -191,8 +191,7 @@ class ThesisRansac:
     rounds: int = 2
     inlier_test: InlierTest = "sampson"
 
-    # Inlier ratio at which sampling stops.
-    stop_inlier_ratio = 0.95
+    stop_inlier_ratio = 0.95  # inlier ratio at which sampling stops
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):

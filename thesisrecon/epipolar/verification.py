@@ -291,8 +291,7 @@ class PairVerification:
     min_inliers: int = 60
     min_inlier_ratio: float = 0.25
 
-    # Distance within which a homography explains a match, or 4.3 sigma if that is more.
-    homography_px = 2.0
+    homography_px = 2.0  # distance within which a homography explains a match, or 4.3 sigma if that is more
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:

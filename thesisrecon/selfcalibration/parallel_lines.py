@@ -326,8 +326,7 @@ class ParallelLines:
     orthogonal_directions: bool = False
 
     max_wrong_side_ratio = 0.02  # largest accepted share of points and cameras on the wrong side of a plane
-    # Maximum number of planes.
-    max_candidates = 5
+    max_candidates = 5  # maximum number of planes
     detector = LineSegments()
 
     def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:

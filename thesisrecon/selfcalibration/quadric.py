@@ -238,8 +238,7 @@ class HypothesesAndRefinement:
     # Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
     max_refined, max_full_refined = 40, 8
     max_candidates = 3  # maximum number of candidates for bundle adjustment
-    # Required share of observations with positive depth.
-    min_in_front_ratio = 0.95
+    min_in_front_ratio = 0.95  # required share of observations with positive depth
     criterion = RotationCriterion()
 
     @_upgrade.as_stage_failure
