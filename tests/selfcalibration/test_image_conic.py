@@ -30,6 +30,7 @@ from thesisrecon.selfcalibration.parallel_lines import (
     LineSegments,
     ParallelLines,
     _find_parallel_directions,
+    _fit_segments,
     _normalize_segments,
     _propose_vanishing_points,
     _refine_plane,
@@ -236,6 +237,9 @@ def test_the_detector_finds_the_sides_of_a_turned_square_and_nothing_in_noise():
     ends = segments.reshape(4, 2, 2)
     assert (np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 100.0).all()
     np.testing.assert_allclose(off_the_sides(ends[..., 0], ends[..., 1]), 0.0, atol=0.15)
+    # Edge points that are denser at one end.
+    xy = np.array([3.0, 7.0]) + np.linspace(0.0, 1.0, 40)[:, None] ** 2 * [40.0, 30.0]
+    np.testing.assert_allclose(_fit_segments(xy, np.zeros(40, np.int64))[0], [[3.0, 7.0, 43.0, 37.0]])
     assert LineSegments().detect(np.full((50, 60), 90.0, dtype=np.float32)).shape == (0, 4)
     noise = np.random.default_rng(0).normal(128.0, 5.0, (300, 400)).astype(np.float32)
     assert len(LineSegments().detect(noise)) < 10
