@@ -138,7 +138,7 @@ def estimate_homography(
     *,
     threshold_px: float | None = 1.0,
     confidence: float = 0.9999,
-    max_samples: int = 100_000,
+    max_samples: int = 2_000_000,
     seed: int | Generator = 0,
 ) -> HomographyFit:
     """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4; HZ 4.8).

@@ -37,18 +37,23 @@ def _equations(h: F64, match: F64, J: F64) -> tuple[float, float, float]:
     return c0, h[1, 0] * x1 + h[1, 1] * y1 + h[1, 2] - w * y2, w
 
 
-@kernel
-def _squared_distances(H: F64, points: F64) -> F64:
-    """Squared distances (S, N) of matches from homographies (S, 3, 3)."""
-    J, squared = empty((2, 2)), empty((len(H), len(points)))
+@kernel(fastmath={"reassoc", "contract"})
+def _squared_distances(H: F64, columns: F64) -> F64:
+    """Squared distances (S, N) of matches (4, N) from homographies (S, 3, 3)."""
+    squared = empty((len(H), columns.shape[1]))
     for s in range(len(H)):
-        for k in range(len(points)):
-            c0, c1, w = _equations(H[s], points[k], J)
+        h00, h01, h02, h10, h11, h12 = H[s, 0, 0], H[s, 0, 1], H[s, 0, 2], H[s, 1, 0], H[s, 1, 1], H[s, 1, 2]
+        h20, h21, h22 = H[s, 2, 0], H[s, 2, 1], H[s, 2, 2]
+        for k in range(columns.shape[1]):
+            x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
+            w = h20 * x1 + h21 * y1 + h22
+            c0, c1 = h00 * x1 + h01 * y1 + h02 - w * x2, h10 * x1 + h11 * y1 + h12 - w * y2
+            j00, j01, j10, j11 = h00 - x2 * h20, h01 - x2 * h21, h10 - y2 * h20, h11 - y2 * h21
             # Sums of squares (Lagrange's identity): a difference of products could round below zero.
-            above = (c0 * J[1, 0] - c1 * J[0, 0]) ** 2 + (c0 * J[1, 1] - c1 * J[0, 1]) ** 2
-            above += w * w * (c0 * c0 + c1 * c1)
-            entries = J[0, 0] ** 2 + J[0, 1] ** 2 + J[1, 0] ** 2 + J[1, 1] ** 2 + w * w
-            below = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2 + w * w * entries
+            p, q, determinant = c0 * j10 - c1 * j00, c0 * j11 - c1 * j01, j00 * j11 - j01 * j10
+            above = p * p + q * q + w * w * (c0 * c0 + c1 * c1)
+            entries = j00 * j00 + j01 * j01 + j10 * j10 + j11 * j11 + w * w
+            below = determinant * determinant + w * w * entries
             squared[s, k] = above / below if below > 1e-28 * entries * entries else 1e280
     return squared
 
@@ -59,7 +64,7 @@ def squared_plane_distances(H: F64, points: F64) -> F64:
     To first order; c are the two equations and J their derivatives by the four coordinates (Chum, Pajdla and
     Sturm, 2005). A singular H has no exact match nearby.
     """
-    squared = _squared_distances(np.ascontiguousarray(H).reshape(-1, 3, 3), points)
+    squared = _squared_distances(np.ascontiguousarray(H).reshape(-1, 3, 3), np.ascontiguousarray(points.T))
     return np.asarray(squared).reshape(*H.shape[:-2], len(points))
 
 
@@ -293,21 +298,41 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
         )
 
 
-def _through_four(samples: F64) -> F64:
-    """Homographies (B', 3, 3) of samples of four matches (B, 4, 4) whose triangles keep their orientation.
+@kernel
+def _through_four(points: F64, samples: I64) -> F64:
+    """Homographies (B', 3, 3) of samples (B, 4) of four matches whose triangles keep their orientation.
 
-    H = B diag(b / a) A^-1 with three points as the columns of A, B and barycentric coordinates of the fourth.
+    With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
+    fourth, H = B diag(b / a) A^-1; the rows of A^-1 are cross products of the columns of A.
     """
-    apart = samples[:, :3] - samples[:, 3:]
-    e, f = np.roll(apart, -1, axis=1), np.roll(apart, -2, axis=1)
-    a, b = (e[:, :, k] * f[:, :, k + 1] - e[:, :, k + 1] * f[:, :, k] for k in (0, 2))
-    same = a * b * (a.sum(axis=1) * b.sum(axis=1))[:, None]
-    # Points of a visible plane lie on one side of its horizon.
-    good = (same > 0.0).all(axis=1)
-    corners, ratio = samples[good, :3], b[good] / a[good]
-    x1 = homogenize(corners[:, :, :2])
-    dual = np.cross(np.roll(x1, -1, axis=1), np.roll(x1, -2, axis=1))
-    return unit_norm((homogenize(corners[:, :, 2:]) * ratio[:, :, None]).swapaxes(1, 2) @ dual)
+    models, n, s = empty((len(samples), 3, 3)), 0, empty((2, 3))
+    d, x = empty((4, 3)), empty((4, 3))
+    for sample in samples:
+        for k in range(3):
+            for c in range(4):
+                x[c, k] = points[sample[k], c]
+                d[c, k] = x[c, k] - points[sample[3], c]
+        for i in range(2):
+            u, v = d[2 * i], d[2 * i + 1]
+            s[i, 0], s[i, 1] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2]
+            s[i, 2] = u[0] * v[1] - u[1] * v[0]
+        side = (s[0, 0] + s[0, 1] + s[0, 2]) * (s[1, 0] + s[1, 1] + s[1, 2])
+        # Points of a visible plane lie on one side of its horizon.
+        if not min(s[0, 0] * s[1, 0] * side, s[0, 1] * s[1, 1] * side, s[0, 2] * s[1, 2] * side) > 0.0:
+            continue
+        H = models[n]
+        H[:] = 0.0
+        for k in range(3):
+            i, j, ratio = (k + 1) % 3, (k + 2) % 3, s[1, k] / s[0, k]
+            across, down = ratio * (x[1, i] - x[1, j]), ratio * (x[0, j] - x[0, i])
+            last = ratio * (x[0, i] * x[1, j] - x[0, j] * x[1, i])
+            for r in range(3):
+                y = 1.0 if r == 2 else x[2 + r, k]
+                H[r, 0] += y * across
+                H[r, 1] += y * down
+                H[r, 2] += y * last
+        n += 1
+    return models[:n]
 
 
 def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int]:
@@ -317,7 +342,7 @@ def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F
         return refine_plane(H, points[rows[:500]], 1.5 * gate, 3) if len(rows) >= _SAMPLE else H
 
     found = search_models(
-        lambda samples: _through_four(points[samples]),
+        lambda samples: unit_norm(_through_four(points, samples)),
         lambda H, rows: squared_plane_distances(H, points[rows]) / gate**2,
         refit, rng, len(points), _SAMPLE, budget,
     )  # fmt: skip

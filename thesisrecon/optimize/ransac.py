@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.random import Generator
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import Notice, StageFailure, counted
@@ -48,7 +50,7 @@ def draw_samples(rng: Generator, count: int, n: int, size: int) -> I64:
     if n < 8 * size:
         return rng.random((count, n)).argpartition(size - 1, axis=1)[:, :size]
     drawn = rng.integers(0, n, (count, size))
-    while len(again := np.flatnonzero((np.diff(np.sort(drawn, axis=1), axis=1) == 0).any(axis=1))):
+    while len(again := np.flatnonzero(np.any([a == b for a, b in combinations(drawn.T, 2)], axis=0))):
         drawn[again] = rng.integers(0, n, (len(again), size))
     return drawn
 
@@ -72,8 +74,9 @@ def search_models(
         models = solve(draw_samples(rng, batch, n, size))
         drawn += batch
         if len(models):
-            inside = np.count_nonzero(squared(models, scored[:FIRST]) < 1.0, axis=1)
-            tried = min(FIRST, len(scored))
+            # As many data as a good model needs not to be among the worst.
+            tried = min(max(FIRST, int(LOST_SIGMAS**2 * (1.0 - share) / max(share, 1e-9)) + 1), len(scored))
+            inside = np.count_nonzero(squared(models, scored[:tried]) < 1.0, axis=1)
             models = models[inside >= tried * share - LOST_SIGMAS * np.sqrt(tried * share * (1.0 - share))]
         for some in np.array_split(models, len(models) * len(scored) // AT_ONCE + 1) if len(models) else ():
             cost = np.minimum(squared(some, scored), 1.0).mean(axis=1)
@@ -277,11 +280,26 @@ def resect_projective(
 
 def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
     """Return squared reprojection residuals (B, M), inf on or behind the principal plane."""
-    xh = (P.reshape(-1, 4) @ X.T).reshape(len(P), 3, -1)
-    x, y, depths = xh[:, 0], xh[:, 1], xh[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        squared = (x / depths - xy[:, 0]) ** 2 + (y / depths - xy[:, 1]) ** 2
-    return np.where((depths > 0) & np.isfinite(squared), squared, np.inf)
+    return np.asarray(
+        _residuals(np.ascontiguousarray(P), np.ascontiguousarray(X.T), np.ascontiguousarray(xy.T))
+    )
+
+
+@kernel(fastmath={"reassoc", "contract"})
+def _residuals(P: F64, X: F64, xy: F64) -> F64:
+    """:func:`_squared_residuals` of columns X (4, M) and xy (2, M)."""
+    squared = empty((len(P), X.shape[1]))
+    for b in range(len(P)):
+        p, q, r = P[b, 0], P[b, 1], P[b, 2]
+        for k in range(X.shape[1]):
+            x0, x1, x2, x3 = X[0, k], X[1, k], X[2, k], X[3, k]
+            w = r[0] * x0 + r[1] * x1 + r[2] * x2 + r[3] * x3
+            inverse = 1.0 / w if w > 0.0 else np.inf
+            dx = (p[0] * x0 + p[1] * x1 + p[2] * x2 + p[3] * x3) * inverse - xy[0, k]
+            dy = (q[0] * x0 + q[1] * x1 + q[2] * x2 + q[3] * x3) * inverse - xy[1, k]
+            distance = dx * dx + dy * dy
+            squared[b, k] = distance if distance < np.inf else np.inf
+    return squared
 
 
 def resect_calibrated(
