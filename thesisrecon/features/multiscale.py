@@ -255,10 +255,7 @@ def _dominant_direction(blurred: F32, xy: F64) -> F32:
 
 
 def _normalize_patches(patches: F32) -> tuple[F32, B8]:
-    """The ``PATCH_VALUES`` lowest cosine coefficients (S, PATCH_VALUES) but the mean, of unit norm.
-
-    Also returns whether each patch had contrast above a grey level.
-    """
+    """Lowest ``PATCH_VALUES`` cosine coefficients but the mean, of unit norm, and which have contrast."""
     contrast = patches.std(axis=1)
     coefficients = (patches - patches.mean(axis=1, keepdims=True)) @ _low_frequencies()
     norm = np.linalg.norm(coefficients, axis=1, keepdims=True)

@@ -134,11 +134,7 @@ def nearest_seeds(seeds1: Seeds, seeds2: Seeds, ratio: float) -> tuple[I64, I64,
 def match_seeds(
     seeds1: Seeds, seeds2: Seeds, pair: tuple[int, int], *, rotated: bool, ratio: float
 ) -> Matches:
-    """Match seeds that are mutually nearest and pass the ratio test; with their local maps.
-
-    Patch distances are sqrt(2 - 2 correlation); "elsewhere" begins at a quarter of the patch (8 pixels of its
-    level).
-    """
+    """Match seeds that are mutually nearest and pass the ratio test of sqrt(2 - 2 correlation), with maps."""
     use1, use2 = (np.flatnonzero((s.angle != 0.0) == rotated) for s in (seeds1, seeds2))
     rows, columns, score = nearest_seeds(select_found(seeds1, use1), select_found(seeds2, use2), ratio)
     if not len(rows):
@@ -163,11 +159,7 @@ def seed_matches(
     features1: Features, features2: Features, pair: tuple[int, int], *,
     orientation: Literal["auto", "upright", "rotated"], ratio: float,
 ) -> Iterator[SeedSet]:  # fmt: skip
-    """Sets of matched seeds: one of each orientation, or one of all with simulated oblique views.
-
-    These are matched with the other image itself: of two views of a plane, one suitably compressed, only a
-    similarity remains.
-    """
+    """Sets of matched seeds: one of each orientation, or one of all with oblique views of either image."""
     seeds1, seeds2 = features1.seeds, features2.seeds
     assert seeds1 is not None
     assert seeds2 is not None

@@ -24,10 +24,7 @@ Pair = TypeVar("Pair", Matches, TwoView)
 
 @kernel
 def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
-    """First corner (N,) of the set of each corner after uniting along ``edges`` (E, 2) in their order.
-
-    An edge between two sets that share a view is rejected: a set has one corner per view at most.
-    """
+    """First corner (N,) of the set of each corner along ``edges`` (E, 2); no set sees a view twice."""
     count = len(view_of)
     # Sets are lists linked through ``following``; the smaller one joins the larger.
     parent, last, size = empty(count, np.int64), empty(count, np.int64), full(count, 1, np.int64)

@@ -1,7 +1,4 @@
-"""Integer images of rectified pairs, their noise, and matching costs of rows, strip by strip.
-
-Inner loops run over row slices without index arithmetic, so that the compiler vectorises them.
-"""
+"""Integer images of rectified pairs, their noise, and matching costs of rows, strip by strip."""
 
 from __future__ import annotations
 
@@ -78,10 +75,7 @@ def _side(image: NDArray[np.generic]) -> StereoImage:
 
 
 def estimate_noise(image: StereoImage) -> float:
-    """Standard deviation in grey levels of the noise of one channel, 0 with fewer than 3 x 3 pixels.
-
-    The median absolute difference of two Laplacians (Immerkaer 1996 with the mean): shading does not count.
-    """
+    """Noise of a channel in grey levels: median difference of two Laplacians (Immerkaer 1996: mean)."""
     rows_for_noise = 24  # Number of evenly spaced rows used for the median
     if min(image.valid.shape) < 3:
         return 0.0

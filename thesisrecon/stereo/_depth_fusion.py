@@ -29,10 +29,7 @@ GATE = 3.0  #: standard deviations within which estimates agree; limit of the in
 
 
 def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32]:
-    """Inverse depths and standard deviations (H, W) from the correspondence with another camera, or NaN.
-
-    A pixel is at H (x, y, 1) + rho e in the other view; rho minimises the distance to the correspondence.
-    """
+    """Inverse depths, std (H, W) that bring H (x, y, 1) + rho e nearest to the correspondence, or NaN."""
     H, e = pixel_transfer(P, P_other)
     v, u = np.nonzero(np.isfinite(pair.xy[..., 0]) & np.isfinite(pair.sigma))
     xy, h = pair.xy[v, u].astype(np.float64), np.stack([u, v, np.ones_like(u)], axis=1) @ H.T
@@ -49,10 +46,7 @@ def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32
 
 
 def fuse_inverse_depths(found: Sequence[tuple[F32, F32]], shape: tuple[int, ...]) -> InverseDepth:
-    """Fuse inverse depths and standard deviations, (H, W) each: the largest group that agrees is averaged.
-
-    Weights are the inverse variances; among groups of equal size the more certain one is taken.
-    """
+    """Average the largest group of inverse depths (H, W) that agree, by inverse variances."""
     none = np.full(shape, np.nan, dtype=np.float32)
     rho, std = (np.stack(part) for part in zip(*(found or [(none, none)]), strict=True))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -203,10 +197,7 @@ def fit_planes(rho: F32, radius: int) -> F32:
 
 @kernel
 def surface_continuation(rho: F32, std: F32, sure: B8, radius: int, gate: float) -> B8:
-    """Pixels (H, W) within ``gate`` standard deviations of the plane of ``sure`` pixels around them.
-
-    These have similar inverse depth, are a quarter of the window and surround the pixel.
-    """
+    """Pixels (H, W) near the plane of ``sure`` ones around, a quarter of the window; ``gate`` in std."""
     joins = zeros(rho.shape, np.bool_)
     for v in range(rho.shape[0]):
         for u in range(rho.shape[1]):

@@ -49,10 +49,7 @@ class PatchSearch(NamedTuple):
 
 
 def pack_squares(gray: F32) -> U32:
-    """Pack the grey levels of 2 x 2 pixels into one word (H, W), so that an interpolation needs one load.
-
-    The lowest byte is the pixel itself, then its right, lower and lower right neighbour; 0 if one is missing.
-    """
+    """Pack 2 x 2 grey levels into a word (H, W): pixel, right, lower, lower right; 0 if one is missing."""
     level = np.nan_to_num(np.clip(gray + np.float32(0.5), 1.0, 255.0)).astype(np.uint32)
     four = level[:-1, :-1], level[:-1, 1:], level[1:, :-1], level[1:, 1:]
     word = four[0] | four[1] << 8 | four[2] << 16 | four[3] << 24

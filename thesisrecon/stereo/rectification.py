@@ -553,11 +553,7 @@ def _midlines(rectification: Rectification, side: int, size: Size) -> tuple[floa
 
 
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
-    """Return the rectification of least distortion among the methods that do not fail.
-
-    Those within the angle and aspect limits take precedence; if all fail, the last ``StageFailure`` is
-    raised.
-    """
+    """Return the rectification of least distortion, first of those within the angle and aspect limits."""
     found: list[Rectification] = []
     failure = StageFailure(Notice("no-rectification-method"))
     for method in methods:

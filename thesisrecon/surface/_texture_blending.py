@@ -68,10 +68,7 @@ class ViewSurface(NamedTuple):
 
 @kernel
 def observe_points(points: F64, normals: F64, view: ViewSurface, weight: F32, color: F32) -> None:
-    """Observe points in one view: weights (pixels per area times trust) and colours times the gain.
-
-    Visible: at most ``view.tolerance`` of its depth behind the farthest of the four pixels around.
-    """
+    """Weights (pixels per area times trust) and colours times the gain of the points that a view shows."""
     P, centre, scale, depth, trust, tolerance, rgb, gain = view
     height, width = depth.shape
     for n in range(points.shape[0]):
