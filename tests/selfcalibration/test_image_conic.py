@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.selfcalibration import stratified_scenes as scenes
@@ -35,6 +36,7 @@ from thesisrecon.selfcalibration.parallel_lines import (
     _propose_vanishing_points,
     _refine_plane,
     _refined_point,
+    _triangulated_pairs,
 )
 from thesisrecon.selfcalibration.stratified import Stratified
 from validation.scenes.real import load_fixture_scene
@@ -197,6 +199,16 @@ def test_directions_at_right_angles_give_the_calibration_too():
     prior = scenes.prior_for(scene, scenes.NOTHING_BUT_CONSTANT)
     answer = scenes.calibrated(Stratified(way, refine=False), scene, prior, seed=2)
     np.testing.assert_allclose(answer.K, scene.K, rtol=1e-7, atol=1e-3)
+
+
+def test_vanishing_points_of_one_direction_are_near_the_epipolar_lines_of_each_other():
+    turn = Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix()
+    P = np.stack([np.eye(3, 4), np.column_stack([TURN, [1.0, 0.2, 0.1]])])
+    first = np.array([[0.3, -0.2, 1.0]])
+    for scale in (0.2, 1.0, 5.0):
+        cameras, second = P * np.array([1.0, scale])[:, None, None], first @ TURN.T
+        assert len(_triangulated_pairs(cameras, [first, second])) == 1
+        assert len(_triangulated_pairs(cameras, [first, second @ turn.T])) == 0
 
 
 @pytest.mark.parametrize(("sigma", "stray", "limit"), [(0.0, 0, 1e-8), (0.3, 60, 0.01)])
