@@ -179,7 +179,7 @@ def prepare_image(
     grays = [image.rgb[:, :, c].astype(np.float32) for c in range(3)] if colour else []
     channels = tuple(_pyramid(gray, doubled)[0] for gray in grays) or (pixels,)
     cell_px = max(4.0, 0.01 * max(image.size))
-    cells = (cell_px, *cells_of(features.xy, image.size, cell_px))
+    cells = (cell_px, *_cells(features.xy, image.size, cell_px))
     return PreparedImage(image.size, features, (pixels, levels, base), cells, window, channels)
 
 
@@ -194,7 +194,7 @@ def _pyramid(gray: F32, doubled: bool) -> tuple[F32, I64]:
     return np.concatenate([g.ravel() for g in grays]), levels
 
 
-def cells_of(xy: F64, size: tuple[float, float], cell_px: float) -> tuple[I64, I64, I64]:
+def _cells(xy: F64, size: tuple[int, int], cell_px: float) -> tuple[I64, I64, I64]:
     """Sort corners into square cells, row by row: those of cell c are ``order[start[c]:start[c + 1]]``."""
     shape = np.array([int(size[1] / cell_px) + 1, int(size[0] / cell_px) + 1], dtype=np.int64)
     column, row = (np.clip((xy[:, a] / cell_px).astype(np.int64), 0, shape[1 - a] - 1) for a in (0, 1))

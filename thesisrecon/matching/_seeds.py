@@ -12,7 +12,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._prepared import cells_of, empty_matches, join_matches, select_found
+from thesisrecon.matching._prepared import empty_matches, join_matches, select_found
 from thesisrecon.matching.track_alignment import strongest_distinct
 from thesisrecon.records import Features, Matches, Seeds
 
@@ -246,33 +246,27 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
     return Matches(known.i, known.j, one, two, xy1[one], xy2[two], known.score[order], known.affine[order])
 
 
-def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
-    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to positions ``of`` (N, 2), nearest first."""
-    low = xy.min(axis=0)
-    width, height = np.ptp(xy, axis=0)
-    # About two points in a cell.
-    cell = max(np.sqrt(2.0 * width * height / len(xy)), 2.0 * max(width, height) / len(xy), 1e-9)
-    return _nearest_in_cells(xy, of, count, low, (cell, *cells_of(xy - low, (width, height), cell)))
-
-
 @kernel
-def _nearest_in_cells(xy: F64, of: F64, count: int, low: F64, cells: tuple[float, I64, I64, I64]) -> I64:
-    """Search rings of cells around each position; of equally distant points the smaller number is first."""
-    cell, shape, start, order = cells
-    rows, columns = shape
+def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
+    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2).
+
+    The nearest is first, of equally distant ones that with the smaller number.
+    """
+    low, cell, shape = _grid(xy)
+    start, order = _fill_cells(xy, low, cell, shape)
     found, near = empty((len(of), count), np.int64), empty(count)
     for n in range(len(of)):
         x, y = of[n, 0] - low[0], of[n, 1] - low[1]
-        column = min(max(int(np.floor(x / cell)), 0), columns - 1)
-        row = min(max(int(np.floor(y / cell)), 0), rows - 1)
+        column = min(max(int(np.floor(x / cell)), 0), shape[0] - 1)
+        row = min(max(int(np.floor(y / cell)), 0), shape[1] - 1)
         held, best = 0, found[n]
-        for ring in range(max(rows, columns)):
-            for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
+        for ring in range(max(shape[0], shape[1])):
+            for r in range(max(row - ring, 0), min(row + ring, shape[1] - 1) + 1):
                 inside = abs(r - row) < ring
                 for c in range(column - ring, column + ring + 1, 2 * ring if inside else 1):
-                    if c < 0 or c >= columns:
+                    if c < 0 or c >= shape[0]:
                         continue
-                    first = r * columns + c
+                    first = r * shape[0] + c
                     for at in range(start[first], start[first + 1]):
                         m = order[at]
                         dx, dy = xy[m, 0] - of[n, 0], xy[m, 1] - of[n, 1]
@@ -283,11 +277,11 @@ def _nearest_in_cells(xy: F64, of: F64, count: int, low: F64, cells: tuple[float
             safe = np.inf
             if column - ring > 0:
                 safe = min(safe, x - (column - ring) * cell)
-            if column + ring < columns - 1:
+            if column + ring < shape[0] - 1:
                 safe = min(safe, (column + ring + 1) * cell - x)
             if row - ring > 0:
                 safe = min(safe, y - (row - ring) * cell)
-            if row + ring < rows - 1:
+            if row + ring < shape[1] - 1:
                 safe = min(safe, (row + ring + 1) * cell - y)
             if near[count - 1] < safe * abs(safe):
                 break
@@ -307,3 +301,34 @@ def _insert(m: int, distance2: float, found: I64, near: F64, held: int) -> int:
         at -= 1
     near[at], found[at] = distance2, m
     return min(held + 1, len(near))
+
+
+@kernel
+def _grid(xy: F64) -> tuple[F64, float, I64]:
+    """Lower corner (2,), side and numbers (2,) of square cells of about two points each."""
+    low, high, shape = empty(2), empty(2), empty(2, np.int64)
+    for a in range(2):
+        low[a] = high[a] = xy[0, a]
+        for n in range(len(xy)):
+            low[a], high[a] = min(low[a], xy[n, a]), max(high[a], xy[n, a])
+    width, height = high[0] - low[0], high[1] - low[1]
+    cell = max(np.sqrt(2.0 * width * height / len(xy)), 2.0 * max(width, height) / len(xy), 1e-9)
+    shape[0], shape[1] = int(width / cell) + 1, int(height / cell) + 1
+    return low, cell, shape
+
+
+@kernel
+def _fill_cells(xy: F64, low: F64, cell: float, shape: I64) -> tuple[I64, I64]:
+    """The points of cell c, row by row, are ``order[start[c]:start[c + 1]]``."""
+    place, start = empty(len(xy), np.int64), zeros(shape[0] * shape[1] + 1, np.int64)
+    for n in range(len(xy)):
+        column = min(int((xy[n, 0] - low[0]) / cell), shape[0] - 1)
+        place[n] = min(int((xy[n, 1] - low[1]) / cell), shape[1] - 1) * shape[0] + column
+        start[place[n] + 1] += 1
+    for c in range(len(start) - 1):
+        start[c + 1] += start[c]
+    order, fill = empty(len(xy), np.int64), start.copy()
+    for n in range(len(xy)):
+        order[fill[place[n]]] = n
+        fill[place[n]] += 1
+    return start, order
