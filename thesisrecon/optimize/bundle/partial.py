@@ -277,7 +277,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
 
     end = run_levenberg_marquardt(
         linearize, retract, lambda s: float(projective_cost(UnitState.at(s, points), obs, weighting)),
-        start / np.linalg.norm(start), max_iterations=iterations,
+        start / float(np.linalg.norm(start)), max_iterations=iterations,
     ).state  # fmt: skip
     # Row-major entries: vec(T^-1 P M) = (T^-1 kron M') vec(P).
     back = np.kron(np.linalg.inv(T), (frame.S @ frame.N).T)
