@@ -76,6 +76,34 @@ def test_wrong_arguments_are_refused(camera):
     refuses(ValueError, r"depth \(N\); got \(4, 2\), \(3,\)", camera.unproject, np.zeros((4, 2)), np.ones(3))
 
 
+def test_cameras_keep_copies_and_compare_by_value(camera):
+    mine = K.copy()
+    one, other = (Camera(mine, np.eye(3), np.zeros(3), (640, 480), std={"k1": np.nan}) for _ in range(2))
+    mine[0, 0] = 1.0
+    np.testing.assert_array_equal(one.K, K)
+    refuses(ValueError, "read-only", one.K.fill, 0.0)
+    assert one == other
+    assert one in [other]
+    assert one not in (camera, None, replace(one, t=np.ones(3)), replace(one, distortion=np.zeros(1)))
+    refuses(TypeError, "unhashable", hash, one)
+    for five in ([-0.2, 0.1, 0.001, 0.0, 0.0], [0.1, 0, 0, 0, 0.01], [0.1, 0.1, 0.1, 0.0]):
+        refuses(
+            ValueError, "k1, k2, p1, p2, k3 in OpenCV, and k1, k2, k3, k4, k5", replace, one, distortion=five
+        )
+    assert replace(one, distortion=[0.1, 0.2, 0, 0, 0]).distortion.shape == (5,)
+    refuses(ValueError, "hidden by its mask", replace, one, t=np.ma.masked_all(3))
+
+
+def test_pixels_outside_the_range_of_a_lens_have_no_ray(camera):
+    lens = replace(camera, R=np.eye(3), t=np.zeros(3), distortion=np.array([-0.3]))
+    # r (1 - 0.3 r^2) grows up to r = 1.054, to 0.703.
+    r = np.array([0.0, 0.5, 0.7, 0.71, 3.0])
+    rays = lens.unproject(np.column_stack([K[0, 2] + K[0, 0] * r, np.full(5, K[1, 2])]), np.ones(5))
+    np.testing.assert_array_equal(np.isfinite(rays).all(axis=1), r < 0.703)
+    back = lens.project(rays[:3])
+    np.testing.assert_allclose(back[:, 0], K[0, 2] + K[0, 0] * r[:3], atol=1e-6)
+
+
 def test_holes_are_filled_with_the_farther_side():
     nan = np.nan
     disparity = np.array([[nan, 5, nan, nan, 3, nan], [nan] * 6, [1, nan, 4, nan, 2, 2]], dtype=np.float32)

@@ -1,8 +1,10 @@
-"""Names of NumPy array types, checks of shapes and values, and rows of arrays by image number."""
+"""Names of NumPy array types, the arrays of callers read and checked, and records that compare by value."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +21,164 @@ U32 = NDArray[np.uint32]
 U64 = NDArray[np.uint64]
 
 Stratum = Literal["projective", "affine", "metric"]
+
+
+class Record:
+    """Base of frozen dataclasses with arrays: ``==`` compares all fields by value, NaN equal to NaN.
+
+    Records have no hash, as lists and arrays have none.
+    """
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        names = (field.name for field in fields(self) if field.compare)  # type: ignore[arg-type]
+        return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if a is b:
+        return True
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind in "fc")
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(map(_equal, a, b))
+    return bool(a == b) or (isinstance(a, float) and a != a and b != b)
+
+
+def numbers(caller: str, *, missing: tuple[str, ...] = (), **arrays: Any) -> list[F64]:
+    """Read arrays of real numbers in double precision: arrays, lists, and what has ``__array__``.
+
+    The values that a numpy mask hides, and None, are NaN in the arrays of ``missing``; in the others they are
+    a ``ValueError``, as are complex numbers, words and lists of different lengths.
+    """
+    return [_real(caller, name, value, name in missing) for name, value in arrays.items()]
+
+
+_LARGEST = 1e100  # Squares and products of a few such numbers are finite
+
+
+def _real(caller: str, name: str, value: Any, missing: bool) -> F64:
+    if isinstance(value, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in value):
+        value = np.ma.stack(value) if len({np.shape(one) for one in value}) == 1 else value
+    try:
+        hidden = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.zeros(0, bool)
+        found = np.asarray(value)
+        if found.dtype.kind in "OV" and not isinstance(value, Mapping | str):
+            found = np.asarray(value, dtype=np.float64)
+    except Exception:
+        # Tensors that are not in the memory of the processor raise errors of any kind.
+        found, hidden = np.empty(0, dtype=object), np.zeros(0, bool)
+    if found.dtype.kind not in "biuf" or value is None or not found.ndim:
+        kind = "complex numbers" if found.dtype.kind == "c" else f"{value!r}" if not found.ndim else ""
+        kind = kind or f"a {type(value).__name__} of {found.dtype}"
+        raise ValueError(f"{caller} needs an array of real numbers as {name}; got {kind}")
+    if hidden.any() and not missing:
+        count = f"{int(hidden.sum())} of {hidden.size} are hidden by its mask"
+        raise ValueError(f"{caller} needs all values of {name}, but {count}; leave out these rows")
+    real = np.ascontiguousarray(found, dtype=np.float64)
+    if np.any(np.abs(real[np.isfinite(real)]) > _LARGEST):
+        raise ValueError(f"{caller} needs numbers of at most {_LARGEST:g} as {name}; some are larger")
+    return np.where(hidden, np.nan, real) if hidden.any() else real
+
+
+def generator(caller: str, seed: Any) -> np.random.Generator:
+    """The random generator of a seed, or the one that was given."""
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        rule = "a whole number of at least 0, or a numpy.random.Generator, as seed"
+        raise ValueError(f"{caller} needs {rule}; got {seed!r}")
+    return np.random.default_rng(int(seed))
+
+
+def number(caller: str, name: str, value: Any, rule: str = "a number") -> float:
+    """Read one real number, which may be NaN; ``ValueError`` with the rule for anything else."""
+    # Tensors of one number have no axes.
+    if isinstance(value, str | bytes | bool | complex) or getattr(value, "shape", ()) != ():
+        raise ValueError(f"{caller} needs {rule} as {name}; got {value!r}")
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{caller} needs {rule} as {name}; got {value!r}") from None
+
+
+def whole_number(caller: str, name: str, value: Any, least: int) -> int:
+    """Read a whole number of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{caller} needs a whole number of at least {least} as {name}; got {value!r}")
+    return int(value)
+
+
+def white_level(highest: float) -> float:
+    """White of integer levels whose largest is ``highest``: 2^n - 1 of the fewest bits, at least 8."""
+    return float(2.0 ** max(8, int(highest).bit_length()) - 1)
+
+
+def image_levels(*images: Any) -> list[U8 | F32]:
+    """Read arrays of images or colours as levels from 0 to 255, of one scale for all of a kind.
+
+    Unsigned bytes stay; other whole numbers have the range of the fewest bits that hold the largest; floats
+    are 0 to 1, 0 to 255 or 0 to 65535 by their largest. Floats are single precision, NaN where missing or
+    hidden by a mask. ``ValueError`` for other ranges and kinds.
+    """
+    given = [_level_array(image) for image in images]
+    whole = [a for a in given if a.dtype.kind in "iu" and a.dtype != np.uint8]
+    real = [a for a in given if a.dtype.kind == "f"]
+    white = {"b": 1.0, "i": _white_of(whole), "f": _white_of(real)}
+    read: list[U8 | F32] = []
+    for array in given:
+        scale = 255.0 / white["i" if array.dtype.kind == "u" else array.dtype.kind]
+        if array.dtype == np.uint8:
+            read.append(array)
+        elif array.dtype.kind in "bui" and scale in (1.0, 255.0):
+            read.append((array * np.uint16(scale)).astype(np.uint8))
+        else:
+            read.append(np.asarray(array * scale, dtype=np.float32))
+    return read
+
+
+def eight_bit(levels: U8 | F32) -> tuple[U8, B8 | None]:
+    """Rounded levels from 0 to 255, and the pixels (H, W) in which none is missing; None: all."""
+    if levels.dtype == np.uint8:
+        return np.asarray(levels, dtype=np.uint8), None
+    known = np.isfinite(levels)
+    whole: U8 = np.rint(np.clip(np.where(known, levels, 128.0), 0.0, 255.0)).astype(np.uint8)
+    return whole, None if known.all() else np.asarray(known if known.ndim == 2 else known.all(axis=2))
+
+
+def _level_array(image: Any) -> Any:
+    try:
+        hidden = np.ma.getmaskarray(image) if isinstance(image, np.ma.MaskedArray) else np.zeros(0, bool)
+        array = np.asarray(image)
+        if array.dtype.kind == "O" and array.ndim:
+            array = array.astype(np.float64)
+    except Exception:
+        array, hidden = np.empty(0, dtype=object), np.zeros(0, bool)
+    if array.dtype.kind not in "biuf":
+        kinds = "a path, a Pillow image or a numpy array of grey levels or colours"
+        raise ValueError(f"an image must be {kinds}; got a {type(image).__name__} of {array.dtype}")
+    return np.where(hidden, np.nan, array.astype(np.float32)) if hidden.any() else array
+
+
+def _white_of(arrays: list[Any]) -> float:
+    """White of whole or real levels: 1, 255 or by the bits of the largest; ``ValueError`` of other ranges."""
+    known = np.array([[a.min(), a.max()] for a in (a[np.isfinite(a)] for a in arrays) if a.size], np.float64)
+    if not len(known):
+        return 255.0
+    low, high = float(known[:, 0].min()), float(known[:, 1].max())
+    real = arrays[0].dtype.kind == "f"
+    # Resampled levels exceed their range a little.
+    if real and low >= -0.5 and high <= 1.5:
+        return 1.0
+    if (-128.0 if real and high > 1.5 else 0.0) <= low and high <= 65535.5:
+        return 255.0 if real and high < 512.0 else white_level(high)
+    ranges = "0 to 1 (floats), 0 to 255 or 0 to 65535"
+    raise ValueError(f"the levels of an image must be {ranges}; got {low:g} to {high:g}")
 
 
 def rows_of_views(view: I64, n_views: int) -> list[I64]:

@@ -12,6 +12,9 @@ import numpy as np
 from thesisrecon.arrays import (
     B8,
     F64,
+    Record,
+    number,
+    numbers,
     require_calibration,
     require_finite,
     require_rotations,
@@ -21,8 +24,10 @@ from thesisrecon.arrays import (
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(Record):
     """Metric camera x ~ K [R t] X with radial distortion (3.21).
+
+    It holds read-only copies of its arrays.
 
     Parameters
     ----------
@@ -33,8 +38,9 @@ class Camera:
     size : tuple of int
         Image (width, height) in pixels.
     distortion : ndarray (C,), optional
-        Radial coefficients k1, k2, ...: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
-        ...). None: no distortion.
+        Radial coefficients k1, k2, k3: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
+        k3 r^6). None: no distortion. More than three numbers are refused unless the others are 0: four and
+        more mean k1, k2, p1, p2, k3 in OpenCV and k1, k2, k3, k4, k5 elsewhere.
     std : mapping of str to float, optional
         Standard deviations of estimated values: "focal_px", "aspect", "skew_px", "principal_x_px",
         "principal_y_px", "k1", "k2", "k3" (0: as assumed), and of poses of a run "rotation_x_deg" and y, z
@@ -45,8 +51,9 @@ class Camera:
     Raises
     ------
     ValueError
-        If a shape is wrong, a number is not finite, K is not upper triangular with positive focal lengths and
-        K33 = 1, R is not a rotation, or the size is not whole numbers of at least 1.
+        If a shape is wrong, a number is not finite or masked, K is not upper triangular with positive focal
+        lengths and K33 = 1, R is not a rotation, the size is not whole numbers of at least 1, or distortion
+        has more than three numbers that are not 0.
 
     Examples
     --------
@@ -70,12 +77,15 @@ class Camera:
     as_stored: bool = False
 
     def __post_init__(self) -> None:
-        fields = {name: np.asarray(getattr(self, name), dtype=np.float64) for name in ("K", "R", "t")}
-        K, R, t = fields.values()
+        given = {name: getattr(self, name) for name in ("K", "R", "t", "distortion")}
+        if self.distortion is None:
+            del given["distortion"]
+        fields = {name: array.copy() for name, array in zip(given, numbers("Camera", **given), strict=True)}
+        K, R, t = fields["K"], fields["R"], fields["t"]
         require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
-        if self.distortion is not None:
-            fields["distortion"] = np.asarray(self.distortion, dtype=np.float64)
+        if "distortion" in fields:
             require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
+            _require_radial(fields["distortion"])
         require_finite("Camera", *fields.values())
         require_calibration("Camera", K)
         require_rotations("Camera", R)
@@ -85,7 +95,10 @@ class Camera:
             raise ValueError(f"Camera needs a size of two whole numbers; got {self.size}") from None
         if min(width, height) < 1:
             raise ValueError(f"Camera needs a size of at least 1 x 1; got {self.size}")
-        for name, value in {**fields, "size": (width, height)}.items():
+        for array in fields.values():
+            array.setflags(write=False)
+        std = self.std if self.std is None else dict(self.std)
+        for name, value in {**fields, "size": (width, height), "std": std}.items():
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -102,7 +115,7 @@ class Camera:
         Camera
             Without distortion.
         """
-        P = np.asarray(P, dtype=np.float64)
+        (P,) = numbers("Camera.from_matrix", P=P)
         require_shapes("Camera.from_matrix", P=(P, (3, 4)))
         return cls(*decompose_camera(P), size)
 
@@ -134,7 +147,7 @@ class Camera:
         ndarray (N, 2)
             Pixels xy.
         """
-        X = np.asarray(X, dtype=np.float64)
+        (X,) = numbers("Camera.project", missing=("X",), X=X)
         require_shapes("Camera.project", X=(X, ("N", 3)))
         return project_camera(self.K, self.R, self.t, X, distortion=self._coefficients)
 
@@ -150,15 +163,25 @@ class Camera:
         -------
         ndarray (N, 3)
             Points in the world frame; without ``depth`` unit vectors of the viewing rays in the world frame.
+            NaN for pixels farther out than the distortion images any point.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        given = {} if depth is None else {"depth": (depth, ("N",))}
+        (xy,) = numbers("Camera.unproject", missing=("xy",), xy=xy)
+        z = None if depth is None else numbers("Camera.unproject", missing=("depth",), depth=depth)[0]
+        given = {} if z is None else {"depth": (z, ("N",))}
         require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
         xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
-        rays = np.column_stack([undistort(xh[:, :2] / xh[:, 2:], self._coefficients), np.ones(len(xy))])
-        if depth is None:
+        places = xh[:, :2] / xh[:, 2:]
+        plane = undistort(places, self._coefficients)
+        # Beyond the radius up to which the distortion grows, its inverse does not exist.
+        largest = growing_radius(self._coefficients)
+        returned = np.linalg.norm(distort(plane, self._coefficients) - places, axis=1)
+        outside = np.linalg.norm(plane, axis=1) > largest * (1.0 + 1e-9)
+        outside |= returned > 1e-6 * np.maximum(1.0, np.linalg.norm(places, axis=1))
+        plane[outside] = np.nan
+        rays = np.column_stack([plane, np.ones(len(xy))])
+        if z is None:
             return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True) @ self.R)
-        return np.asarray((rays * np.asarray(depth)[:, None] - self.t) @ self.R)
+        return np.asarray((rays * z[:, None] - self.t) @ self.R)
 
     def scaled(self, factor: float) -> Camera:
         """Return the camera of the resized image: x goes to (x + 0.5) s - 0.5 along each side.
@@ -173,7 +196,7 @@ class Camera:
         -------
         Camera
         """
-        if not 0.0 < factor < math.inf:
+        if not 0.0 < number("Camera.scaled", "factor", factor, "a finite factor above 0") < math.inf:
             raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")
         width, height = (max(1, round(side * factor)) for side in self.size)
         S = resizing_transform(np.divide((width, height), self.size))
@@ -246,6 +269,22 @@ def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
         factor = _radial_factor(k, r2)
         reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted
     return np.asarray(xy_normalized / np.where(reached & (factor > 0.0), factor, 1.0))
+
+
+def growing_radius(distortion: F64) -> float:
+    """Normalised radius up to which r (1 + k1 r^2 + k2 r^4 + ...) grows, infinity if everywhere."""
+    slopes = distortion * np.arange(3, 2 * len(distortion) + 2, 2)
+    roots = np.roots([*slopes[::-1], 1.0])
+    squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return float(np.sqrt(squares.min())) if len(squares) else np.inf
+
+
+def _require_radial(distortion: F64) -> None:
+    """Refuse numbers after k3: their meaning is not that of OpenCV's calibration files."""
+    if np.any(distortion[3:]) or (len(distortion) > 3 and np.any(distortion[2:])):
+        both = "they are k1, k2, p1, p2, k3 in OpenCV, and k1, k2, k3, k4, k5 of a radial lens elsewhere"
+        advice = "give radial k1, k2, k3; for tangential p1, p2 undistort the images first"
+        raise ValueError(f"Camera got {len(distortion)} distortion numbers, and {both}; {advice}")
 
 
 def _radial_factor(distortion: float | F64, r2: F64) -> F64:

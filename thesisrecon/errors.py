@@ -67,6 +67,13 @@ def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:
     return f"unknown {what} {in_words(word)}; {hint}"
 
 
+def require_word(what: str, word: Any, known: Iterable[str]) -> str:
+    """Return a known word; UsageError of :func:`unknown_word` for anything else."""
+    if not isinstance(word, str) or word not in known:
+        raise UsageError(unknown_word(what, word, known))
+    return word
+
+
 class Notice(str):
     """Text of a warning, failed check or reason of ``messages.toml``, which states cause and remedy too.
 

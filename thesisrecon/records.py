@@ -4,18 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F32, F64, I64, Stratum, resizing_transform
+from thesisrecon.arrays import (
+    B8,
+    F32,
+    F64,
+    I64,
+    Record,
+    Stratum,
+    eight_bit,
+    image_levels,
+    numbers,
+    require_shapes,
+    resizing_transform,
+)
 from thesisrecon.errors import Notice, counted
 
 
-@dataclass(frozen=True)
-class Image:
-    """One image at working size.
+@dataclass(frozen=True, eq=False)
+class Image(Record):
+    """One image at working size; grey images and levels of other kinds become (H, W, 3) uint8.
 
     Examples
     --------
@@ -27,6 +40,18 @@ class Image:
     rgb: NDArray[np.uint8]  #: (H, W, 3)
     original_size: tuple[int, int]  #: (width, height) after EXIF rotation (from COLMAP: as stored)
     mask: B8 | None = None  #: (H, W) pixels to use; None: all
+
+    def __post_init__(self) -> None:
+        if isinstance(self.rgb, np.ndarray) and self.rgb.dtype == np.uint8 and self.rgb.shape[2:] == (3,):
+            return
+        rgb, known = eight_bit(image_levels(self.rgb)[0])
+        if rgb.size == np.prod(rgb.shape[:2]):
+            rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
+        if rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise ValueError(f"an Image needs rgb (H, W, 3); got {np.shape(self.rgb)}")
+        object.__setattr__(self, "rgb", rgb)
+        if known is not None:
+            object.__setattr__(self, "mask", known if self.mask is None else known & self.mask)
 
     @property
     def has_pixels(self) -> bool:
@@ -63,8 +88,8 @@ class Image:
         return levels
 
 
-@dataclass(frozen=True)
-class Seeds:
+@dataclass(frozen=True, eq=False)
+class Seeds(Record):
     """Corners of several scales with a normalised patch each, matched without a search radius."""
 
     xy: F64  #: (S, 2) positions, px
@@ -74,8 +99,8 @@ class Seeds:
     frame: F64 | None = None  #: (S, 2, 2) px per sample along the patch's axes; None: by scale and angle
 
 
-@dataclass(frozen=True)
-class Features:
+@dataclass(frozen=True, eq=False)
+class Features(Record):
     """Corners of one image, strongest first."""
 
     xy: F64  #: (N, 2) positions, px
@@ -85,8 +110,8 @@ class Features:
     oblique: Seeds | None = None  #: seeds of simulated oblique views, for pairs that need them
 
 
-@dataclass(frozen=True)
-class Matches:
+@dataclass(frozen=True, eq=False)
+class Matches(Record):
     """Matched corners of views i and j."""
 
     i: int
@@ -99,8 +124,8 @@ class Matches:
     affine: F64  #: (M, 2, 2) local map from image 1 to image 2; identity if it was not estimated
 
 
-@dataclass(frozen=True)
-class PairChoice:
+@dataclass(frozen=True, eq=False)
+class PairChoice(Record):
     """The pairs of views to match."""
 
     pairs: I64  #: (M, 2) view numbers, the smaller first, sorted
@@ -108,8 +133,8 @@ class PairChoice:
     compared: int = 0  #: number of pairs whose overlap was estimated
 
 
-@dataclass(frozen=True)
-class DegeneracyReport:
+@dataclass(frozen=True, eq=False)
+class DegeneracyReport(Record):
     """Whether the matches of a pair determine its F (no other F explains them as well), with the evidence."""
 
     determined: bool
@@ -122,8 +147,8 @@ class DegeneracyReport:
     expected_error_px: float = float("inf")  #: RMS epipolar distance of exact matches by the covariance of F
 
 
-@dataclass(frozen=True)
-class FundamentalFit:
+@dataclass(frozen=True, eq=False)
+class FundamentalFit(Record):
     """A robust estimate of F."""
 
     F: F64  #: (3, 3) of unit Frobenius norm
@@ -135,8 +160,8 @@ class FundamentalFit:
     competing_models: F64 = field(default_factory=lambda: np.empty((0, 3, 3)))
 
 
-@dataclass(frozen=True)
-class TwoView:
+@dataclass(frozen=True, eq=False)
+class TwoView(Record):
     """A pair of views with its epipolar geometry and its verified matches, which are valid for any F."""
 
     i: int
@@ -167,8 +192,8 @@ class TwoView:
         return self.degeneracy is not None and not self.degeneracy.determined
 
 
-@dataclass(frozen=True)
-class Tracks:
+@dataclass(frozen=True, eq=False)
+class Tracks(Record):
     """Observations of scene points, sorted by (point, view); a point at most once per view."""
 
     view_index: I64  #: (K,)
@@ -185,8 +210,8 @@ def common_points(view: I64, point: I64, n_views: int) -> scipy.sparse.csr_array
     return seen @ seen.T
 
 
-@dataclass(frozen=True)
-class Reconstruction:
+@dataclass(frozen=True, eq=False)
+class Reconstruction(Record):
     """Cameras and points in one stratum ("projective", "affine" or "metric"), with their tracks."""
 
     stratum: Stratum
@@ -238,8 +263,8 @@ INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
 """Columns of every per-view table of intrinsics."""
 
 
-@dataclass(frozen=True)
-class IntrinsicsPrior:
+@dataclass(frozen=True, eq=False)
+class IntrinsicsPrior(Record):
     """Gaussian prior of the intrinsics of V views or cameras, in pixels at working size."""
 
     #: (V, C), C = 6 columns as in :data:`INTRINSICS`, or 8 with k2 and k3; NaN: a focal without initial value
@@ -271,8 +296,8 @@ class IntrinsicsPrior:
         return np.isfinite(self.std[:, 0]) & np.isfinite(self.mean[:, 0])
 
 
-@dataclass(frozen=True)
-class Upgrade:
+@dataclass(frozen=True, eq=False)
+class Upgrade(Record):
     """One candidate of self-calibration."""
 
     metric_from_projective: F64  #: (4, 4)
@@ -281,8 +306,8 @@ class Upgrade:
     method: str  #: the method it came from
 
 
-@dataclass(frozen=True)
-class IdentifiabilityReport:
+@dataclass(frozen=True, eq=False)
+class IdentifiabilityReport(Record):
     """Whether the views determine the calibration under the prior, and the nearest critical motion."""
 
     identifiable: bool  #: whether the calibration is determined; the prior may resolve a critical motion
@@ -294,8 +319,8 @@ class IdentifiabilityReport:
     prior_contradicted: bool = False  #: determined but for the prior, such as one camera for zoomed images
 
 
-@dataclass(frozen=True)
-class SelfCalibration:
+@dataclass(frozen=True, eq=False)
+class SelfCalibration(Record):
     """Result of self-calibration (chapter 7)."""
 
     metric_from_projective: F64  #: (4, 4) upgrading transform of the best candidate
@@ -320,8 +345,8 @@ class SelfCalibration:
         return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class IntrinsicInterval:
+@dataclass(frozen=True, eq=False)
+class IntrinsicInterval(Record):
     """One intrinsic of one view with its standard deviation (in pixels or dimensionless) and source."""
 
     value: float
@@ -329,8 +354,8 @@ class IntrinsicInterval:
     source: str
 
 
-@dataclass(frozen=True)
-class MetricResult:
+@dataclass(frozen=True, eq=False)
+class MetricResult(Record):
     """Result of the metric stage."""
 
     reconstruction: Reconstruction
@@ -349,8 +374,8 @@ class MetricResult:
     pose_std: F64 | None = None
 
 
-@dataclass(frozen=True)
-class DisparityMap:
+@dataclass(frozen=True, eq=False)
+class DisparityMap(Record):
     """Disparity of the left image of a rectified pair."""
 
     disparity: F32  #: (H, W) x_right = x_left - d, NaN where unknown or occluded
@@ -374,8 +399,8 @@ class DisparityMap:
         return np.asarray(np.fmin(from_left, from_right))
 
 
-@dataclass(frozen=True)
-class DepthMap:
+@dataclass(frozen=True, eq=False)
+class DepthMap(Record):
     """Depth map of one view, distortion removed."""
 
     view: int
@@ -385,8 +410,8 @@ class DepthMap:
     views: NDArray[np.uint8]  #: (H, W) number of other views that confirm it
 
 
-@dataclass(frozen=True)
-class PinholeView:
+@dataclass(frozen=True, eq=False)
+class PinholeView(Record):
     """An image with its distortion removed."""
 
     view: int
@@ -395,9 +420,12 @@ class PinholeView:
     seen: B8  #: (H, W) pixels inside the original image and its mask
 
 
-@dataclass(frozen=True)
-class TexturedMesh:
-    """A triangle mesh with vertex colours, a texture or neither."""
+@dataclass(frozen=True, eq=False)
+class TexturedMesh(Record):
+    """A triangle mesh with vertex colours, a texture or neither.
+
+    The calls also take faces of quads (M, 4), uv (M, 4, 2), and colours as floats from 0 to 1.
+    """
 
     vertices: F64  #: (N, 3)
     faces: I64  #: (M, 3) vertex indices, counter-clockwise seen from outside
@@ -407,8 +435,8 @@ class TexturedMesh:
     untextured: B8 | None = None  #: (M,) faces that no view sees
 
 
-@dataclass(frozen=True)
-class RenderedView:
+@dataclass(frozen=True, eq=False)
+class RenderedView(Record):
     """A rendered mesh."""
 
     color: NDArray[np.uint8]  #: (H, W, 3)
@@ -416,8 +444,8 @@ class RenderedView:
     valid: B8  #: (H, W) pixels with a surface
 
 
-@dataclass(frozen=True)
-class HeldOut:
+@dataclass(frozen=True, eq=False)
+class HeldOut(Record):
     """Comparison of a held-out image, distortion removed, with the rendered model."""
 
     view: int
@@ -433,8 +461,8 @@ class HeldOut:
         return float(self.compared.mean()) if self.compared.size else 0.0
 
 
-@dataclass(frozen=True)
-class StageReport:
+@dataclass(frozen=True, eq=False)
+class StageReport(Record):
     """Computing time, numbers and warnings of one stage."""
 
     stage: str
@@ -444,26 +472,65 @@ class StageReport:
     warnings: tuple[str, ...] = ()
 
 
-def require_mesh(caller: str, mesh: TexturedMesh) -> None:
-    """``ValueError`` unless faces, colours and texture coordinates fit the vertices, finite where used."""
+def as_mesh(caller: str, mesh: TexturedMesh) -> TexturedMesh:
+    """Return a mesh of triangles in the types of the record.
+
+    Quads become two triangles each; colours and textures of floats or 16 bits levels from 0 to 255.
+    ``ValueError`` unless faces, colours and texture coordinates fit the vertices, finite where used.
+    """
     if not isinstance(mesh, TexturedMesh):
         given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
         raise ValueError(f"{caller} needs a TexturedMesh; {given}")
-    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+    missing = ("vertices", "faces", "uv")
+    vertices, corners = numbers(caller, missing=missing, vertices=mesh.vertices, faces=mesh.faces)
+    n = len(vertices)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        advice = "; divide homogeneous ones by their last coordinate" if vertices.shape[1:] == (4,) else ""
+        raise ValueError(f"{caller} needs vertices (N, 3) of the mesh; got {vertices.shape}{advice}")
+    if corners.ndim != 2 or corners.shape[1] not in (3, 4):
+        rule = "faces (M, 3), or (M, 4) of quads, of the mesh"
+        raise ValueError(f"{caller} needs {rule}; got {corners.shape}; divide other polygons into triangles")
+    if not (corners == np.rint(corners)).all():
+        raise ValueError(f"{caller} needs faces of whole numbers, the rows of their vertices; some are not")
+    faces = corners.astype(np.int64)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < n:
         raise ValueError(f"{caller}: the faces refer to vertices that do not exist")
-    finite: B8 = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
-    if not finite[mesh.faces].all():
+    if not np.isfinite(vertices[np.unique(faces)]).all():
         raise ValueError(f"{caller}: the vertices of faces must be finite")
-    if mesh.uv is not None and mesh.uv.shape != (len(mesh.faces), 3, 2):
-        raise ValueError(f"{caller}: uv must be ({len(mesh.faces)}, 3, 2); got {mesh.uv.shape}")
-    if mesh.uv is not None and not np.isfinite(mesh.uv).all():
+    uv = None if mesh.uv is None else numbers(caller, missing=missing, uv=mesh.uv)[0]
+    if uv is not None and uv.shape != (*faces.shape, 2):
+        raise ValueError(f"{caller}: uv must be {(*faces.shape, 2)}; got {uv.shape}")
+    if uv is not None and not np.isfinite(uv).all():
         raise ValueError(f"{caller}: uv must be finite")
-    if mesh.colors is not None and mesh.colors.shape != mesh.vertices.shape:
-        raise ValueError(f"{caller}: colors must be {mesh.vertices.shape}; got {mesh.colors.shape}")
+    untextured = mesh.untextured
+    if faces.shape[1] == 4:
+        faces = _halves(faces)
+        uv = None if uv is None else _halves(uv)
+        untextured = None if untextured is None else np.repeat(untextured, 2)
+    colors = None if mesh.colors is None else _colours(caller, "colors", mesh.colors, (n,))
+    image = None if mesh.texture is None else _colours(caller, "texture", mesh.texture, ("H", "W"))
+    return replace(
+        mesh, vertices=vertices, faces=faces, colors=colors, uv=uv, texture=image, untextured=untextured
+    )
+
+
+def _halves(quads: NDArray[Any]) -> NDArray[Any]:
+    """Two triangles (2 M, 3, ...) of each quad (M, 4, ...), in the order of their corners."""
+    return np.asarray(quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, *quads.shape[2:]))
+
+
+def _colours(caller: str, name: str, given: Any, shape: tuple[int | str, ...]) -> NDArray[np.uint8]:
+    """Colours (..., 3) as uint8; those of (..., 4) lose their alpha."""
+    (levels,) = image_levels(given)
+    levels = levels[..., :3] if levels.shape[-1:] == (4,) else levels
+    require_shapes(caller, **{name: (levels, (*shape, 3))})
+    if not np.isfinite(levels).all():
+        raise ValueError(f"{caller}: {name} must be finite")
+    return np.ascontiguousarray(np.rint(np.clip(levels, 0.0, 255.0)), dtype=np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
-class Similarity:
+class Similarity(Record):
     """The similarity y = scale R x + t, with a positive scale."""
 
     scale: float

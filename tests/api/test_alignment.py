@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
-from thesisrecon import Camera, UsageError, align_to_positions, scaled
+from thesisrecon import Camera, UsageError, align_to_positions, reconstruction_from_cameras, scaled
 from thesisrecon.results import SparseModel, SparseView
 
 R0, T0, S0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), np.array([40.0, -7.0, 3.0]), 2.5
@@ -76,9 +76,12 @@ def test_too_few_and_collinear_positions_are_refused():
     few = {name: positions[name] for name in ("0.jpg", "1.jpg")}
     words = "at least 3 images; got 2; 'x.jpg' is not an image of the model"
     refuses(UsageError, words, align_to_positions, model, few | {"x.jpg": np.zeros(3)})
-    for wrong in ([0.0, np.nan, 1.0], [0.0, 1.0], 3.0, "0 1 2", None):
+    for wrong in ([0.0, 1.0], 3.0, "0 1 2", [0.0, np.inf, 1.0]):
         bad = positions | {"0.jpg": wrong}
-        refuses(UsageError, "three finite coordinates", align_to_positions, model, bad)
+        refuses(
+            UsageError, "three coordinates of each position; that of 0.jpg", align_to_positions, model, bad
+        )
+    refuses(UsageError, "positions by image name", align_to_positions, model, [np.zeros(3)] * 6)
     line = [SparseView(f"{i}.jpg", np.eye(3), np.array([float(i), 0, 0])) for i in range(6)]
     words = "camera centres of the 6 images lie on one line"
     refuses(UsageError, words, align_to_positions, SparseModel(line), positions)
@@ -89,6 +92,28 @@ def test_too_few_and_collinear_positions_are_refused():
     street = [SparseView(v.name, v.R, v.t + rng.normal(0, 0.02, 3)) for v in line]
     noisy = {view.name: view.centre + rng.normal(0, 0.05, 3) for view in line}
     refuses(UsageError, "rotation about it undetermined", align_to_positions, SparseModel(street), noisy)
+
+
+def test_a_missing_position_costs_one_image():
+    model = make_model(10)
+    for missing in ([0.0, np.nan, 1.0], None, [None] * 3, np.ma.masked_all(3)):
+        moved, report = align_to_positions(model, true_positions(model) | {"4.jpg": missing})
+        assert report.missing == ("4.jpg",)
+        assert "1 image without a position, such as 4.jpg" in str(report)
+        np.testing.assert_allclose(moved.views[4].centre, true_positions(model)["4.jpg"], atol=1e-9)
+
+
+def test_models_are_cameras_in_any_form():
+    views = make_model(4).views
+    cameras = {view.name: Camera(view.K, view.R, view.t, view.size, view.distortion) for view in views}
+    K, R, t = (np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t"))
+    for model in (cameras, list(cameras.values()), reconstruction_from_cameras(K, R, t, sizes=(640, 480))):
+        first, last = (f"{k}.jpg" if isinstance(model, dict) else f"image-{k}" for k in (0, 3))
+        found = scaled(model, first, last, 7.0)
+        assert np.linalg.norm(found.views[0].centre - found.views[3].centre) == pytest.approx(7.0)
+        assert {view.camera for view in found.views} == {0}
+    refuses(UsageError, "0.jpg is a ndarray", scaled, {"0.jpg": np.eye(3, 4)}, "0.jpg", "1.jpg", 1.0)
+    refuses(UsageError, "a model must be", scaled, 3, "0.jpg", "1.jpg", 1.0)
 
 
 def test_a_known_distance_gives_the_scale():

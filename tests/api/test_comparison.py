@@ -132,8 +132,42 @@ def test_cameras_are_paired_by_name_stem_and_order(truth):
     assert found.names_b == tuple(truth.names)
     assert np.isnan(found.focal_error_rel).all()
     assert "focal_error_rel" not in found.summary
+    assert found.notes[0] == "no name is common; the 14 cameras were paired by their order alone"
     words = "no common camera: '0.25', '1.25', '2.25' and 11 more in the first and '0000.jpg'"
     refuses(UsageError, words, compare_models, trajectory, SparseModel(truth.views[:2]))
+
+
+def test_trajectories_are_paired_by_time_and_have_errors_by_distance(truth):
+    times = 1e9 + np.arange(14) * 0.1
+    drift = [replace(view, t=view.t - view.R @ [0.01 * k, 0, 0]) for k, view in enumerate(truth.views)]
+    fields = {"K": None, "size": None}
+    fast = renamed(truth, [f"{time:.6f}" for time in times], **fields)
+    # Every second one in another order, late, as images named by nanoseconds, and one without a partner.
+    slow = replace(truth, views=drift[::-2])
+    late = renamed(slow, [f"cam0/{round((time + 2.003) * 1e9)}.png" for time in times[::-2]])
+    late = replace(late, views=[*late.views, replace(late.views[0], name="cam0/1000000500000000000.png")])
+    refuses(UsageError, "nearest times of the models are 0.803 s apart", compare_models, fast, late)
+    found = compare_models(fast, late, time_offset=-2.0)
+    assert found.names_b == tuple(view.name for view in late.views[6::-1])
+    assert found.names == tuple(fast.names[1::2])
+    said = "7 of 14 and 8 cameras were paired by time, at most 0.003 s apart (tolerance 0.01 s, offset -2 s)"
+    assert found.notes[0] == said
+    wide = compare_models(fast, fast, max_time_difference=np.inf, time_offset=0.06)
+    assert wide.names_b[0] == fast.names[0]
+    # The motions by hand.
+    errors = found.relative_errors(2.0)
+    a, b = ({view.name: view for view in model.views} for model in (found.a, found.b))
+    for (i, j), translation, angle in zip(errors.pairs, errors.translation, errors.rotation_deg, strict=True):
+        motions = []
+        for views, names in ((b, found.names_b), (a, found.names)):
+            one, other = views[names[i]], views[names[j]]
+            motions.append((one.R @ other.R.T, one.R @ (other.centre - one.centre)))
+        (R, t), (R_a, t_a) = motions
+        assert translation == pytest.approx(np.linalg.norm(t_a - t))
+        assert angle == pytest.approx(np.degrees(Rotation.from_matrix(R.T @ R_a).magnitude()), abs=1e-6)
+    assert (errors.pairs[1:, 0] == errors.pairs[:-1, 1]).all()
+    refuses(ValueError, "shorter than the distance 1e", found.relative_errors, 1e6)
+    refuses(ValueError, "finite distance above 0", found.relative_errors, 0.0)
 
 
 def test_too_few_cameras_and_cameras_on_a_line_are_compared_as_far_as_possible(truth):

@@ -205,7 +205,7 @@ def test_the_example_makes_a_glb_of_the_courtyard(tmp_path, monkeypatch):
     assert np.nanmedian(off) < 0.005
     assert np.isfinite(off).mean() > 0.6
     # The rendered view is the image.
-    image = read_pixels(source / "images" / "0005.jpg")
+    (image,) = read_pixels(source / "images" / "0005.jpg")
     small = image.reshape(192, 4, 256, 4, 3).mean(axis=(1, 3))
     apart = np.abs(made["view"].color.astype(float) - small)[made["view"].valid]
     assert np.median(apart) < 12.0

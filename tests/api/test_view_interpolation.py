@@ -70,7 +70,6 @@ def test_wrong_calls_of_the_front_door_are_refused(wall):
     for error, words, *images, s, disparity in (
         (ValueError, r"s must be between 0 \(left image\) and 1 .*; got 1\.5", left, right, 1.5, None),
         (ValueError, r"same size; got \(90, 160\) and \(87, 160\)", left, right[:-3], 0.5, None),
-        (ValueError, "uint8", left.astype(float), right, 0.5, None),
         (ValueError, r"shape of the images \(90, 160\); got \(3, 4\)", left, right, 0.5, small),
         (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, [d, d]),
         (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, d[..., None]),

@@ -222,8 +222,8 @@ def test_rectified_images_have_no_levels_where_they_are_transparent():
     assert 0.3 < missing.mean() < 0.7
     # Beside missing pixels the interpolation is linear.
     np.testing.assert_allclose(with_alpha.left[~missing], without.left[~missing], atol=2.0)
-    assert isinstance(read_levels(colours()), np.ndarray)
-    assert np.isnan(read_levels(cutout())[~OPAQUE]).all()
+    assert isinstance(read_levels(colours())[0], np.ndarray)
+    assert np.isnan(read_levels(cutout())[0][~OPAQUE]).all()
     moved = np.roll(cutout(), -6, axis=1)
     disparity = thesisrecon.match_rectified(cutout(), moved, max_disparity_px=12).disparity
     known = np.isfinite(disparity)

@@ -145,12 +145,12 @@ def test_wrong_calls_are_refused():
         ("a run until 'metric' has no mesh", None),
         ("vertices that do not exist", TexturedMesh(np.zeros((2, 3)), np.array([[0, 1, 2]]))),
         ("uv must be", wall(uv=uv[:1], texture=texture)),
-        ("colors must be", wall(colors=np.zeros((1, 3), np.uint8))),
+        (r"colors \(4, 3\)", wall(colors=np.zeros((1, 3), np.uint8))),
         ("vertices of faces must be finite", replace(wall(), vertices=hole)),
         ("uv must be finite", wall(uv=np.full_like(uv, np.nan), texture=texture)),
     ):
         refuses(ValueError, words, render, mesh, CAMERA)
-    refuses(ValueError, "at least one sample", render, wall(), CAMERA, samples=0)
+    refuses(ValueError, "at least 1 as samples", render, wall(), CAMERA, samples=0)
     refuses(ValueError, "either a direction or a position", Light)
 
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.api.cameras import CameraInput, as_cameras, radial_coefficients, require_inside
-from thesisrecon.arrays import B8, F64, I64, require_finite, require_shapes
+from thesisrecon.api.cameras import require_inside
+from thesisrecon.api.given import CameraInput, as_cameras, points_of_reconstruction, radial_coefficients
+from thesisrecon.arrays import B8, F64, I64, Record, numbers, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.errors import unknown_word
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.projection import POSE_DOF, MetricCameras, Observations, sort_observations
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
+from thesisrecon.results import RunResult
 
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
@@ -24,8 +26,8 @@ STD_NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px"
 """Names of the standard deviations in :attr:`thesisrecon.Camera.std`."""
 
 
-@dataclass(frozen=True)
-class BundleAdjustment:
+@dataclass(frozen=True, eq=False)
+class BundleAdjustment(Record):
     """Refined cameras and points with their uncertainty.
 
     All covariances are those of the inner gauge (free network adjustment): among the solutions that differ by
@@ -176,16 +178,18 @@ def _problem(
     cameras: CameraInput, X: F64 | None, xy: F64 | Tracks | Observations | None, sizes: I64 | None,
 ) -> tuple[list[Camera], F64, Observations, tuple[int, ...] | None]:  # fmt: skip
     """Cameras, points and observations, and the shape of xy if it was dense."""
+    cameras = cameras.reconstruction if isinstance(cameras, RunResult) else cameras
     views = as_cameras("bundle_adjust", cameras, sizes)
     if isinstance(cameras, Reconstruction) and X is None and xy is None:
-        return views, *_of_reconstruction(cameras), None
+        X, *observed = points_of_reconstruction(cameras)
+        return views, X, Observations(*observed), None
     if X is None or xy is None:
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
-    X, shape = np.asarray(X, dtype=np.float64), None
+    (X,), shape = numbers("bundle_adjust", X=X), None
     if isinstance(xy, Tracks | Observations):
         observed = Observations(xy.view_index, xy.point_index, xy.xy)
     else:
-        xy = np.asarray(xy, dtype=np.float64)
+        (xy,) = numbers("bundle_adjust", missing=("xy",), xy=xy)
         shape = (len(views), len(X), 2)
         if xy.shape != shape:
             raise ValueError(
@@ -195,15 +199,6 @@ def _problem(
         observed = Observations(view, point, xy[view, point])
     require_shapes("bundle_adjust", X=(X, ("N", 3)))
     return views, X, observed, shape
-
-
-def _of_reconstruction(r: Reconstruction) -> tuple[F64, Observations]:
-    """Valid points, and the inlier observations in registered views."""
-    tracks, used = r.tracks, r.used
-    view, point = np.cumsum(r.registered) - 1, np.cumsum(r.valid) - 1
-    X = r.X[r.valid]
-    observed = Observations(view[tracks.view_index[used]], point[tracks.point_index[used]], tracks.xy[used])
-    return np.asarray(X[:, :3] / X[:, 3:]), observed
 
 
 def _free(names: Sequence[str]) -> B8:

@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from thesisrecon.api.cameras import reconstruction_from_cameras
-from thesisrecon.arrays import F64, I64, require_finite, require_shapes
+from thesisrecon.api.given import checked_sizes
+from thesisrecon.arrays import F64, I64, numbers, require_finite, require_shapes
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
-from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.errors import StageFailure, UsageError, require_word, unknown_word
 from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Image, Reconstruction, SelfCalibration
@@ -131,8 +132,7 @@ def absolute_dual_quadric(
     >>> bool(np.allclose(w / w[2, 2], found.K[0] @ found.K[0].T, rtol=1e-6)), found.identifiable
     (True, True)
     """
-    if method not in ("nonlinear", "linear"):
-        raise ValueError(unknown_word("method", method, ("nonlinear", "linear")))
+    require_word("method", method, ("nonlinear", "linear"))
     return self_calibrate(reconstruction, sizes, X=X, xy=xy, method=f"{method}-quadric", config=config)
 
 
@@ -182,7 +182,7 @@ def plane_at_infinity(
         if isinstance(calibrator, Stratified):
             return calibrator.locate(projective, prior=prior, rng=rng)
         return calibrator.calibrate(projective, prior=prior, rng=rng).plane_at_infinity
-    v = np.asarray(vanishing_points, dtype=np.float64)
+    (v,) = numbers("plane_at_infinity", missing=("vanishing_points",), vanishing_points=vanishing_points)
     v = homogenize(v) if v.shape[-1:] == (2,) else v
     require_shapes("plane_at_infinity", P=(projective.P, ("V", 3, 4)), vanishing_points=(v, ("V", "D", 3)))
     seen = projective.registered
@@ -233,7 +233,7 @@ def upgrade_affine(
     projective = _projective("upgrade_affine", reconstruction, None, None, None)
     if plane is None:
         plane = plane_at_infinity(projective, config=config, images=images, seed=seed)
-    return upgrade_to_affine(projective, plane)
+    return upgrade_to_affine(projective, numbers("upgrade_affine", plane=plane)[0])
 
 
 def _projective(
@@ -245,7 +245,11 @@ def _projective(
             way = "reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
             message = f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
             raise ValueError(message)
-        return reconstruction_from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
+        try:
+            return reconstruction_from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
+        except ValueError as error:
+            # The message names the call that was made.
+            raise ValueError(str(error).replace("reconstruction_from_cameras", caller)) from None
     if given.stratum == "projective":
         return given
     advice = (
@@ -318,11 +322,11 @@ def kruppa(F: F64, sizes: I64) -> F64:
     >>> round(float(kruppa(F, (640, 480))[0, 0]), 3)
     800.0
     """
-    F = np.asarray(F, dtype=np.float64)
+    (F,) = numbers("kruppa", F=F)
     F = F[None] if F.ndim == 2 else F
     require_shapes("kruppa", F=(F, ("M", 3, 3)))
     require_finite("kruppa", F)
-    sizes = np.unique(np.atleast_2d(sizes), axis=0)
-    if sizes.shape != (1, 2):
-        raise ValueError(f"kruppa needs images of the same size, width and height; got {sizes.tolist()}")
-    return calibrate_from_fundamentals(F, sizes)
+    given = np.atleast_2d(numbers("kruppa", sizes=sizes)[0])
+    if given.ndim != 2 or given.shape[1] != 2 or len(np.unique(given, axis=0)) != 1:
+        raise ValueError(f"kruppa needs images of the same size, width and height; got {given.tolist()}")
+    return calibrate_from_fundamentals(F, checked_sizes("kruppa", given, len(given))[:1])

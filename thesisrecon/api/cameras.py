@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, get_args
+from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 from numpy.random import Generator
 
+from thesisrecon.api.given import calibrated_arrays, checked_sizes
 from thesisrecon.arrays import (
     F64,
     I64,
     Stratum,
+    generator,
+    number,
+    numbers,
     require_calibration,
     require_finite,
     require_rotations,
     require_shapes,
+    whole_number,
 )
-from thesisrecon.camera import Camera, compose_camera, decompose_camera
+from thesisrecon.camera import compose_camera, decompose_camera
+from thesisrecon.errors import require_word
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate_points
 from thesisrecon.optimize.ransac import Budget, Resection, resect_robust
 from thesisrecon.records import Reconstruction, Tracks
-
-CameraInput = Sequence[Camera] | tuple[F64, F64, F64] | Mapping[str, Camera] | Reconstruction
-"""Cameras, (K, R, t), cameras by image name, or a metric reconstruction."""
 
 
 def cheirality(P: F64, X: F64) -> F64:
@@ -48,7 +51,7 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
-    P, X = np.asarray(P, dtype=np.float64), np.asarray(X, dtype=np.float64)
+    P, X = numbers("cheirality", missing=("X",), P=P, X=X)
     require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
@@ -106,15 +109,15 @@ def resect(
     >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
     (500.0, [0.2, -0.1, 4.0])
     """
-    X, xy = np.asarray(X, dtype=np.float64), np.asarray(xy, dtype=np.float64)
+    X, xy = numbers("resect", X=X, xy=xy)
     require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
     if K is not None:
-        K = np.asarray(K, dtype=np.float64)
+        (K,) = numbers("resect", K=K)
         require_calibration("resect", K)
     require_finite("resect", X, xy)
     require_threshold(threshold_px, xy)
     budget = search_budget(confidence, max_samples)
-    return resect_robust(X, xy, K, threshold_px, budget, np.random.default_rng(seed))
+    return resect_robust(X, xy, K, threshold_px, budget, generator("resect", seed))
 
 
 def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
@@ -122,8 +125,8 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
 
     Parameters
     ----------
-    P, xy : ndarray (V, 3, 4) and (V, N, 2)
-        V >= 2 cameras of any scale, and pixels; NaN for not observed.
+    P, xy : array_like (V, 3, 4) and (V, N, 2)
+        V >= 2 cameras of any scale, and pixels; NaN or masked for not observed.
     method : {"polynomial", "linear", "midpoint", "iterated", "optimal"}, optional
         "polynomial": optimal for exactly two views (6.3.3); "linear" and "iterated": algebraic (6.3.1);
         "midpoint": metric frames only (6.3.2); "optimal": least reprojection error from any number of views.
@@ -147,11 +150,9 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     >>> np.allclose(X / X[:, 3:], [[0.0, 0.0, 2.0, 1.0]])
     True
     """
-    if method is not None and method not in get_args(TriangulationMethod):
-        raise ValueError(f"method must be one of {', '.join(get_args(TriangulationMethod))}; got {method!r}")
-    if np.iscomplexobj(P) or np.iscomplexobj(xy):
-        raise ValueError("triangulate needs real numbers; got complex ones")
-    P, xy = np.ascontiguousarray(P, dtype=np.float64), np.ascontiguousarray(xy, dtype=np.float64)
+    if method is not None:
+        require_word("method", method, get_args(TriangulationMethod))
+    P, xy = numbers("triangulate", missing=("xy",), P=P, xy=xy)
     require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     if len(P) < 2:
         raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
@@ -204,37 +205,19 @@ def reconstruction_from_cameras(
     )  # fmt: skip
 
 
-def _calibrated(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F64]:
-    """K (V, 3, 3), also of one camera, R (V, 3, 3) and t (V, 3)."""
-    K, R, t = (np.asarray(one, dtype=np.float64) for one in (K, R, t))
-    K = np.broadcast_to(K, (len(R), 3, 3)) if K.ndim == 2 else K
-    require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
-    return K, R, t
-
-
-def _checked_sizes(caller: str, sizes: I64, n: int) -> I64:
-    """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
-    given = np.asarray(sizes)
-    if given.shape not in ((2,), (n, 2)) or not np.isin(given.dtype.kind, ("i", "u", "f")):
-        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height; got {given.shape}, V = {n}")
-    if not (np.isfinite(given).all() and (given >= 1).all() and (given == np.round(given)).all()):
-        raise ValueError(f"{caller} needs sizes of whole numbers above 0; got {given.tolist()}")
-    return np.broadcast_to(given, (n, 2)).astype(np.int64)
-
-
 def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tuple[F64, F64 | None, I64]:
     """P (V, 3, 4), K (V, 3, 3) of a metric frame, and sizes (V, 2), of P alone or of K, R and t."""
     caller = "reconstruction_from_cameras"
     K: F64 | None = None
     if len(cameras) == 1:
-        P = np.asarray(cameras[0], dtype=np.float64)
+        (P,) = numbers(caller, P=cameras[0])
         require_shapes(caller, P=(P, ("V", 3, 4)))
         require_finite(caller, P)
         if metric:
             K, R, t = (np.stack(part) for part in zip(*map(decompose_camera, P), strict=True))
             P = compose_camera(K, R, t)
     elif len(cameras) == 3 and metric:
-        K, R, t = _calibrated(caller, *cameras)
+        K, R, t = calibrated_arrays(caller, *cameras)
         require_finite(caller, K, R, t)
         for one in K:
             require_calibration(caller, one)
@@ -242,7 +225,7 @@ def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tup
         P = compose_camera(K, R, t)
     else:
         raise ValueError(f"{caller} needs P, or K, R and t of a metric frame; got {len(cameras)} arrays")
-    return P, K, _checked_sizes(caller, sizes, len(P))
+    return P, K, checked_sizes(caller, sizes, len(P))
 
 
 def require_inside(view: I64, xy: F64, sizes: I64) -> None:
@@ -263,13 +246,13 @@ def _checked_points(
     caller = "reconstruction_from_cameras"
     if xy is None:
         xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)
-    xy = np.asarray(xy, dtype=np.float64)
+    (xy,) = numbers(caller, missing=("xy",), xy=xy)
     require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
     require_inside(views, xy[views, point], sizes)
     if X is None:
         X = triangulate_points(P, xy) if xy.shape[1] else np.zeros((0, 4))
-    X = np.asarray(X, dtype=np.float64)
+    (X,) = numbers(caller, X=X)
     X = homogenize(X) if X.ndim == 2 and X.shape[1] == 3 else X
     require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
     require_finite(caller, X)
@@ -283,7 +266,7 @@ def require_threshold(threshold_px: float | None, *points: F64) -> None:
     """Raise ``ValueError`` unless a threshold is None, or positive and smaller than the extents of points."""
     if threshold_px is None:
         return
-    if not 0.0 < threshold_px < np.inf:
+    if not 0.0 < number("the search", "threshold_px", threshold_px, "a positive number or None") < np.inf:
         raise ValueError(
             f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
         )
@@ -297,54 +280,6 @@ def require_threshold(threshold_px: float | None, *points: F64) -> None:
 
 def search_budget(confidence: float, max_samples: int) -> Budget:
     """The budget of a search, checked."""
-    if not 0.0 < confidence < 1.0:
+    if not 0.0 < number("the search", "confidence", confidence) < 1.0:
         raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
-    if isinstance(max_samples, bool) or not int(max_samples) == max_samples or max_samples < 1:
-        raise ValueError(f"max_samples must be a whole number of at least 1; got {max_samples}")
-    return Budget(confidence, int(max_samples))
-
-
-def as_cameras(
-    caller: str, cameras: CameraInput, sizes: I64 | None = None, names: Sequence[str] = ()
-) -> list[Camera]:
-    """The cameras in order; the registered ones of a reconstruction; of a mapping those of ``names``."""
-    if isinstance(cameras, Reconstruction):
-        return _registered_cameras(caller, cameras)
-    if isinstance(cameras, Mapping):
-        missing = [name for name in names if name not in cameras]
-        if missing:
-            first = next(iter(cameras), None)
-            raise ValueError(f"{caller} got no camera for {missing[0]}; the first camera is that of {first}")
-        return [cameras[name] for name in names or cameras]
-    given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
-    if given and all(isinstance(one, Camera) for one in given):
-        return given
-    if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
-        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
-        raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
-    if sizes is None:
-        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")
-    K, R, t = _calibrated(caller, *given)
-    return [Camera(*one) for one in zip(K, R, t, _checked_sizes(caller, sizes, len(R)), strict=True)]
-
-
-def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
-    if r.stratum != "metric" or r.K is None:
-        raise ValueError(f"{caller} needs a metric reconstruction with K; got {r.stratum}")
-    lenses = np.zeros((len(r.P), 3)) if r.distortion is None else r.distortion
-    views = []
-    for i in np.flatnonzero(r.registered):
-        Rt = np.linalg.solve(r.K[i], r.P[i])
-        views.append(Camera(r.K[i], Rt[:, :3], Rt[:, 3], tuple(r.sizes[i].tolist()), lenses[i]))
-    return views
-
-
-def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
-    """Distortion k1, k2, k3 (V, 3) of cameras; ``ValueError`` if one has further coefficients."""
-    table = np.zeros((len(views), 3))
-    for row, view in zip(table, views, strict=True):
-        lens = np.zeros(0) if view.distortion is None else view.distortion
-        if np.any(lens[3:]):
-            raise ValueError(f"{caller} takes distortion by k1, k2, k3; got {len(lens)} coefficients")
-        row[: len(lens[:3])] = lens[:3]
-    return table
+    return Budget(confidence, whole_number("the search", "max_samples", max_samples, 1))

@@ -11,16 +11,16 @@ from pathlib import Path, PurePath
 import numpy as np
 
 from thesisrecon._numba import ThreadPool
-from thesisrecon.api.models import as_sparse_model
+from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import F64, rows_of_views
-from thesisrecon.camera import undistort
-from thesisrecon.errors import UsageError, unknown_word
+from thesisrecon.camera import growing_radius, undistort
+from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io import _exports as formats
 from thesisrecon.io._colmap import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._exports import write_image
-from thesisrecon.io._files import first_repeated, read_json, require_image_name, write_atomically
+from thesisrecon.io._files import as_path, first_repeated, read_json, require_image_name, write_atomically
 from thesisrecon.io._images import (
     MAX_DECODED_BYTES,
     USELESS_MASKS,
@@ -82,7 +82,7 @@ FORMATS = (*_PINHOLE, *_DISTORTED)
 
 
 def export(
-    model: SparseModel | RunResult | str | Path, out: str | Path, *, to: str,
+    model: Model, out: str | Path, *, to: str,
     images: str | Path | None = None, masks: str | Path | None = None, threads: int = 0,
     overwrite: bool = False,
 ) -> ExportReport:  # fmt: skip
@@ -90,8 +90,8 @@ def export(
 
     Parameters
     ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
+    model : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
+        As for :func:`thesisrecon.align_to_positions`.
     out : path
         Folder of the export; created if missing.
     to : str
@@ -132,13 +132,13 @@ def export(
     >>> report.file.name
     'camchain.yaml'
     """
-    if to not in FORMATS:
-        raise UsageError(unknown_word("export format", to, FORMATS))
-    folder = Path(out)
+    require_word("export format", to, FORMATS)
+    folder = as_path("export", "out", out)
     images, lost = images or recorded_images(model), list[str]()
     if masks is None:
         masks, lost = recorded_masks(model, to)
-    source = model.out if isinstance(model, RunResult) else None if isinstance(model, SparseModel) else model
+    source = model.out if isinstance(model, RunResult) else None
+    source = Path(model) if isinstance(model, str | os.PathLike) else source
     require_separate(folder, to, model=source, images=images, masks=masks)
     model = as_sparse_model(model)
     _require_cameras(model, to)
@@ -212,12 +212,12 @@ def _rounding_notes(model: SparseModel) -> list[str]:
     ]
 
 
-def recorded_images(model: SparseModel | RunResult | str | Path) -> Path | None:
+def recorded_images(model: Model) -> Path | None:
     """Return the folder of the images that a run was made from, None if it is not known."""
     return _recorded(model, "images_folder")
 
 
-def recorded_masks(model: SparseModel | RunResult | str | Path, to: str) -> tuple[Path | None, list[str]]:
+def recorded_masks(model: Model, to: str) -> tuple[Path | None, list[str]]:
     """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
     folder = _recorded(model, "masks_folder") if to in _PINHOLE else None
     if folder is None or folder.is_dir():
@@ -225,8 +225,8 @@ def recorded_masks(model: SparseModel | RunResult | str | Path, to: str) -> tupl
     return None, [f"no masks are written: the folder {folder} of the run is gone; give --masks (masks=)"]
 
 
-def _recorded(model: SparseModel | RunResult | str | Path, name: str) -> Path | None:
-    if isinstance(model, SparseModel):
+def _recorded(model: Model, name: str) -> Path | None:
+    if not isinstance(model, RunResult | str | os.PathLike):
         return None
     summary = model.summary if isinstance(model, RunResult) else read_json(Path(model) / "summary.json")
     folder = summary.get(name) if isinstance(summary, Mapping) else None
@@ -281,7 +281,7 @@ def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, 
     focal = np.array([original[0, 0], original[0, 0] if centred else original[1, 1]])
     low, high = focal * [left[:, 0].max(), top[:, 1].max()], focal * [right[:, 0].min(), bottom[:, 1].min()]
     corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
-    inner = min(1.0, 0.99 * _growing_radius(distortion) / corner)
+    inner = min(1.0, 0.99 * growing_radius(distortion) / corner)
     low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
     # The image extends beyond the original by at most half of each side.
     growth, rounding_px = 0.5 * np.array(sides), 1e-6
@@ -302,14 +302,6 @@ def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, 
         what = f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px"
         raise UsageError(f"{what} ({place}); {advice}")
     return K, (int(size[0]), int(size[1]))
-
-
-def _growing_radius(distortion: F64) -> float:
-    """Normalised radius up to which r (1 + k1 r^2 + k2 r^4 + k3 r^6) grows, infinity if everywhere."""
-    k1, k2, k3 = distortion.tolist()
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-    squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(np.sqrt(squares.min())) if len(squares) else np.inf
 
 
 def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
@@ -376,7 +368,7 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_mesh(folder + "/triangle.glb", mesh)
     """
-    path = Path(path)
+    path = as_path("write_mesh", "path", path)
     if path.suffix.lower() != ".glb":
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
     write_atomically(path, glb_bytes(mesh))

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
+from os import PathLike
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.api.given import Model, as_sparse_model, cameras_of_model
+from thesisrecon.arrays import B8, F64, I64, Record, number, numbers, whole_number
 from thesisrecon.camera import Camera
-from thesisrecon.errors import UsageError, counted, in_words, unknown_word
+from thesisrecon.errors import UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
-from thesisrecon.io._files import read_json
+from thesisrecon.io._files import as_path, read_json
 from thesisrecon.io._models import read_model, read_positions
-from thesisrecon.pipeline.outputs import folder_with, load_run, save_result
+from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
 from thesisrecon.results import (
     SUMMARY,
@@ -40,7 +42,7 @@ _INLIER_SIGMAS = 3.37
 
 
 @dataclass(frozen=True, eq=False)
-class AlignmentReport:
+class AlignmentReport(Record):
     """Result of an alignment to positions, in the unit of the positions."""
 
     similarity: Similarity  #: from the old to the new coordinates
@@ -51,6 +53,7 @@ class AlignmentReport:
     unknown: tuple[str, ...] = ()  #: names of positions without an image in the model
     #: latitude and longitude (degrees) and height (m) of the origin if the positions were degrees
     origin: tuple[float, float, float] | None = None
+    missing: tuple[str, ...] = ()  #: images whose position is None or NaN, left out
 
     @property
     def distance(self) -> F64:
@@ -75,29 +78,14 @@ class AlignmentReport:
         if self.unknown:
             text = f"{counted(len(self.unknown), 'position')} without an image, such as {self.unknown[0]}"
             lines.append(text)
+        if self.missing:
+            text = f"{counted(len(self.missing), 'image')} without a position, such as {self.missing[0]}"
+            lines.append(text)
         return "\n".join(lines)
 
 
-def as_sparse_model(model: SparseModel | RunResult | str | Path) -> SparseModel:
-    """Return the sparse model of a run, of an output folder or of a COLMAP model.
-
-    A run without cameras is a ``UsageError``.
-    """
-    if isinstance(model, SparseModel):
-        return model
-    if not isinstance(model, RunResult):
-        return read_model(model)
-    if (out := folder_with(model)) is not None:
-        return read_model(out)
-    if model.metric is None:
-        raise UsageError("the result has no cameras; it ended before the metric stage")
-    with TemporaryDirectory() as folder:
-        save_result(replace(model, mesh=None), Path(folder), overwrite=False)
-        return read_model(folder)
-
-
 def align_to_positions(
-    model: SparseModel | RunResult | str | Path, positions: Mapping[str, ArrayLike] | str | Path, *,
+    model: Model, positions: Mapping[str, ArrayLike] | str | Path, *,
     seed: int = 0,
 ) -> tuple[SparseModel, AlignmentReport]:  # fmt: skip
     """Move a model to known positions of its cameras by a robust similarity.
@@ -108,12 +96,12 @@ def align_to_positions(
 
     Parameters
     ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
+    model : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
+        A model in memory (also of pycolmap), the output folder of a run, or a COLMAP model.
     positions : mapping of str to (3,), or path
         Image name -> position, in metres or any other unit of length; or a CSV file of ``name,x,y,z``. If
         its header names latitude, longitude and height (degrees and metres, WGS84), they become metres east,
-        north and up of their median.
+        north and up of their median. Positions that are None, NaN or masked are left out.
     seed : int
         Random seed of the triples, which are drawn only for more than 18 positions.
 
@@ -125,8 +113,8 @@ def align_to_positions(
     Raises
     ------
     UsageError
-        If fewer than three images have a position, a position is not three finite numbers, the positions look
-        like degrees, or they or the camera centres lie on one line within their noise.
+        If fewer than three images have a position, a position is not three numbers, the positions look like
+        degrees, or they or the camera centres lie on one line within their noise.
 
     Examples
     --------
@@ -140,29 +128,44 @@ def align_to_positions(
     (2.5, [12.5, 10.0, 10.0])
     """
     origin = None
-    if isinstance(positions, str | Path):
+    if isinstance(positions, str | PathLike):
         positions, origin = read_positions(Path(positions))
+    if not isinstance(positions, Mapping):
+        kinds = "positions by image name, or a CSV file"
+        raise UsageError(f"alignment needs {kinds}; got a {type(positions).__name__}")
+    whole_number("align_to_positions", "seed", seed, 0)
     model = as_sparse_model(model)
     centres = {view.name: view.centre for view in model.views}
-    names = tuple(name for name in positions if name in centres)
+    places = {name: _position(name, place) for name, place in positions.items() if name in centres}
+    names = tuple(name for name, place in places.items() if place is not None)
+    missing = tuple(name for name, place in places.items() if place is None)
     unknown = tuple(name for name in positions if name not in centres)
     if len(names) < 3:
         rest = f"; {unknown[0]!r} is not an image of the model" if unknown else ""
+        rest = f"; that of {missing[0]!r} is missing" if missing else rest
         raise UsageError(f"alignment needs the positions of at least 3 images; got {len(names)}{rest}")
     source = np.array([centres[name] for name in names])
-    try:
-        target = np.array([positions[name] for name in names], dtype=np.float64)
-    except (TypeError, ValueError):  # words, or lists of different lengths
-        target = np.full((len(names), 3), np.nan)
-    if target.shape != (len(names), 3) or not np.isfinite(target).all():
-        raise UsageError("alignment needs three finite coordinates of each position")
+    target = np.array([places[name] for name in names])
     _require_lengths(target)
     _require_width(source, "camera centres", 0.0)
     similarity, inlier, sigma = _robust_similarity(source, target, seed)
     _require_width(target[inlier], "positions", sigma)
     residual = similarity.apply(source) - target
-    report = AlignmentReport(similarity, names, residual, inlier, sigma, unknown, origin)
+    report = AlignmentReport(similarity, names, residual, inlier, sigma, unknown, origin, missing)
     return model.transformed(similarity), report
+
+
+def _position(name: str, place: ArrayLike | None) -> F64 | None:
+    """Three coordinates, or None if they are missing; UsageError that names the image for anything else."""
+    if place is None:
+        return None
+    try:
+        (found,) = numbers("alignment", missing=("position",), position=place)
+    except ValueError:
+        found = np.empty(0)
+    if found.shape != (3,) or np.isinf(found).any():
+        raise UsageError(f"alignment needs three coordinates of each position; that of {name} is {place!r}")
+    return None if np.isnan(found).any() else found
 
 
 def _require_lengths(positions: F64) -> None:
@@ -234,15 +237,13 @@ def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity,
     return best, inlier, sigma
 
 
-def scaled(
-    model: SparseModel | RunResult | str | Path, name1: str, name2: str, distance: float
-) -> SparseModel:
+def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel:
     """Scale a model so that two camera centres have a known distance (section 3.4.4; HZ 10.2).
 
     Parameters
     ----------
-    model : SparseModel, RunResult or path
-        A model, a run or its output folder, or a COLMAP model.
+    model : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
+        As for :func:`align_to_positions`.
     name1, name2, distance : str, str, float
         Two images, and the distance of their camera centres in the new unit.
 
@@ -268,8 +269,8 @@ def scaled(
     model = as_sparse_model(model)
     centres = {view.name: view.centre for view in model.views}
     for name in (name1, name2):
-        if name not in centres:
-            raise UsageError(unknown_word("image", name, centres))
+        require_word("image", name, centres)
+    distance = number("scaled", "distance", distance, "a positive number")
     now = float(np.linalg.norm(centres[name1] - centres[name2]))
     if not (0.0 < distance < math.inf and now > 0.0):
         have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
@@ -306,19 +307,10 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     >>> cameras["0000.jpg"].size
     (1024, 768)
     """
-    path = Path(path)
+    path = as_path("read_cameras", "path", path)
     if not path.exists():
         raise UsageError(f"there is no {path.name} in {path.parent}; no run has finished in this folder")
-    cameras, model = {}, read_model(path)
-    for view in model.views:
-        if view.K is None or view.size is None:
-            raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
-        if view.distortion is None:
-            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
-            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
-        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
-        cameras[view.name] = camera
-    return cameras
+    return cameras_of_model(read_model(path), path)
 
 
 def load(out: str | Path) -> RunResult:
@@ -352,7 +344,7 @@ def load(out: str | Path) -> RunResult:
     ...     len(load(out).features[0].xy) == found
     True
     """
-    folder = Path(out)
+    folder = as_path("load", "out", out)
     summary, run = read_json(folder / SUMMARY), read_json(folder / RUN_FILE)
     if not isinstance(summary, dict) or not isinstance(run, dict):
         raise UsageError(f"{folder} holds no {SUMMARY} and {RUN_FILE}; no run has finished in this folder")
@@ -393,20 +385,23 @@ def save(result: RunResult, folder: str | Path, *, overwrite: bool = False) -> N
     ...     (Path(folder) / "cameras.json").is_file()
     True
     """
-    save_result(result, Path(folder), overwrite=overwrite)
+    if not isinstance(result, RunResult):
+        raise UsageError(f"save needs a RunResult; got a {type(result).__name__}")
+    save_result(result, as_path("save", "folder", folder), overwrite=overwrite)
 
 
-Model = str | Path | SparseModel | RunResult | Mapping[str, Camera]
-
-
-def compare_models(a: Model, b: Model) -> ModelComparison:
+def compare_models(
+    a: Model, b: Model, *, max_time_difference: float = 0.01, time_offset: float = 0.0
+) -> ModelComparison:
     """Compare two metric models of the same images after the similarity (Umeyama 1991) from a to b.
 
     Parameters
     ----------
-    a, b : path, RunResult, SparseModel or mapping of str to Camera
-        Models; b is the reference. A path is the folder of a run, a COLMAP model, a ``cameras.json``, or a
-        trajectory in TUM or KITTI format.
+    a, b : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
+        Models (also of pycolmap); b is the reference. A path is the folder of a run, a COLMAP model, a
+        ``cameras.json``, or a trajectory in TUM or KITTI format.
+    max_time_difference, time_offset : float
+        Largest difference in seconds of cameras that are paired by time, and what is added to the times of b.
 
     Returns
     -------
@@ -420,9 +415,12 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
 
     Notes
     -----
-    Cameras are paired by name; if no name is common, by name without folder and suffix; if there is none
-    either, a trajectory is paired by order with a model of as many cameras. The similarity needs three common
-    cameras whose centres are not on one line. Intrinsics are compared at the image size in b.
+    If one model is a trajectory and all names are times (seconds, or whole numbers of milli-, micro- or
+    nanoseconds), each camera is paired with the nearest of the other model if that is true both ways. Others
+    are paired by name; if no name is common, by name without folder and suffix; if there is none either, a
+    trajectory without times by order with a model of as many cameras. ``notes`` says how. The similarity
+    needs three common cameras whose centres are not on one line. Intrinsics are compared at the image size
+    in b.
 
     Examples
     --------
@@ -439,12 +437,17 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
     >>> bool(comparison.summary["centre_error"]["max"] < 1e-12)
     True
     """
-    first, second = _model(a, "first"), _model(b, "second")
-    pairs = _pairs(first, second)
+    first, second, notes = _model(a, "first"), _model(b, "second"), list[str]()
+    tolerance = number("compare_models", "max_time_difference", max_time_difference)
+    offset = number("compare_models", "time_offset", time_offset)
+    if not (tolerance >= 0.0 and np.isfinite(offset)):
+        rule = "max_time_difference of at least 0 and a finite time_offset"
+        raise ValueError(f"compare_models needs {rule}; got {tolerance:g} and {offset:g}")
+    pairs = _pairs_by_time(first, second, tolerance, offset, notes) or _pairs(first, second, notes)
     left, right = [first.views[i] for i, _ in pairs], [second.views[j] for _, j in pairs]
     R, R_b = (np.array([view.R for view in views]) for views in (left, right))
     centres, centres_b = (np.array([view.centre for view in views]) for views in (left, right))
-    unknown, notes = np.full(len(pairs), np.nan), list[str]()
+    unknown = np.full(len(pairs), np.nan)
     similarity = _similarity(centres, centres_b, notes)
     points = None
     if similarity is not None:
@@ -464,18 +467,64 @@ def compare_models(a: Model, b: Model) -> ModelComparison:
 
 
 def _model(model: Model, which: str) -> SparseModel:
-    if isinstance(model, Mapping):
-        cameras = model.items()
-        model = SparseModel([SparseView(name, c.R, c.t, c.K, c.size, c.distortion) for name, c in cameras])
-    if isinstance(model, str | Path | RunResult | SparseModel):
-        model = as_sparse_model(model)
-        if len(model.views):
-            return model
-    kinds = "a path, a RunResult, a SparseModel or a mapping of names to cameras, with at least one camera"
-    raise UsageError(f"the {which} model of a comparison must be {kinds}; got {in_words(model)}")
+    found = as_sparse_model(model, f"the {which} model of a comparison")
+    if not len(found.views):
+        rule = "a path or a model in memory with at least one camera"
+        raise UsageError(f"the {which} model of a comparison must be {rule}; it has none")
+    return found
 
 
-def _pairs(a: SparseModel, b: SparseModel) -> list[tuple[int, int]]:
+def _pairs_by_time(
+    a: SparseModel, b: SparseModel, tolerance: float, offset: float, notes: list[str]
+) -> list[tuple[int, int]]:
+    """Pairs of cameras that are nearest to each other in time; none unless a trajectory has times."""
+    times, times_b = _times(a), _times(b)
+    if times is None or times_b is None or not any(map(_is_trajectory, (a, b))):
+        return []
+    times_b = times_b + offset
+    nearest, nearest_a = _nearest(times, times_b), _nearest(times_b, times)
+    mutual = nearest_a[nearest] == np.arange(len(times))
+    least = np.abs(times - times_b[nearest])
+    pairs = [(int(i), int(nearest[i])) for i in np.flatnonzero(mutual & (least <= tolerance))]
+    if not pairs:
+        rule = (
+            "give a larger max_time_difference, or the time_offset that is added to the times of the second"
+        )
+        raise UsageError(f"the nearest times of the models are {least.min():.6g} s apart; {rule}")
+    most = max(float(least[i]) for i, _ in pairs)
+    counts = f"{len(pairs)} of {len(times)} and {counted(len(times_b), 'camera')}"
+    given = f"at most {most:.3g} s apart (tolerance {tolerance:g} s, offset {offset:g} s)"
+    notes.append(f"{counts} were paired by time, {given}")
+    return pairs
+
+
+def _nearest(times: F64, others: F64) -> I64:
+    """The number of the nearest other time of each time."""
+    order = np.argsort(others, kind="stable")
+    after = np.searchsorted(others, times, sorter=order).clip(0, len(others) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(others[order[before]] - times) <= np.abs(others[order[after]] - times)
+    return np.asarray(order[np.where(closer, before, after)])
+
+
+def _is_trajectory(model: SparseModel) -> bool:
+    return all(view.K is None for view in model.views)
+
+
+def _times(model: SparseModel) -> F64 | None:
+    """Times (V,) in seconds of names that are all numbers, with decimals or of epochs; None otherwise."""
+    names = [_stem(view.name) for view in model.views]
+    if not all(re.fullmatch(r"\d+(\.\d+)?([eE][+-]?\d+)?", name) for name in names):
+        return None
+    times = np.array(names, dtype=np.float64)
+    if all(name.isdigit() for name in names):
+        # Whole numbers are epochs of smaller units, or else the numbers of frames.
+        unit = next((unit for unit in (1e9, 1e6, 1e3) if times.min() > 1e8 * unit), 1.0)
+        return times / unit if times.min() > 1e8 else None
+    return times
+
+
+def _pairs(a: SparseModel, b: SparseModel, notes: list[str]) -> list[tuple[int, int]]:
     """Pairs of cameras with the same name, in the order of a."""
     for key in (str, _stem):
         keys, keys_b = ([key(view.name) for view in model.views] for model in (a, b))
@@ -484,8 +533,8 @@ def _pairs(a: SparseModel, b: SparseModel) -> list[tuple[int, int]]:
         pairs = [(i, place[name]) for i, name in enumerate(keys) if counts[name] == 1 and name in place]
         if pairs:
             return pairs
-    trajectory = any(all(view.K is None for view in model.views) for model in (a, b))
-    if trajectory and len(a.views) == len(b.views):
+    if any(map(_is_trajectory, (a, b))) and len(a.views) == len(b.views):
+        notes.append(f"no name is common; the {len(a.views)} cameras were paired by their order alone")
         return [(i, i) for i in range(len(a.views))]
     names = (f"{_few(model.names)} in the {which}" for which, model in (("first", a), ("second", b)))
     advice = "give models of the same images, or a trajectory of as many cameras"

@@ -11,17 +11,28 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from thesisrecon.api.cameras import require_threshold, search_budget
-from thesisrecon.arrays import F64, U8, require_finite, require_shapes
+from thesisrecon.arrays import (
+    F32,
+    F64,
+    I64,
+    U8,
+    generator,
+    number,
+    numbers,
+    require_finite,
+    require_shapes,
+    whole_number,
+)
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
 from thesisrecon.epipolar.homography import HomographyFit, fit_homography
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
-from thesisrecon.errors import Notice, StageFailure, unknown_word
+from thesisrecon.errors import Notice, StageFailure, require_word
 from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.two_view import lines_of_points
-from thesisrecon.io._images import read_image, read_pixels
+from thesisrecon.io._images import eight_bit_images, read_image, read_pixels
 from thesisrecon.pipeline.image_pair import ImageInput, match_images
 from thesisrecon.records import Image, TwoView
 
@@ -63,7 +74,8 @@ def match_pair(
     """
     config = as_config(config)
     size = config.images.max_size_px
-    images = [read_image(image, max_size_px=size).images[0] for image in (image1, image2)]
+    sources = eight_bit_images(image1, image2)
+    images = [read_image(image, max_size_px=size).images[0] for image in sources]
     pair = match_images(config, (images[0], images[1]), seed)
     if not pair.accepted:
         raise StageFailure(Notice("unmatched-pair"), pair.reason)
@@ -101,7 +113,7 @@ def draw_epipolar_lines(
 
     Parameters
     ----------
-    image1, image2 : path or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
+    image1, image2 : path or array_like (H, W), (H, W, 3) or (H, W, 4)
         Files, read at full size, or images.
     F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
         Fundamental matrix and matches in pixels of these images.
@@ -111,7 +123,8 @@ def draw_epipolar_lines(
     Returns
     -------
     ndarray (H, W, 3) uint8, twice
-        The images, with the line F x1 and the point x2 in the second, F' x2 and x1 in the first.
+        The images, with the line F x1 and the point x2 in the second, F' x2 and x1 in the first, drawn to
+        fractions of a pixel.
 
     Examples
     --------
@@ -123,12 +136,13 @@ def draw_epipolar_lines(
     >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
     ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
     """
-    F, xy1, xy2 = (np.asarray(array, dtype=np.float64) for array in (F, xy1, xy2))
+    F, xy1, xy2 = numbers("draw_epipolar_lines", F=F, xy1=xy1, xy2=xy2)
+    whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
     require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("draw_epipolar_lines", F, xy1, xy2)
-    some = np.unique(np.linspace(0, len(xy1) - 1, min(max(max_lines, 0), len(xy1))).astype(np.int64))
+    some = np.unique(np.linspace(0, len(xy1) - 1, min(max_lines, len(xy1))).astype(np.int64))
     xy1, xy2 = xy1[some], xy2[some]
-    first, second = read_pixels(image1), read_pixels(image2)
+    first, second = read_pixels(image1, image2)
     return _drawn(first, lines_of_points(F.T, xy2), xy1), _drawn(second, lines_of_points(F, xy1), xy2)
 
 
@@ -181,12 +195,12 @@ def estimate_homography(
     >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
     (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
     """
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    xy1, xy2 = numbers("estimate_homography", xy1=xy1, xy2=xy2)
     require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite("estimate_homography", xy1, xy2)
     require_threshold(threshold_px, xy1, xy2)
     budget = search_budget(confidence, max_samples)
-    return fit_homography(xy1, xy2, threshold_px, budget, np.random.default_rng(seed))
+    return fit_homography(xy1, xy2, threshold_px, budget, generator("estimate_homography", seed))
 
 
 def estimate_trifocal(
@@ -236,20 +250,19 @@ def estimate_trifocal(
     >>> bool(estimate_trifocal(*points).point_residuals_px.max() < 1e-6)
     True
     """
-    if not loss_px > 0.0:
+    if not number("estimate_trifocal", "loss_px", loss_px) > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
+    xy1, xy2, xy3, segments = numbers("estimate_trifocal", xy1=xy1, xy2=xy2, xy3=xy3, segments=segments)
+    require_threshold(threshold_px, xy1, xy2, xy3)
     require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
     points = np.stack([xy1, xy2, xy3])
-    if np.iscomplexobj(points) or np.iscomplexobj(segments):
-        raise ValueError("points and segments must be real numbers; got complex ones")
-    points, segments = np.asarray(points, dtype=np.float64), np.asarray(segments, dtype=np.float64)
     require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
     require_finite("a trifocal tensor", points, segments)
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
         raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
-    rng = np.random.default_rng(seed)
+    rng = generator("estimate_trifocal", seed)
     return fit_trifocal(points, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
 
 
@@ -307,14 +320,14 @@ def estimate_fundamental(
     >>> linear.covariance.shape
     (9, 9)
     """
-    rng = np.random.default_rng(seed)
-    require_threshold(threshold_px, np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64))
+    xy1, xy2 = numbers("estimate_fundamental", xy1=xy1, xy2=xy2)
+    require_word("method", method, get_args(Method))
+    rng = generator("estimate_fundamental", seed)
+    require_threshold(threshold_px, xy1, xy2)
     if threshold_px is None:
         threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
     if method == "locally-optimised":
         fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
-    elif method not in get_args(Method):
-        raise ValueError(unknown_word("method", method, get_args(Method)))
     else:
         # Imported on use: the default method does not need it.
         from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, fit_all, fit_seven
@@ -328,8 +341,7 @@ def estimate_fundamental(
         else:
             fit = fit_all(xy1, xy2, refined=method == "gold-standard")
     # Copies: the test is made later.
-    xy1, xy2 = np.array(xy1, dtype=np.float64), np.array(xy2, dtype=np.float64)
-    return FundamentalEstimate(**vars(fit), xy1=xy1, xy2=xy2, unit_px=threshold_px)
+    return FundamentalEstimate(**vars(fit), xy1=xy1.copy(), xy2=xy2.copy(), unit_px=threshold_px)
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:
@@ -351,31 +363,49 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
     [[0.0, 1.0, 30.0]]
     """
-    F, xy1 = np.asarray(F, dtype=np.float64), np.asarray(xy1, dtype=np.float64)
+    F, xy1 = numbers("epipolar_lines", missing=("xy1",), F=F, xy1=xy1)
     require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return lines_of_points(F, xy1)
 
 
 def _drawn(image: U8, lines: F64, xy: F64) -> U8:
     """An image with unit-normal lines (N, 3) and points (N, 2); number k always has the same colour."""
-    # Imported on use: the estimators of this chapter need no images.
-    import PIL.Image
-    import PIL.ImageDraw
-
-    canvas = PIL.Image.fromarray(image)
-    draw = PIL.ImageDraw.Draw(canvas)
-    reach, thick = float(np.hypot(*canvas.size)), max(1, round(max(canvas.size) / 400))
-    middle = (np.array(canvas.size) - 1.0) / 2.0
+    canvas, thick = image.astype(np.float32), float(max(1, round(max(image.shape) / 400)))
     for k, (line, point) in enumerate(zip(lines, xy, strict=True)):
         # The golden ratio spreads hues evenly for any number of matches.
-        red, green, blue = (round(255.0 * c) for c in colorsys.hsv_to_rgb(0.618034 * k % 1.0, 1.0, 1.0))
-        foot = middle - (line[:2] @ middle + line[2]) * line[:2]
-        along = reach * np.array([-line[1], line[0]])
-        if np.abs(foot - middle).max() < reach:
-            # Pillow cuts off fractions.
-            draw.line([*np.rint(foot - along), *np.rint(foot + along)], fill=(red, green, blue), width=thick)
-        radius = 4.0 * thick
-        draw.ellipse(
-            [*np.rint(point - radius), *np.rint(point + radius)], outline=(red, green, blue), width=thick
-        )
-    return np.asarray(canvas)
+        colour = 255.0 * np.array(colorsys.hsv_to_rgb(0.618034 * k % 1.0, 1.0, 1.0), dtype=np.float32)
+        _draw_line(canvas, line, thick, colour)
+        _draw_circle(canvas, point, 4.0 * thick, thick, colour)
+    return np.rint(canvas).astype(np.uint8)
+
+
+def _draw_line(canvas: F32, line: F64, thick: float, colour: F32) -> None:
+    """Draw a line with unit normal; a pixel takes the share of its width that the line covers."""
+    if not np.isfinite(line).all():
+        return
+    if np.abs(line[1]) < np.abs(line[0]):
+        canvas, line = canvas.transpose(1, 0, 2), line[[1, 0, 2]]
+    if not line[1]:
+        return
+    along = np.arange(canvas.shape[1])
+    middle = -(line[0] * along + line[2]) / line[1]
+    reach = int(np.ceil(0.75 * thick + 1.0))
+    # Clipped so that far lines stay within the range of integers.
+    across = np.rint(np.clip(middle, -1e6, 1e6)).astype(np.int64) + np.arange(-reach, reach + 1)[:, None]
+    inside = (across >= 0) & (across < canvas.shape[0])
+    y, x = across[inside], np.broadcast_to(along, across.shape)[inside]
+    _blend(canvas, (y, x), 0.5 * thick + 0.5 - np.abs(line[0] * x + line[1] * y + line[2]), colour)
+
+
+def _draw_circle(canvas: F32, centre: F64, radius: float, thick: float, colour: F32) -> None:
+    reach = radius + thick
+    low = np.clip(np.floor(centre - reach), 0, 1e6).astype(np.int64)
+    high = np.clip(np.ceil(centre + reach) + 1, 0, canvas.shape[1::-1]).astype(np.int64)
+    y, x = (part.ravel() for part in np.mgrid[low[1] : high[1], low[0] : high[0]])
+    apart = np.abs(np.hypot(x - centre[0], y - centre[1]) - radius)
+    _blend(canvas, (y, x), 0.5 * thick + 0.5 - apart, colour)
+
+
+def _blend(canvas: F32, pixels: tuple[I64, I64], coverage: F64, colour: F32) -> None:
+    share = np.clip(coverage, 0.0, 1.0)[:, None].astype(np.float32)
+    canvas[pixels] += share * (colour - canvas[pixels])

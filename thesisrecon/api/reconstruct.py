@@ -21,6 +21,7 @@ from thesisrecon.io._images import (
     check_masks_folder,
     images_folder,
     list_images,
+    list_of_images,
     read_images,
     scene_name,
 )
@@ -117,6 +118,8 @@ def reconstruct(
         if frames is None and not list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
         run.title = scene_name(Path(images)) or run.title
+    else:
+        images = list_of_images("reconstruct", images)
     run.images_folder = images_folder(images) if frames is None else frames.home(run.directory.path)
     if masks is not None:
         run.masks_folder = check_masks_folder(Path(masks), run.images_folder)

@@ -9,14 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from thesisrecon._numba import ThreadPool
-from thesisrecon.api.cameras import CameraInput, as_cameras, radial_coefficients
-from thesisrecon.arrays import F32, F64, I64, resizing_transform
+from thesisrecon.api.given import CameraInput, as_cameras, named_cameras, radial_coefficients
+from thesisrecon.arrays import F32, F64, I64, number, numbers, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
-from thesisrecon.io._images import is_rgba, list_images, read_image, read_levels, rotation_words
+from thesisrecon.io._images import (
+    eight_bit_images,
+    list_images,
+    list_of_images,
+    read_image,
+    read_levels,
+    rotation_words,
+)
 from thesisrecon.pipeline.image_pair import ImageInput
 from thesisrecon.records import (
     DepthMap,
@@ -25,7 +32,7 @@ from thesisrecon.records import (
     Reconstruction,
     TexturedMesh,
     Tracks,
-    require_mesh,
+    as_mesh,
 )
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
@@ -34,7 +41,7 @@ from thesisrecon.stereo.rectification import rectify as best_rectification
 from thesisrecon.surface.model import SurfaceModel
 
 ImagesInput = str | Path | Sequence[ImageInput]
-"""A folder, or images as files or uint8 arrays."""
+"""A folder, or images as files or arrays."""
 
 
 def rectify(
@@ -76,11 +83,11 @@ def rectify(
     >>> bool(np.abs(rows[0] - rows[1]).max() < 1e-6)
     True
     """
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    images = read_levels(image1), read_levels(image2)
+    F, xy1, xy2 = numbers("rectify", F=F, xy1=xy1, xy2=xy2)
+    images = read_levels(image1, image2)
     size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
     frame = best_rectification(pair_of_fundamental(F, xy1, xy2, size1, size2), PLANAR if planar else METHODS)
-    return RectifiedImages.of(frame, images, disparity_range(frame, xy1, xy2))
+    return RectifiedImages.of(frame, (images[0], images[1]), disparity_range(frame, xy1, xy2))
 
 
 def match_rectified(
@@ -90,9 +97,10 @@ def match_rectified(
 
     Parameters
     ----------
-    left, right : path or ndarray (H, W), (H, W, 3) or (H, W, 4)
+    left, right : path, or array_like (H, W), (H, W, 3) or (H, W, 4)
         Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
-        cannot be read), or levels 0 to 255 with NaN for missing pixels; transparent pixels are missing.
+        cannot be read), or levels 0 to 255, 0 to 1 (floats) or of 16 bits, the same for both. Pixels that are
+        NaN, masked or transparent are missing.
     max_disparity_px : float
         Largest disparity; x_right = x_left - d with d from 0 to this.
     config : PipelineConfig, str or path, optional
@@ -113,15 +121,10 @@ def match_rectified(
     >>> round(float(np.nanmedian(found.disparity)), 1)
     6.0
     """
-    images = [
-        side if isinstance(side, np.ndarray) and not is_rgba(side) else read_levels(side)
-        for side in (left, right)
-    ]
-    for image in images:
-        # Levels of rectified images may exceed the range a little; those of 16 bits would all be white.
-        if image.dtype.kind in "iu" and image.max(initial=0) > 255:
-            message = f"match_rectified needs grey levels 0 to 255; got {image.dtype} up to {image.max()}"
-            raise ValueError(message)
+    images = read_levels(left, right, grey=True)
+    most = number("match_rectified", "max_disparity_px", max_disparity_px)
+    if not 0.0 <= most < np.inf:
+        raise ValueError(f"match_rectified needs max_disparity_px of at least 0, finite; got {most:g}")
     dense = as_config(config).dense
     return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
 
@@ -137,7 +140,7 @@ def depth_maps(
     ----------
     images : path or sequence of paths or ndarray (H, W), (H, W, 3) or (H, W, 4) uint8
         A folder (files in order of their names; with cameras by name those that have one), or V >= 2 images.
-    cameras : sequence of Camera, mapping of file name to Camera, tuple (K, R, t) or Reconstruction
+    cameras : sequence or mapping of Camera by file name, tuple (K, R, t), Reconstruction, RunResult or path
         Their cameras in pixels of the images (arrays with ``sizes``), after EXIF rotation unless they are
         ``as_stored``. If a reconstruction has points with observations, these give the depth range and the
         neighbours. Of a run from COLMAP's matches or tracks give ``result.cameras``.
@@ -249,6 +252,9 @@ def fuse_depth_maps(
     >>> mesh.vertices[:, 2].round(2).min(), mesh.vertices[:, 2].round(2).max()
     (np.float64(2.0), np.float64(2.0))
     """
+    depth_maps = list_of_images("fuse_depth_maps", depth_maps, "a sequence of depth maps")
+    if not depth_maps:
+        raise ValueError("fuse_depth_maps needs at least one depth map; got none")
     model = as_config(config).model
     if not isinstance(model, SurfaceModel):
         raise UsageError(f"fuse_depth_maps needs a SurfaceModel as config.model; got {type(model).__name__}")
@@ -302,7 +308,7 @@ def texture(
     >>> texture(mesh, [image], [camera]).texture.dtype
     dtype('uint8')
     """
-    require_mesh("texture", mesh)
+    mesh = as_mesh("texture", mesh)
     method = as_config(config)
     read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
     views = [pinhole_view(image, model, i, max_side=max(image.size)) for i, image in enumerate(read)]
@@ -313,11 +319,12 @@ def _scene(
     caller: str, images: ImagesInput, cameras: CameraInput, sizes: I64 | None, max_size: int
 ) -> tuple[list[Image], Reconstruction]:
     """Images at working size, and their cameras for it, with the points of a reconstruction."""
+    cameras = named_cameras(caller, cameras)
     if isinstance(images, str | Path):
         files = list_images(Path(images))
         # Images that were not registered have no camera.
         images = [path for path in files if isinstance(cameras, Mapping) and path.name in cameras] or files
-    listed = list(images)
+    listed = eight_bit_images(*list_of_images(caller, images))
     names = [_name_of(n, image) for n, image in enumerate(listed)]
     views = as_cameras(caller, cameras, sizes, names)
     if len(views) != len(names):
@@ -367,7 +374,7 @@ def _model(views: Sequence[Camera]) -> Reconstruction:
 
 
 def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
-    limits = np.asarray(depth_range, dtype=np.float64)
+    (limits,) = numbers("depth_maps", depth_range=depth_range)
     if limits.shape not in ((2,), (n, 2)):
         message = f"depth_range needs shape (2,) or ({n}, 2), nearest and farthest; got {limits.shape}"
         raise ValueError(message)
@@ -379,7 +386,7 @@ def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
 
 def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
     """The depth map of an array of the camera's size or smaller."""
-    z: F32 = np.array(depth, dtype=np.float32)
+    z: F32 = numbers("fuse_depth_maps", missing=("depth",), depth=depth)[0].astype(np.float32)
     # Renderers give infinity where no surface is.
     z[~((z > 0.0) & (z < np.inf))] = np.nan
     if z.ndim != 2 or not camera.is_pinhole:

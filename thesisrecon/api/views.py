@@ -12,7 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon.api.pairs import match_pair
-from thesisrecon.arrays import F32, F64, U8, require_calibration, resizing_transform
+from thesisrecon.arrays import (
+    F32,
+    F64,
+    U8,
+    Record,
+    eight_bit,
+    image_levels,
+    number,
+    numbers,
+    require_calibration,
+    resizing_transform,
+    whole_number,
+)
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
@@ -20,8 +32,8 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
-from thesisrecon.io._images import read_image, read_levels, read_pixels
-from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, require_mesh
+from thesisrecon.io._images import eight_bit_images, read_image, read_levels, read_pixels
+from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, as_mesh
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.rectification import PlanarRectification
@@ -83,7 +95,7 @@ def interpolate_view(
     >>> np.array_equal(view, left)
     True
     """
-    if not 0.0 <= s <= 1.0:
+    if not 0.0 <= number("interpolate_view", "s", s) <= 1.0:
         raise ValueError(f"s must be between 0 (left image) and 1 (right image); got {s}")
     return prepare_rectified_pair(left, right, disparity=disparity, config=config).view(s)
 
@@ -97,30 +109,32 @@ def prepare_rectified_pair(
 
     The arguments are those of :func:`interpolate_view`.
     """
-    levels = read_levels(left), read_levels(right)
-    images = read_pixels(left), read_pixels(right)
+    levels = read_levels(left, right)
+    images = read_pixels(left, right)
     shapes = [image.shape[:2] for image in images]
     if shapes[0] != shapes[1]:
         raise ValueError(f"rectified images must have the same size; got {shapes[0]} and {shapes[1]}")
     if disparity is None:
         config = as_config(config)
-        most = _largest_disparity(*levels, config)
-        maps = match_both_sides(partial(config.dense.match_rectified, max_disparity_px=most), *levels)
-    elif isinstance(disparity, tuple):
+        most = _largest_disparity(levels[0], levels[1], config)
+        maps = match_both_sides(
+            partial(config.dense.match_rectified, max_disparity_px=most), levels[0], levels[1]
+        )
+    elif isinstance(disparity, tuple) and len(disparity) == 2:
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
         maps = _as_map(disparity), disparity_of_right(_as_map(disparity))
     for shape in (found.disparity.shape for found in maps):
         if shape != shapes[0]:
             raise ValueError(f"disparities must have the shape of the images {shapes[0]}; got {shape}")
-    return InterpolatedPair(images, np.stack([np.eye(3)] * 2), *maps)
+    return InterpolatedPair((images[0], images[1]), np.stack([np.eye(3)] * 2), *maps)
 
 
 def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
     """The disparities as a map; plain ones have confidence 1 where they are known."""
     if isinstance(disparity, DisparityMap):
         return disparity
-    disparity = np.asarray(disparity, dtype=np.float32)
+    disparity = numbers("interpolate_view", missing=("disparity",), disparity=disparity)[0].astype(np.float32)
     if disparity.ndim != 2:
         raise ValueError(f"disparities must be (H, W), or a tuple of two such maps; got {disparity.shape}")
     return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
@@ -158,7 +172,7 @@ def prepare_pair(
     config = as_config(config)
     first, second = (
         one if isinstance(one, Image) else read_image(one, max_size_px=config.images.max_size_px).images[0]
-        for one in (image1, image2)
+        for one in eight_bit_images(image1, image2)
     )
     require_comparable_images((first, second))
     pair = match_pair(first, second, config=config, seed=seed)
@@ -202,8 +216,8 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
             raise StageFailure(reason, evidence, _SIDE_BY_SIDE)
 
 
-@dataclass(frozen=True)
-class MatchedImages:
+@dataclass(frozen=True, eq=False)
+class MatchedImages(Record):
     """Two images with their sparse and dense correspondences."""
 
     images: tuple[Image, Image]  #: at working size
@@ -215,7 +229,10 @@ class MatchedImages:
 def match_images(image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0) -> MatchedImages:
     """Match two images sparsely and densely, for :func:`prepare_trilinear_views`."""
     config = as_config(config)
-    read = [read_image(source, max_size_px=config.images.max_size_px) for source in (image1, image2)]
+    read = [
+        read_image(source, max_size_px=config.images.max_size_px)
+        for source in eight_bit_images(image1, image2)
+    ]
     first, second = (found.images[0] for found in read)
     pair = match_pair(first, second, config=config, seed=seed)
     dense = config.dense.match_two_views(first, second, pair.F, pair.xy1, pair.xy2)
@@ -286,7 +303,7 @@ def synthesize_view(
     ValueError: a rotation has R'R = I and det R = 1; this one is off by 3, det 8
     """
     # Checked before the matching, which takes minutes.
-    rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+    rotation, translation = numbers("synthesize_view", rotation=rotation, translation=translation)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))
     found = match_images(image1, image2, config=config, seed=seed)
@@ -298,7 +315,7 @@ def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
     """Return K as (2, 3, 3), None if not given; ``ValueError`` if it is not that of a camera."""
     if K is None:
         return None
-    given = np.asarray(K, dtype=np.float64)
+    (given,) = numbers("view synthesis", K=K)
     if given.shape not in ((3, 3), (2, 3, 3)):
         raise ValueError(f"K must be (3, 3) for both images or (2, 3, 3); got {given.shape}")
     both = np.broadcast_to(given, (2, 3, 3))
@@ -334,8 +351,8 @@ def render(
         Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
     shading : Shading, optional
         Lighting. None shows the texture as photographed.
-    background : tuple of int
-        Colour of empty pixels.
+    background : tuple of int, or of float
+        Colour of empty pixels, 0 to 255, or 0 to 1 as floats.
     samples : int
         Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
     threads : int
@@ -358,7 +375,17 @@ def render(
     >>> view.color.shape, bool(view.valid[5, 10]), float(view.depth[5, 10])
     ((20, 20, 3), True, 2.0)
     """
-    if samples < 1:
-        raise ValueError(f"render needs at least one sample a side; got {samples}")
-    require_mesh("render", mesh)
-    return render_mesh(mesh, camera, shading=shading, background=background, samples=samples, threads=threads)
+    whole_number("render", "samples", samples, 1)
+    whole_number("render", "threads", threads, 1)
+    if not isinstance(camera, Camera):
+        raise ValueError(f"render needs a thesisrecon.Camera as camera; got a {type(camera).__name__}")
+    if not (shading is None or isinstance(shading, Shading)):
+        raise ValueError(f"render needs a Shading or None as shading; got a {type(shading).__name__}")
+    (behind,) = numbers("render", background=background)
+    if behind.shape != (3,) or not np.isfinite(behind).all():
+        rule = "background, three levels from 0 to 255 (or floats from 0 to 1)"
+        raise ValueError(f"render needs {rule}; got {background!r}")
+    colour = tuple(eight_bit(image_levels(background)[0])[0].tolist())
+    return render_mesh(
+        as_mesh("render", mesh), camera, shading=shading, background=colour, samples=samples, threads=threads
+    )

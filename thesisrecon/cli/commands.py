@@ -230,6 +230,10 @@ def compare(
     b: Annotated[Path, folder_argument("B", "Reference: any of these.")],
     json: Annotated[Path | None, typer.Option("--json", help="Write all numbers to this file.")] = None,
     page: Annotated[Path | None, typer.Option("--page", help=_PAGE_HELP)] = None,
+    max_time_difference: Annotated[
+        float, typer.Option("--max-time-difference", min=0.0, help="Largest difference of paired times, s.")
+    ] = 0.01,
+    time_offset: Annotated[float, typer.Option("--time-offset", help="Added to the times of B, s.")] = 0.0,
     overwrite: Overwrite = False,
 ) -> None:
     """Compare two models of the same images after a similarity alignment."""
@@ -241,7 +245,8 @@ def compare(
 
     if json is not None and json == page:
         raise UsageError("--json and --page name the same file; give different ones")
-    found = compare_models(a, b)
+    times = {"max_time_difference": max_time_difference, "time_offset": time_offset}
+    found = compare_models(a, b, **times)
     lines = [f"A: {a}", f"B: {b} (reference)", headline(found), *(f"note: {note}" for note in found.notes)]
     cameras, most = camera_table(found), 60
     tables = [summary_table(found), point_table(found), cameras[: most + 1]]

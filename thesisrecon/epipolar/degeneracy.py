@@ -220,7 +220,7 @@ def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
     return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FundamentalEstimate(FundamentalFit):
     """An estimate of F with its matches, and whether they determine it, tested when it is first read.
 

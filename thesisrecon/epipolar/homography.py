@@ -12,7 +12,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon._numba import empty, kernel, zeros
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.epipolar._matches import PairFrame, noise_width
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
@@ -207,8 +207,8 @@ _EXACT = 1e-9  # residuals in units of the frame below which they are rounding e
 _DEPENDENT = 1e-9  # ratio of singular values of the equations below which they are dependent
 
 
-@dataclass(frozen=True)
-class HomographyFit:
+@dataclass(frozen=True, eq=False)
+class HomographyFit(Record):
     """A homography with its inliers and noise.
 
     Parameters

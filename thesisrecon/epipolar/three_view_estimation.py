@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8, F64, Record
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_normals, unit_tensor
@@ -39,8 +39,8 @@ REMEDY = "use matches off one plane from three different positions, and check fo
 _State = tuple[F64, F64]
 
 
-@dataclass(frozen=True)
-class TrifocalFit:
+@dataclass(frozen=True, eq=False)
+class TrifocalFit(Record):
     """A trifocal tensor with its residuals and noise.
 
     Parameters

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
-from thesisrecon.arrays import B8, F32, F64, I64, U8, resizing_transform
+from thesisrecon.arrays import B8, F32, F64, I64, U8, Record, resizing_transform
 from thesisrecon.camera import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.records import Image, PinholeView, Reconstruction
@@ -277,7 +277,7 @@ def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]
     return top + fy * (bottom - top), spread
 
 
-class Rectification(ABC):
+class Rectification(Record, ABC):
     """Maps between two images (side 0 is the left one) and a frame whose rows are epipolar lines."""
 
     size: tuple[int, int]

@@ -164,7 +164,9 @@ def _binary_point(data: bytes, at: int) -> tuple[_Point, int]:
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    return (line for line in data.decode("utf-8", "surrogateescape").split("\n") if line[:1] != "#")
+    text = data.decode("utf-8", "surrogateescape")
+    # Windows writes a byte order mark before the text.
+    return (line for line in text.removeprefix("\ufeff").split("\n") if line[:1] != "#")
 
 
 def _text_cameras(data: bytes) -> Iterator[_Camera]:

@@ -82,6 +82,14 @@ def natural_key(name: str) -> tuple[list[tuple[str, int, str]], str]:
     return parts, name
 
 
+def as_path(caller: str, name: str, path: Any) -> Path:
+    """Return the path of a file or folder; UsageError for anything that is none."""
+    if not isinstance(path, str | os.PathLike) or isinstance(os.fspath(path), bytes):
+        rule = f"a path (str or pathlib.Path) as {name}"
+        raise UsageError(f"{caller} needs {rule}; got a {type(path).__name__}")
+    return Path(path)
+
+
 def shortened(text: str, longest: int = 60) -> str:
     """Cut the end of a long text."""
     return text if len(text) <= longest else text[: longest - 3] + "..."
@@ -209,7 +217,7 @@ def _plain(value: Any) -> Any:
 def read_json(path: Path) -> Any:
     """Read a JSON file; None if it is absent, damaged, too large or not regular."""
     try:
-        return json.loads(read_bytes(path).decode("utf-8"))
+        return json.loads(read_bytes(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError):
         return None
 

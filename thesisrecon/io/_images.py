@@ -11,7 +11,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -24,7 +24,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64, U8, eight_bit, image_levels
 from thesisrecon.errors import Notice, StageFailure, UsageError
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
@@ -204,7 +204,7 @@ def read_images(
     ``map_all`` is an ordered map; that of a thread pool reads several images at the same time. Files are
     rotated upright unless they are read ``as_stored``. Names are printable; equal names are numbered.
     """
-    items = _named_items(source)
+    items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
         if not is_image_name(item[0]):
@@ -261,11 +261,7 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     elif isinstance(item, Image):
         decoded = DecodedImage(replace(item, name=name), "")
     else:
-        array = np.asarray(item)
-        if array.dtype != np.uint8 or (array.ndim != 2 and array.shape[2:] not in ((3,), (4,))):
-            rule = "an image array must be (H, W), (H, W, 3) or (H, W, 4) uint8"
-            raise ValueError(f"{rule}; got {array.shape} {array.dtype}")
-        decoded = DecodedImage(_image(name, StoredImage(PIL.Image.fromarray(array)), max_size_px), "")
+        decoded = DecodedImage(_image(name, _stored(item), max_size_px), "")
     decoded = with_digest(decoded)
     rgb, mask = decoded.image.rgb, decoded.image.mask
     if min(rgb.shape[:2]) < MIN_SIDE:
@@ -391,30 +387,79 @@ def _exif(file: PIL.Image.Image) -> tuple[int, float]:
     return orientation if isinstance(orientation, int) else 0, focal
 
 
-def read_pixels(side: Any) -> U8:
-    """A file at full size, or a checked array, as RGB."""
-    return _full_image(side).rgb
+def read_pixels(*sources: Any) -> list[U8]:
+    """Files at full size, Pillow images, records or arrays of levels of one scale, as RGB."""
+    return [_full_image(source).rgb for source in eight_bit_images(*sources)]
 
 
-def is_rgba(array: NDArray[Any]) -> bool:
-    """Whether an array is an 8-bit image with alpha."""
-    return array.dtype == np.uint8 and array.shape[2:] == (4,)
+def read_levels(*sources: Any, grey: bool = False) -> list[U8 | F32]:
+    """As :func:`read_pixels`, NaN where transparent or missing; fractions of levels are not rounded.
+
+    ``grey``: images without colours are (H, W).
+    """
+    arrays = iter(_arrays_of_levels(sources))
+    found = [source if _is_image(source) else next(arrays) for source in sources]
+    keep_grey = grey and all(isinstance(one, np.ndarray) and one.ndim == 2 for one in found)
+    return [_levels_of(one, keep_grey=keep_grey) for one in found]
 
 
-def read_levels(side: Any) -> U8 | F32:
-    """As :func:`read_pixels`; with transparency in single precision, NaN where it is."""
-    image = _full_image(side)
+def list_of_images(caller: str, images: Any, kinds: str = "a folder, or a sequence of images") -> list[Any]:
+    """The items of a sequence of images; UsageError for a single path or anything else."""
+    try:
+        if not isinstance(images, str | bytes | Path | Mapping | set):
+            return list(images)
+    except TypeError:
+        pass  # an object without items
+    raise UsageError(f"{caller} needs {kinds}; got a {type(images).__name__}")
+
+
+def eight_bit_images(*sources: Any) -> list[Any]:
+    """Other sources as they are; arrays, of one scale, as uint8, transparent where a level is missing."""
+    arrays = iter(_arrays_of_levels(sources))
+    return [source if _is_image(source) else _eight_bit_array(next(arrays)) for source in sources]
+
+
+def _is_image(source: Any) -> bool:
+    return isinstance(source, str | Path | Image | PIL.Image.Image)
+
+
+def _arrays_of_levels(sources: Sequence[Any]) -> list[U8 | F32]:
+    """The arrays among sources as levels of one scale; ValueError unless they have the shape of an image."""
+    arrays = image_levels(*(source for source in sources if not _is_image(source)))
+    shaped = [array[:, :, 0] if array.ndim == 3 and array.shape[2] == 1 else array for array in arrays]
+    for array in shaped:
+        if not array.size or array.ndim not in (2, 3) or array.shape[2:] not in ((), (3,), (4,)):
+            advice = "; transpose it to (H, W, channels)" if array.shape[:1] in ((1,), (3,), (4,)) else ""
+            rule = "an image array of numpy must be (H, W), (H, W, 3) or (H, W, 4)"
+            raise ValueError(f"{rule}; got {array.shape}{advice}")
+    return shaped
+
+
+def _eight_bit_array(levels: U8 | F32) -> U8:
+    whole, known = eight_bit(levels)
+    if known is None:
+        return whole
+    whole = np.repeat(whole[:, :, None], 3, axis=2) if whole.ndim == 2 else whole
+    alpha = whole[:, :, 3] if whole.shape[2] == 4 else np.uint8(255)
+    return np.dstack([whole[:, :, :3], np.where(known, alpha, 0).astype(np.uint8)])
+
+
+def _levels_of(source: Any, *, keep_grey: bool) -> U8 | F32:
+    if isinstance(source, np.ndarray) and source.shape[2:] != (4,):
+        return source if keep_grey or source.ndim == 3 else np.repeat(source[:, :, None], 3, axis=2)
+    image = _full_image(_eight_bit_array(source) if isinstance(source, np.ndarray) else source)
     return image.rgb if image.mask is None else image.levels
 
 
-def _full_image(side: Any) -> Image:
-    if not isinstance(side, np.ndarray):
-        return read_image(side, max_size_px=_ANY_SIZE).images[0]
-    if side.dtype != np.uint8 or side.ndim not in (2, 3) or (side.ndim == 3 and side.shape[2] not in (3, 4)):
-        message = f"an image must be a uint8 array (H, W, 3) or (H, W, 4); got {side.dtype} {side.shape}"
-        raise ValueError(message)
+def _stored(source: U8 | PIL.Image.Image) -> StoredImage:
+    return StoredImage(source if isinstance(source, PIL.Image.Image) else PIL.Image.fromarray(source))
+
+
+def _full_image(source: Any) -> Image:
+    if isinstance(source, str | Path | Image):
+        return read_image(source, max_size_px=_ANY_SIZE).images[0]
     try:
-        return _image("", StoredImage(PIL.Image.fromarray(side)), _ANY_SIZE)
+        return _image("", _stored(source), _ANY_SIZE)
     except UnusableImage as refusal:
         raise StageFailure(Notice("unusable-image", refusal)) from None
 

@@ -18,7 +18,7 @@ import PIL.Image
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
-from thesisrecon.records import TexturedMesh, require_mesh
+from thesisrecon.records import TexturedMesh, as_mesh
 
 _MAX_TEXELS = 2**26  # Many times the size of a run's texture, and within the limit of Pillow
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
@@ -107,7 +107,7 @@ def _require_tree(nodes: list[dict[str, Any]]) -> None:
 
 def glb_bytes(mesh: TexturedMesh) -> bytes:
     """The GLB that :func:`write_mesh` writes."""
-    require_mesh("write_mesh", mesh)
+    mesh = as_mesh("write_mesh", mesh)
     import trimesh
     from trimesh.visual import material as materials
     from trimesh.visual import texture as textures

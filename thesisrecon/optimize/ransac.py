@@ -12,7 +12,7 @@ import scipy
 from numpy.random import Generator
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import depth, project
@@ -127,8 +127,8 @@ _EXACT_PX = 1e-6  # residuals below this are rounding errors, not noise
 _FLAT = 1e-6  # ratio of extents below which points lie in one plane
 
 
-@dataclass(frozen=True)
-class Resection:
+@dataclass(frozen=True, eq=False)
+class Resection(Record):
     """A camera from space points and their pixels.
 
     Parameters

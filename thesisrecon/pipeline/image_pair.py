@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8
 from thesisrecon.config import KINDS, PipelineConfig
@@ -18,8 +19,8 @@ from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Features, Image, Matches, Seeds, TwoView
 
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
-ImageInput = str | Path | np.ndarray | Image
-"""A file, a uint8 array (H, W), (H, W, 3) or (H, W, 4), or an :class:`Image`."""
+ImageInput = str | Path | ArrayLike | Image
+"""A file, an array of levels (H, W), (H, W, 3) or (H, W, 4), a Pillow image, or an :class:`Image`."""
 MASK_REACH = 4.0  # half width, in pixels of its scale, of the window that determines the position of a corner
 
 

@@ -12,11 +12,18 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64, I64, rows_of_views
+from thesisrecon.arrays import F64, I64, numbers, rows_of_views
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import require_image_name
-from thesisrecon.io._images import DecodedImage, ImageSet, image_without_pixels, read_image, rotation_words
+from thesisrecon.io._images import (
+    DecodedImage,
+    ImageSet,
+    eight_bit_images,
+    image_without_pixels,
+    read_image,
+    rotation_words,
+)
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.projection import Observations, sort_observations
@@ -149,8 +156,10 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
             some = f"{len(missing)} of the {count} images"
             raise UsageError(f"{some} are not in {folder}, such as {missing[0]!r}")
         images = folder
-    elif images is not None and len(images) != count:
-        raise UsageError(f"there are {len(images)} images and {count} sizes")
+    elif images is not None:
+        if len(images) != count:
+            raise UsageError(f"there are {len(images)} images and {count} sizes")
+        images = eight_bit_images(*images)
     return Views(names, table.astype(np.int64), images, as_stored)
 
 
@@ -208,10 +217,10 @@ def _positions(xy: Any, i: int, views: Views) -> F64:
     """Checked positions (N, 2) of one image."""
     name = views.names[i]
     try:
-        found = np.asarray(xy, dtype=np.float64)
-    except (TypeError, ValueError):
+        (found,) = numbers(f"the image {name!r}", keypoints=xy)
+    except ValueError as error:
         advice = "of OpenCV's keypoints take [k.pt for k in keypoints]"
-        raise UsageError(f"keypoints of {name!r} must be (N, 2) numbers; {advice}") from None
+        raise UsageError(f"keypoints of {name!r} must be (N, 2) numbers: {error}; {advice}") from None
     if found.size == 0:
         return np.zeros((0, 2))
     if found.ndim != 2 or found.shape[1] != 2 or not np.isfinite(found).all():
@@ -228,10 +237,12 @@ def _positions(xy: Any, i: int, views: Views) -> F64:
 
 def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
     """Checked rows (M, 2) of keypoints; of several matches of a keypoint only the first is kept."""
+    where = f"matches of images {pair[0]} and {pair[1]}"
+    if np.ma.is_masked(given):
+        raise UsageError(f"{where} have rows that are hidden by a mask; leave them out")
     rows = np.asarray(given)
     if rows.size == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    where = f"matches of images {pair[0]} and {pair[1]}"
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
         rule = "must be (M, 2) whole numbers, rows of keypoints"
         raise UsageError(f"{where} {rule}; got {rows.shape} {rows.dtype}")
@@ -258,11 +269,15 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
     """The matches of all pairs of images that share enough points."""
     count = len(views.names)
     if not isinstance(tracks, Tracks):
-        if not isinstance(tracks, np.ndarray) or tracks.ndim != 3 or tracks.shape[2] != 2:
-            kinds = "thesisrecon.Tracks or an array of pixels (V, N, 2), NaN where a point is not seen"
-            raise UsageError(f"tracks must be {kinds}; got a {type(tracks).__name__}")
-        point, view = np.nonzero(np.isfinite(tracks).all(axis=2).T)
-        tracks = Tracks(view, point, tracks[view, point], *tracks.shape[:2])
+        kinds = "thesisrecon.Tracks or an array of pixels (V, N, 2), NaN or masked where a point is not seen"
+        try:
+            (xy,) = numbers("tracks", missing=("tracks",), tracks=tracks)
+        except ValueError as error:
+            raise UsageError(f"tracks must be {kinds}: {error}") from None
+        if xy.ndim != 3 or xy.shape[2] != 2:
+            raise UsageError(f"tracks must be {kinds}; got a {type(tracks).__name__} {xy.shape}")
+        point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
+        tracks = Tracks(view, point, xy[view, point], *xy.shape[:2])
     view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
     if tracks.n_views != count:
         raise UsageError(f"there are tracks of {tracks.n_views} images and {count} sizes")

@@ -33,7 +33,7 @@ def pictured(images: int) -> list[int]:
     return [int(number) for number in np.unique(spread)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReportData(RunResult):
     """Content of ``report.html``: the result of a run, and what only the page shows."""
 

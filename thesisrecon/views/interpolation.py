@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64, U8, Record
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.imaging.raster import run_in_strips
@@ -163,8 +163,8 @@ class _Side:
     weight: F32
 
 
-@dataclass(frozen=True)
-class InterpolatedPair:
+@dataclass(frozen=True, eq=False)
+class InterpolatedPair(Record):
     """Two images and the views between them (thesis, section 1.2).
 
     Each pixel of either image moves along its row by a share of its disparity and out of the rectified frame

@@ -24,6 +24,7 @@ from thesisrecon.arrays import (
     I16,
     I32,
     U8,
+    Record,
     require_calibration,
     require_finite,
     require_rotations,
@@ -46,8 +47,8 @@ def _require_motion(R: F64, t: F64) -> None:
     require_rotations("view synthesis", R)
 
 
-@dataclass(frozen=True)
-class CalibratedPair:
+@dataclass(frozen=True, eq=False)
+class CalibratedPair(Record):
     """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length."""
 
     K1: F64  #: (3, 3) intrinsics, as is ``K2``
@@ -151,8 +152,8 @@ def _decompose(E: F64) -> list[tuple[F64, F64]]:
     return [(R, sign * U[:, 2]) for R in turns for sign in (1.0, -1.0)]
 
 
-@dataclass(frozen=True)
-class VirtualCamera:
+@dataclass(frozen=True, eq=False)
+class VirtualCamera(Record):
     """A virtual camera: the third camera of the seed tensor, moved from X_3 to R X_3 + t."""
 
     rotation: F64  #: R (3, 3)
@@ -356,8 +357,8 @@ def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32]
     return complete
 
 
-@dataclass(frozen=True)
-class TensorSynthesis:
+@dataclass(frozen=True, eq=False)
+class TensorSynthesis(Record):
     """Two images prepared for view synthesis by :func:`prepare_synthesis`."""
 
     pair: CalibratedPair

@@ -1,0 +1,197 @@
+"""Cameras and models as they are given to calls: records, arrays, runs, folders and models of pycolmap."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from thesisrecon.arrays import F64, I64, numbers, require_shapes
+from thesisrecon.camera import Camera
+from thesisrecon.errors import UsageError, in_words
+from thesisrecon.io._files import require_image_name
+from thesisrecon.io._models import read_model
+from thesisrecon.records import Reconstruction
+from thesisrecon.results import RunResult, SparseModel, SparseView
+
+Model = str | Path | SparseModel | RunResult | Reconstruction | Mapping[str, Camera] | Sequence[Camera]
+"""A model in memory or a folder; what has the methods of ``pycolmap.Reconstruction`` is one, too."""
+CameraInput = Model | tuple[F64, F64, F64]
+"""Cameras in the order of the images or by image name, (K, R, t), a metric reconstruction, or a model."""
+
+
+def as_sparse_model(model: Model, what: str = "a model") -> SparseModel:
+    """Return the sparse model, ``what`` it is in messages, of anything that holds cameras: see ``Model``.
+
+    Cameras without names are called image-0 and so on. A run without cameras and anything else are a
+    ``UsageError``.
+    """
+    if isinstance(model, SparseModel):
+        return model
+    if isinstance(model, str | PathLike):
+        return read_model(model)
+    if isinstance(model, Mapping) or (isinstance(model, list | tuple) and len(model)):
+        return _model_of_cameras(model)
+    if isinstance(model, Reconstruction):
+        X, view, point, xy = points_of_reconstruction(model)
+        views = _model_of_cameras(as_cameras("a model", model)).views
+        return SparseModel(views, X, view_index=view, point_index=point, xy=xy)
+    if all(callable(getattr(model, name, None)) for name in ("write", "reg_image_ids")):
+        with TemporaryDirectory() as folder:
+            model.write(folder)  # type: ignore[union-attr]
+            return read_model(folder)
+    if not isinstance(model, RunResult):
+        kinds = "a path, a RunResult, a SparseModel, a metric Reconstruction or Cameras, by name or in a list"
+        raise UsageError(f"{what} must be {kinds}; got {in_words(model)} ({type(model).__name__})")
+    # Imported on use: models in memory need no stages.
+    from thesisrecon.pipeline.outputs import folder_with, save_result
+
+    if (out := folder_with(model)) is not None:
+        return read_model(out)
+    if model.metric is None:
+        raise UsageError("the result has no cameras; it ended before the metric stage")
+    with TemporaryDirectory() as folder:
+        save_result(replace(model, mesh=None), Path(folder), overwrite=False)
+        return read_model(folder)
+
+
+def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> SparseModel:
+    """The model of cameras alone; those with equal intrinsics have one number."""
+    if not isinstance(cameras, Mapping):
+        width = len(str(len(cameras) - 1))
+        cameras = {f"image-{i:0{width}d}": camera for i, camera in enumerate(cameras)}
+    for name, camera in cameras.items():
+        if not isinstance(camera, Camera):
+            rule = "Camera(K, R, t, size) or Camera.from_matrix(P, size) of each image"
+            raise UsageError(f"a model of cameras needs {rule}; {name} is a {type(camera).__name__}")
+        require_image_name(name, "a model of cameras")
+    lenses = radial_coefficients("a model", list(cameras.values()))
+    numbers_of: dict[bytes, int] = {}
+    views = []
+    for (name, one), lens in zip(cameras.items(), lenses, strict=True):
+        key = np.concatenate([one.K.ravel(), one.size, lens]).tobytes()
+        number = numbers_of.setdefault(key, len(numbers_of))
+        views.append(SparseView(name, one.R, one.t, one.K, one.size, lens, number))
+    stored = {camera.as_stored for camera in cameras.values()}
+    if len(stored) > 1:
+        raise UsageError("a model needs cameras that are all as_stored, or none; some of these are")
+    return SparseModel(views, as_stored=stored == {True})
+
+
+def cameras_by_name(caller: str, model: Model) -> Mapping[str, Camera]:
+    """The cameras of any model by image name, for ``caller``."""
+    if isinstance(model, RunResult):
+        if model.metric is None:
+            raise UsageError("the result has no cameras; it ended before the metric stage")
+        return model.cameras
+    if not isinstance(model, str | PathLike | SparseModel) and not hasattr(model, "reg_image_ids"):
+        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
+        raise ValueError(f"{caller} needs {kinds}; got a {type(model).__name__}")
+    source = model if isinstance(model, str | PathLike) else "the model"
+    return cameras_of_model(as_sparse_model(model), source)
+
+
+def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:
+    """The cameras of a model by name; UsageError, with its path, if one is incomplete or not radial."""
+    cameras = {}
+    for view in model.views:
+        if view.K is None or view.size is None:
+            raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
+        if view.distortion is None:
+            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
+            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
+        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
+        cameras[view.name] = camera
+    return cameras
+
+
+def as_cameras(
+    caller: str, cameras: CameraInput, sizes: I64 | None = None, names: Sequence[str] = ()
+) -> list[Camera]:
+    """The cameras in order; the registered ones of a reconstruction; of a mapping those of ``names``."""
+    if isinstance(cameras, Reconstruction):
+        return _registered_cameras(caller, cameras)
+    cameras = named_cameras(caller, cameras)
+    if isinstance(cameras, Mapping):
+        missing = [name for name in names if name not in cameras]
+        if missing:
+            first = next(iter(cameras), None)
+            raise ValueError(f"{caller} got no camera for {missing[0]}; the first camera is that of {first}")
+        for name, camera in cameras.items():
+            if not isinstance(camera, Camera):
+                rule = "a thesisrecon.Camera by each name"
+                raise ValueError(f"{caller} needs {rule}; that of {name} is a {type(camera).__name__}")
+        return [cameras[name] for name in names or cameras]
+    given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
+    if given and all(isinstance(one, Camera) for one in given):
+        return given
+    if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
+        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
+        raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
+    if sizes is None:
+        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")
+    K, R, t = calibrated_arrays(caller, *given)
+    return [Camera(*one) for one in zip(K, R, t, checked_sizes(caller, sizes, len(R)), strict=True)]
+
+
+def named_cameras(caller: str, cameras: Any) -> Any:
+    """The cameras by name of a run, a folder or a model of other kinds; anything else as it is."""
+    known = Reconstruction | Mapping | list | tuple | np.ndarray
+    if cameras is None or isinstance(cameras, known | int | float):
+        return cameras
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str):
+        return cameras_by_name(caller, cameras)
+    return cameras
+
+
+def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
+    if r.stratum != "metric" or r.K is None:
+        raise ValueError(f"{caller} needs a metric reconstruction with K; got {r.stratum}")
+    lenses = np.zeros((len(r.P), 3)) if r.distortion is None else r.distortion
+    views = []
+    for i in np.flatnonzero(r.registered):
+        Rt = np.linalg.solve(r.K[i], r.P[i])
+        views.append(Camera(r.K[i], Rt[:, :3], Rt[:, 3], tuple(r.sizes[i].tolist()), lenses[i]))
+    return views
+
+
+def points_of_reconstruction(r: Reconstruction) -> tuple[F64, I64, I64, F64]:
+    """Valid points (N, 3), and view, point and pixels of the inlier observations in registered views."""
+    tracks, used = r.tracks, r.used
+    view, point = np.cumsum(r.registered) - 1, np.cumsum(r.valid) - 1
+    X = np.asarray(r.X[r.valid, :3] / r.X[r.valid, 3:])
+    return X, view[tracks.view_index[used]], point[tracks.point_index[used]], tracks.xy[used]
+
+
+def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
+    """Distortion k1, k2, k3 (V, 3) of cameras; ``ValueError`` if one has further coefficients."""
+    table = np.zeros((len(views), 3))
+    for row, view in zip(table, views, strict=True):
+        lens = np.zeros(0) if view.distortion is None else view.distortion
+        if np.any(lens[3:]):
+            raise ValueError(f"{caller} takes distortion by k1, k2, k3; got {len(lens)} coefficients")
+        row[: len(lens[:3])] = lens[:3]
+    return table
+
+
+def calibrated_arrays(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F64]:
+    """K (V, 3, 3), also of one camera, R (V, 3, 3) and t (V, 3)."""
+    K, R, t = numbers(caller, K=K, R=R, t=t)
+    K = np.broadcast_to(K, (len(R), 3, 3)) if K.shape == (3, 3) else K
+    require_shapes(caller, K=(K, ("V", 3, 3)), R=(R, ("V", 3, 3)), t=(t, ("V", 3)))
+    return K, R, t
+
+
+def checked_sizes(caller: str, sizes: I64, n: int) -> I64:
+    """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
+    (given,) = numbers(caller, sizes=sizes)
+    if given.shape not in ((2,), (n, 2)):
+        raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height; got {given.shape}, V = {n}")
+    if not (np.isfinite(given).all() and (given >= 1).all() and (given == np.round(given)).all()):
+        raise ValueError(f"{caller} needs sizes of whole numbers above 0; got {given.tolist()}")
+    return np.broadcast_to(given, (n, 2)).astype(np.int64)
