@@ -258,6 +258,21 @@ def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
     refuses(StageFailure, "disparity range", disparity_range, rectified, scene.xy1[:0], scene.xy2[:0])
 
 
+@pytest.mark.parametrize("scale", [0.25, 0.5, 2.0])
+def test_images_of_unequal_resolution_have_one_resolution_in_a_polar_frame(scale):
+    pair = make_pair("forward", np.random.default_rng(11))
+    S = np.array([[scale, 0.0, 0.5 * scale - 0.5], [0.0, scale, 0.5 * scale - 0.5], [0.0, 0.0, 1.0]])
+    same, other = both_pairs(pair)[1], pair_of_cameras(
+        pair.P[0], S @ pair.P[1], pair.sizes[0], tuple(round(scale * side) for side in pair.sizes[1]),
+        xy1=pair.xy1, xy2=(pair.xy2 + 0.5) * scale - 0.5,
+    )  # fmt: skip
+    frames = [polar(one) for one in (same, other)]
+    most = [np.ptp(matched(frame, one)[:, 0]) for frame, one in zip(frames, (same, other), strict=True)]
+    # The range of the disparities is that of equal images, in pixels of the frame.
+    assert 0.6 < most[1] / most[0] < 1.1 * max(scale, 1.0)
+    np.testing.assert_allclose(matched(frames[1], other)[:, 1], 0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("motion", ["beside", "toed in", "upwards", "diagonal"])
 def test_images_in_the_other_order_do_not_fit_the_fundamental_matrix(motion):
     """Their rows would be off by tens of pixels; with noise the right ones are within one or two."""

@@ -194,6 +194,69 @@ def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32
             out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)
 
 
+def refine_by_gradient(disparity: F32, left: StereoImage, right: StereoImage) -> F32:
+    """Move disparities (H, W) by least squares of the intensities, at most half a pixel.
+
+    In a window (Lucas and Kanade 1981), L(x) = a R(x - d - s) + b with gain a and offset b is linear in a, b
+    and a s for small s. The shift s has the prior of a rounded disparity, with variance 1 / 12, which rules
+    where texture is missing.
+    """
+    size = 9  # Window in pixels, equal to that of the texture
+    (grey, seen), other = _smoothed(left), _smoothed(right)
+    known = np.isfinite(disparity) & seen
+    place = np.arange(disparity.shape[1], dtype=np.float32) - np.where(known, disparity, np.float32(0.0))
+    value, slope, inside = _sampled_row(*other, place)
+    weight = (known & inside).astype(np.float32)
+    y = grey * weight
+
+    def mean(values: F32) -> F32:
+        return np.asarray(scipy.ndimage.uniform_filter(values, size, mode="constant"))
+
+    r, g = value * weight, slope * weight
+    n = np.maximum(mean(weight), np.float32(0.5 / size**2))
+    my, mr, mg = (mean(one) / n for one in (y, r, g))
+    syr, syg, srg = (
+        mean(a * b) / n - ma * mb for a, b, ma, mb in ((y, r, my, mr), (y, g, my, mg), (r, g, mr, mg))
+    )
+    srr, sgg, syy = (mean(a * a) / n - ma * ma for a, ma in ((r, mr), (g, mg), (y, my)))
+    with np.errstate(all="ignore"):
+        # The variance of the residuals without the prior weights it.
+        det = srr * sgg - srg * srg
+        gain, shift = (syr * sgg - syg * srg) / det, (syg * srr - syr * srg) / det
+        noise = np.maximum(syy - gain * syr - shift * syg, np.float32(LEVELS**2 / 12.0))
+        ridged = sgg + np.float32(12.0) * noise / (n * np.float32(size**2))
+        det = srr * ridged - srg * srg
+        gain, shift = (syr * ridged - syg * srg) / det, (syg * srr - syr * srg) / det
+        step = -shift / gain
+        good = known & (weight > 0) & (gain > 0.25) & (np.abs(step) <= 0.5)
+    return np.asarray(np.where(good, disparity + step, disparity), dtype=np.float32)
+
+
+def _smoothed(image: StereoImage) -> tuple[F32, B8]:
+    """Binomial mean of 3 x 3 pixels, whose slopes have less noise, and where all of them exist."""
+    grey = image.grey.astype(np.float32)
+    for axis in (0, 1):
+        grey = scipy.ndimage.correlate1d(grey, (0.25, 0.5, 0.25), axis)
+    return grey, np.asarray(scipy.ndimage.minimum_filter(image.valid, 3) > 0)
+
+
+def _sampled_row(grey: F32, valid: B8, place: F32) -> tuple[F32, F32, B8]:
+    """Values and slopes (H, W) at columns of rows, by cubic convolution (Keys 1981), and where both exist."""
+    width = grey.shape[1]
+    whole = np.floor(place)
+    t = place - whole
+    first = np.clip(whole.astype(np.int64) - 1, 0, max(width - 4, 0))
+    inside: B8 = np.asarray((whole >= 1.0) & (whole <= width - 3.0))
+    taps = [np.minimum(first + k, width - 1) for k in range(4)]
+    a, b, c, d = (np.take_along_axis(grey, at, axis=1) for at in taps)
+    for at in taps:
+        inside &= np.take_along_axis(valid, at, axis=1)
+    one, two, three = c - a, 2.0 * a - 5.0 * b + 4.0 * c - d, 3.0 * (b - c) + d - a
+    value = b + 0.5 * t * (one + t * (two + t * three))
+    slope = 0.5 * (one + t * (2.0 * two + 3.0 * t * three))
+    return value.astype(np.float32), slope.astype(np.float32), inside
+
+
 def texture_of(image: StereoImage, noise: float) -> F32:
     """Squared horizontal gradient (H, W) relative to that of ``noise``: 1 = no texture, NaN = no pixel."""
     texture_radius = 4  # Radius of the window in which texture is measured, equal to that of the costs
@@ -209,11 +272,12 @@ def texture_of(image: StereoImage, noise: float) -> F32:
     return out
 
 
-def disparity_noise(raw: F32, smooth: F32) -> float:
+def disparity_noise(raw: F32, smooth: F32, *, refined: bool) -> float:
     """Standard deviation of the disparities: median deviation from the smoothed ones, plus pixel locking."""
     subsampling = 5  # Row and column step of the pixels used for a median
-    # Standard deviation of the pixel-locking error of the sub-pixel fit, measured on known disparities.
-    locking_px = 0.17
+    # Standard deviation of the errors that neighbours share, measured on known disparities: pixel locking,
+    # or 0.03 in clean to 0.13 in noisy images of what the refinement leaves.
+    locking_px = 0.1 if refined else 0.17
     apart = np.abs(raw[::subsampling, ::subsampling] - smooth[::subsampling, ::subsampling])
     known = apart[np.isfinite(apart)]
     return float(np.hypot(1.4826 * np.median(known), locking_px)) if len(known) else float("nan")

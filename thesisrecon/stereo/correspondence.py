@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64, U8, Record
 from thesisrecon.errors import StageFailure
 from thesisrecon.imaging.resampling import Rectification, bilinear_samples
 from thesisrecon.records import DisparityMap, Image, PinholeView
@@ -24,8 +24,8 @@ MAX_COSTS = 400.0
 """Matching costs per pixel of the reference view; the frames of wide baselines are reduced to that."""
 
 
-@dataclass(frozen=True)
-class Correspondence:
+@dataclass(frozen=True, eq=False)
+class Correspondence(Record):
     """Positions of the pixels of a reference view in another view."""
 
     xy: F32  #: (H, W, 2) pixels of the other view, NaN = unknown
@@ -166,8 +166,8 @@ def _levels(view: PinholeView) -> F32:
     return levels
 
 
-@dataclass(frozen=True)
-class RectifiedPair:
+@dataclass(frozen=True, eq=False)
+class RectifiedPair(Record):
     """Two rectified images and their dense disparities."""
 
     frame: Rectification  #: maps between the images and the rectified frame

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F32, F64, U8, resizing_transform
+from thesisrecon.arrays import F32, F64, U8, Record, resizing_transform
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, principal_ray
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
@@ -75,7 +75,7 @@ def singular_values(J: F64) -> F64:
     return np.stack([a + b, np.abs(a - b)], axis=1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanarRectification(Rectification):
     """Homographies ``H`` (2, 3, 3) to a common rectified frame, with a positive third coordinate."""
 
@@ -317,7 +317,7 @@ def _mapped(H: F64, xy: F64) -> F64:
     return np.asarray(xh[:, :2] / xh[:, 2:])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PolarRectification(Rectification):
     """Polar maps: row r shows the half-plane ``angles[r]``, with linear interpolation between rows.
 
@@ -384,8 +384,11 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
     pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
     phi = _half_planes(pair)
     both = [pencil.chords(side, phi) for side in (0, 1)]
-    angles = _rows_of(pencil, phi, both)[::sign]
-    frame = PolarRectification(pencil, angles, np.ones(2), np.zeros(2), np.zeros(2), (1, len(angles)))
+    # Images of unequal resolution meet halfway, as in planar frames.
+    unit = max(float(np.sqrt(pencil.units.prod())), float(pencil.units.max()) / MAX_SHRINK)
+    scales = unit / pencil.units
+    angles = _rows_of(pencil, phi, both, scales)[::sign]
+    frame = PolarRectification(pencil, angles, scales, np.zeros(2), np.zeros(2), (1, len(angles)))
     frame = _align_disparities(frame, pair) if aligned else frame
     ends = []
     for side, (lines, enter, leave) in enumerate(both):
@@ -407,7 +410,7 @@ def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRe
     slope = disparity_gradients(left, right).mean(axis=0)
     scale = np.exp(np.clip(-slope[0], -max_log_scale, max_log_scale))
     shear = np.clip(-0.5 * slope[1], -max_shear, max_shear)
-    scales = np.array([max(scale, 1.0), max(1.0 / scale, 1.0)])
+    scales = frame.scales * [max(scale, 1.0), max(1.0 / scale, 1.0)]
     return replace(frame, scales=scales, shears=np.array([shear, -shear]))
 
 
@@ -420,7 +423,7 @@ def _half_planes(pair: EpipolarPair) -> F64:
     return np.unique(np.concatenate([np.linspace(low, high, angles), peaks[(peaks > low) & (peaks < high)]]))
 
 
-def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]]) -> F64:
+def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]], scales: F64) -> F64:
     """Angles of the rows, increasing (H,)."""
     per_radian = np.zeros(len(phi))
     for side, (lines, enter, leave) in enumerate(both):
@@ -428,6 +431,8 @@ def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, 
         for t, shrink in ((0.5 * (enter + leave), 1.0), (enter, MAX_SHRINK), (leave, MAX_SHRINK)):
             at = np.where(met, t, 0.0)[:, None]
             sweep_rate = pencil.sweep_rate(side, phi, lines.foot + at * lines.direction) * pencil.units[side]
+            # The ends of an image that is reduced as a whole keep their bound.
+            sweep_rate = sweep_rate * (scales[side] if shrink == 1.0 else max(scales[side], 1.0))
             per_radian = np.maximum(per_radian, np.where(met, sweep_rate / shrink, 0.0))
     # The maximum of both ends bounds the reduction between the samples.
     each = np.maximum(per_radian[:-1], per_radian[1:]) * np.diff(phi)
@@ -444,8 +449,8 @@ METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar
 """All methods; the common orientation needs cameras."""
 
 
-@dataclass(frozen=True)
-class RectifiedImages:
+@dataclass(frozen=True, eq=False)
+class RectifiedImages(Record):
     """Two images whose rows correspond: x_right = x_left - d with disparities d >= 0."""
 
     left: F32  #: (H, W, 3) NaN outside the originals, as is ``right``
@@ -585,7 +590,9 @@ def disparity_range(
     left, right = matches_in_frame(rectification, (xy1, xy2))
     if len(left) == 0:
         raise StageFailure(
-            "the disparity range is unknown", "no match is inside the rectified frame", "specify a range"
+            "the disparity range is unknown",
+            "no match is inside the rectified frame",
+            "check that the matches are pixels (x, y) of these images",
         )
     low, high = disparity_bounds(left[:, 0] - right[:, 0], margin=margin)
     return int(np.floor(low)) - 2, int(np.ceil(high)) + 2

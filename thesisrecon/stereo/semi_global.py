@@ -267,6 +267,7 @@ class SemiGlobalMatching:
     support: bool = True
     """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
     smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
+    refinements: int = 2  #: passes of the least squares of intensities, which remove pixel locking
 
     # Limit for costs and path sums of one strip of rows.
     memory_mb = 256.0
@@ -274,8 +275,14 @@ class SemiGlobalMatching:
     def __post_init__(self) -> None:
         if self.paths not in (4, 8):
             raise ValueError(f"paths must be 4 or 8; got {self.paths}")
-        if not (0.0 <= self.census_share <= 1.0 and self.truncation > 0.0 and self.smoothing_radius >= 0):
-            raise ValueError("census_share must be in [0, 1], truncation positive, smoothing_radius >= 0")
+        if not (
+            0.0 <= self.census_share <= 1.0
+            and self.truncation > 0.0
+            and min(self.smoothing_radius, self.refinements) >= 0
+        ):
+            raise ValueError(
+                "census_share must be in [0, 1], truncation positive, smoothing_radius and refinements >= 0"
+            )
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """Compute the disparities of the left image, NaN where occluded or ambiguous.
@@ -326,7 +333,9 @@ class SemiGlobalMatching:
             _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
         left, right, confidence = found
-        return self._postprocess(left, right, confidence, _postprocessing.texture_of(images[0], measured))
+        return self._postprocess(
+            left, right, confidence, images, _postprocessing.texture_of(images[0], measured)
+        )
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
@@ -337,17 +346,23 @@ class SemiGlobalMatching:
         of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))
         return np.array([of_bit, of_level, cap], np.int16)
 
-    def _postprocess(self, left: F32, right: F32, confidence: F32, texture: F32) -> DisparityMap:
+    def _postprocess(
+        self, left: F32, right: F32, confidence: F32, images: tuple[_cost.StereoImage, _cost.StereoImage],
+        texture: F32,
+    ) -> DisparityMap:  # fmt: skip
         """Check, filter and smooth the disparities (H, W) of the left image; inputs are overwritten."""
         step = np.float32(1.0)  # Largest disparity difference of neighbours on one surface
         _postprocessing.check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
         # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
         _postprocessing.remove_speckles(left, texture > np.float32(1.7), step, 60)
+        for _ in range(self.refinements):
+            left = _postprocessing.refine_by_gradient(left, *images)
         closed, smooth = _postprocessing.fill_pinholes(left, least=5), np.empty_like(left)
         closed[np.isnan(texture)] = np.nan
         _postprocessing.edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
         confidence = _postprocessing.final_confidence(confidence, left, smooth, texture)
-        return DisparityMap(smooth, confidence, _postprocessing.disparity_noise(closed, smooth))
+        sigma_px = _postprocessing.disparity_noise(closed, smooth, refined=self.refinements > 0)
+        return DisparityMap(smooth, confidence, sigma_px)
 
 
 def _adapted_P2(image: _cost.StereoImage, noise: float) -> U8:
@@ -359,5 +374,5 @@ def _adapted_P2(image: _cost.StereoImage, noise: float) -> U8:
     return out
 
 
-PUBLISHED = SemiGlobalMatching(paths=8, census_share=1.0, support=False, smoothing_radius=0)
+PUBLISHED = SemiGlobalMatching(paths=8, census_share=1.0, support=False, smoothing_radius=0, refinements=0)
 """Semi-global matching as published: eight paths over census costs of single pixels."""
