@@ -264,7 +264,7 @@ def undistort_image(
     return pixels.astype(np.uint8), seen
 
 
-def bilinear_samples(values: F32, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:
+def bilinear_samples(values: F32 | F64, x: F32 | F64, y: F32 | F64) -> tuple[F64, F64]:
     """Bilinear samples (..., C) of ``values`` (H, W, C), and the range (..., C) of the four pixels around."""
     height, width = values.shape[:2]
     x0 = np.clip(np.floor(x).astype(np.int64), 0, max(width - 2, 0))

@@ -98,7 +98,8 @@ def _steps(rho: F64, deviation: F64, axis: int) -> B8:
 
 def _sizes(joined: Sequence[B8], counted: B8) -> I64:
     """(H, W) number of ``counted`` pixels in the connected region of each pixel."""
-    label = components(*_edges(np.arange(counted.size).reshape(counted.shape), joined), counted.size)
+    start, stop = _edges(np.arange(counted.size).reshape(counted.shape), joined)
+    label = components(start, stop, counted.size)
     return np.asarray(np.bincount(label, counted.ravel())[label].reshape(counted.shape), dtype=np.int64)
 
 
@@ -153,17 +154,18 @@ class _Spline(NamedTuple):
         number = np.full(cell.shape, -1, dtype=np.int64)
         number.ravel()[pixel] = np.arange(len(pixel))
         inside = [joined & (np.diff(cell, axis=axis) == 0) for axis, joined in enumerate(domain.joined)]
-        piece = components(*_edges(number, inside), len(pixel))
+        start, stop = _edges(number, inside)
+        piece = components(start, stop, len(pixel))
         cells = cell.ravel()[pixel[np.unique(piece, return_index=True)[1]]]
         own = _number_coefficients(cells, columns, np.unique(piece[_edges(number, domain.joined)], axis=1))
         count = int(own.max()) + 1
         places, entry = np.unique(own[:, None, :] * count + own[:, :, None], return_inverse=True)
         starts = np.searchsorted(places, np.arange(count + 1) * count)
-        pattern = tuple(part.astype(np.int32) for part in (places % count, starts, entry.ravel()))
+        row, first, entry = (part.astype(np.int32) for part in (places % count, starts, entry.ravel()))
         along, (bending, gradient) = _basis((np.arange(knot_px) + 0.5) / knot_px), _energies()
         place = (y % knot_px * knot_px + x % knot_px).ravel()[pixel]
-        energy = bending + gradient_weight * gradient
-        return cls(pixel, place, piece, cells, (rows, columns), own, np.kron(along, along), energy, pattern)
+        energy, basis = np.asarray(bending + gradient_weight * gradient), np.asarray(np.kron(along, along))
+        return cls(pixel, place, piece, cells, (rows, columns), own, basis, energy, (row, first, entry))
 
     def fit(self, value: F64, weight: F64, stiffness: F64) -> F64:
         """Coefficients for the values (N,) and weights of the pixels and the stiffness (M,) of the pieces."""
@@ -211,10 +213,9 @@ class BSplineSurface:
         inverse_depth = np.full(depth_map.depth.shape, np.nan)
         if domain.reliable.any():
             spline = _Spline.over(domain, self.knot_px)
-            depth, std, reliable = (
-                part.ravel()[spline.pixel] for part in (depth_map.depth, depth_map.std, domain.reliable)
-            )
-            depth = depth.astype(np.float64)
+            depth = depth_map.depth.ravel()[spline.pixel].astype(np.float64)
+            std = depth_map.std.ravel()[spline.pixel].astype(np.float64)
+            reliable = domain.reliable.ravel()[spline.pixel]
             c = self._coefficients(spline, 1.0 / depth, std / depth**2, reliable)
             inverse_depth.ravel()[spline.pixel] = spline.values(c)
         with np.errstate(divide="ignore", invalid="ignore"):

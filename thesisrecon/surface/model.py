@@ -160,7 +160,7 @@ def choose_views(
         return quality.max(axis=1), first + quality.argmax(axis=1)
 
     def smoothest_of_eight(first: int) -> tuple[F32, I64]:
-        share = quality_of_eight(first) / np.maximum(best, np.float32(1e-20))[:, None]
+        share = np.asarray(quality_of_eight(first) / np.maximum(best, 1e-20)[:, None], dtype=np.float32)
         spread, other = share.copy(), np.empty_like(share)
         for _ in range(smooth_rounds):
             diffuse(share, neighbours, own_weight, spread, other)

@@ -175,9 +175,9 @@ def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
 def _light_rows(shading: Shading, origin: F64) -> F64:
     """Rows (L, 7) of the lights for :func:`_shade_points`, in coordinates about an origin."""
     rows = [
-        (0.0, *light.direction, *light.color)
-        if light.direction is not None
-        else (1.0, *np.subtract(light.position, origin), *light.color)
+        (1.0, *np.subtract(light.position, origin), *light.color)
+        if light.position is not None
+        else (0.0, *(light.direction or ()), *light.color)
         for light in shading.lights
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
