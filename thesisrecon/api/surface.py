@@ -17,7 +17,7 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.io._images import is_rgba, list_images, read_image, read_levels, rotation_words
-from thesisrecon.pipeline.image_pair import ImageInput
+from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.records import (
     DepthMap,
     DisparityMap,

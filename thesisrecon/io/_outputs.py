@@ -19,7 +19,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from thesisrecon.errors import OutputError, StageFailure, UsageError, WorkersLost
+from thesisrecon.errors import Notice, OutputError, StageFailure, UsageError, WorkersLost
 
 LOCK_FILE = ".lock"
 _claims: list[OutputFolder] = []
@@ -105,8 +105,7 @@ class OutputFolder:
 
     def _require_no_link(self, path: Path) -> None:
         if (link := self._link_above(path)) is not None:
-            way = "replace the link by a folder, or choose another output folder"
-            raise UsageError(f"{path} is not written, because {link} is a link; {way}")
+            raise UsageError(Notice("link-above", path, link))
 
     def require(self, names: Sequence[str | Path]) -> None:
         """Raise ``UsageError`` if a file of these names must not be written."""
@@ -133,10 +132,7 @@ class OutputFolder:
         return [path for paths in found for path in paths if os.path.lexists(path)]
 
     def admit(self, path: Path, content: bytes, *, cached: bool) -> bool:
-        """Check and record that a file is written; False if it has this content already.
-
-        ``cached``: a stored result of a stage, which belongs to its run by name and is not recorded.
-        """
+        """Check and record that a file is written, unless it is ``cached``; False if it has this content."""
         self.require_present()
         there = os.path.lexists(path)
         if there or not cached:
@@ -199,10 +195,7 @@ class OutputFolder:
         with suppress(OSError):
             if os.path.samestat(self.path.stat(), os.fstat(self._folder)):
                 return
-        way = "repeat the command, which continues if the folder is back in its place"
-        raise UsageError(
-            f"the output folder {self.path} was moved or removed while the command was writing to it; {way}"
-        )
+        raise UsageError(Notice("folder-gone", self.path))
 
     def require_complete(self, names: Iterable[str]) -> None:
         """Raise ``UsageError`` if these files, or others that the command wrote, are no longer there."""
@@ -286,8 +279,7 @@ def _locked(lock: Path) -> int:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(handle)
-            message = f"another run is writing to the output folder {lock.parent}; choose another one"
-            raise UsageError(message) from None
+            raise UsageError(Notice("folder-in-use", lock.parent)) from None
         # A command that was refused removes the file that it created.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), lock.stat()):
@@ -302,10 +294,9 @@ def claim_folder(
     path: Path, *, overwrite: bool | None = False, names: Sequence[str | Path] = (),
     check: Callable[[OutputFolder], object] = lambda _: None,
 ) -> Iterator[OutputFolder]:  # fmt: skip
-    """Lock an output folder for the block, in which :func:`write_atomically` obeys the rule.
+    """Lock an output folder, unless ``check`` refuses it, for the block; the command writes ``names`` there.
 
-    ``names``: files that the command writes; ``overwrite``: None if the command has no such option; ``check``
-    may refuse the folder.
+    ``overwrite``: None if the command has no such option.
     """
     outputs = OutputFolder(path, overwrite=overwrite)
 
