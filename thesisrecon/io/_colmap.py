@@ -49,6 +49,7 @@ _RADIAL = {
 }  # fmt: skip
 """Places of k1, k2, k3 among the parameters; the further ones must be zero."""
 _Row = TypeVar("_Row")
+_Point = tuple[int, tuple[float, float, float], bytes]  # number, position and colour
 
 
 class _Camera(NamedTuple):
@@ -66,12 +67,6 @@ class _Image(NamedTuple):
     point: I64
 
 
-class _Point(NamedTuple):
-    number: int
-    xyz: Sequence[float]
-    rgb: bytes
-
-
 def is_colmap_model(folder: Path) -> bool:
     """Return whether a folder holds cameras, images and points3D, all ``.bin`` or all ``.txt``."""
     return any(all((folder / (name + kind)).is_file() for name in _FILES) for kind in (".bin", ".txt"))
@@ -87,12 +82,11 @@ def read_colmap_model(folder: Path) -> SparseModel:
     files = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in _FILES]
     cameras, images, points = (_parsed(*given) for given in zip(files, parsers, strict=True))
     known = {camera.number: camera for camera in cameras}
-    ids = np.array([point.number for point in points], np.int64)
-    view, point, xy = _observations(images, ids)
-    X = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    view, point, xy = _observations(images, np.array([number for number, *_ in points], np.int64))
+    X = np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3)
     if not (np.isfinite(X).all() and np.isfinite(xy).all()):
         raise UsageError(f"the COLMAP model in {folder} has coordinates that are not finite; export it again")
-    colors = np.frombuffer(b"".join(point.rgb for point in points), np.uint8).reshape(-1, 3)
+    colors = np.frombuffer(b"".join(rgb for *_, rgb in points), np.uint8).reshape(-1, 3)
     views = [_view(image, known) for image in images]
     return SparseModel(views, X, colors, view, point, xy, as_stored=True)
 
@@ -153,7 +147,7 @@ def _binary_image(data: bytes, at: int) -> tuple[_Image, int]:
 
 def _binary_point(data: bytes, at: int) -> tuple[_Point, int]:
     number, x, y, z, rgb, _, length = struct.unpack_from("<q3d3sdQ", data, at)
-    return _Point(number, (x, y, z), rgb), at + 51 + 8 * length
+    return (number, (x, y, z), rgb), at + 51 + 8 * length
 
 
 def _lines(data: bytes) -> Iterator[str]:
@@ -184,7 +178,7 @@ def _text_points(data: bytes) -> Iterator[_Point]:
     for words in filter(None, map(str.split, _lines(data))):
         x, y, z = (float(word) for word in words[1:4])
         r, g, b = (int(word) for word in words[4:7])
-        yield _Point(int(np.int64(words[0])), (x, y, z), bytes([r, g, b]))
+        yield int(np.int64(words[0])), (x, y, z), bytes([r, g, b])
 
 
 def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64, I64, distinct_corners
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, require_mesh
@@ -193,14 +193,3 @@ def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
     of_vertex = np.full(len(vertices), -1, dtype=np.int64)
     of_vertex[used] = rank[number.ravel()]
     return vertices[used[first[order]]], of_vertex[faces]
-
-
-def distinct_corners(vertex: I64, uv: F64 | I64) -> tuple[I64, I64]:
-    """First corner of each distinct pair of vertex (K,) and texel (K, 2), and number (K,) of each pair."""
-    # Three sorted columns are faster than np.unique of rows.
-    order = np.lexsort((uv[:, 1], uv[:, 0], vertex))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (np.diff(vertex[order]) != 0) | (np.diff(uv[order], axis=0) != 0.0).any(axis=1)
-    number = np.empty(len(order), dtype=np.int64)
-    number[order] = np.cumsum(new) - 1
-    return order[new], number

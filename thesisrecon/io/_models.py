@@ -69,8 +69,8 @@ def _read_folder(folder: Path) -> SparseModel:
         place = np.array([index.get(name, -1) for name in found.names], np.int64)[found.view_index]
         kept = place >= 0
         point, xy = found.point_index[kept], found.xy[kept]
-        seen = {"view_index": place[kept], "point_index": point, "xy": xy}
-        return replace(model, X=found.X, colors=found.colors, **seen)
+        points = replace(model, X=found.X, colors=found.colors)
+        return replace(points, view_index=place[kept], point_index=point, xy=xy)
     if colmap is None:
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
     # The sparse/0 of a run has the pixels of the run.

@@ -145,13 +145,13 @@ class OutputFolder:
         same = there and has_content(path, [digest])
         if there and not same:
             self.require_own(path)
-        self._note(name, digest)
-        self._used = True
+        self.note(name, digest)
         if not there:
             self._created.append(path)
         return not same
 
-    def _note(self, name: str, digest: str) -> None:
+    def note(self, name: str, digest: str) -> None:
+        """Record the digest of a file that is written; an empty one for a folder."""
         new = digest not in self.digests.setdefault(name, set())
         if new and self._record >= 0:
             before = os.fstat(self._record)
@@ -164,6 +164,7 @@ class OutputFolder:
             os.utime(self._record, ns=(before.st_atime_ns, before.st_mtime_ns))
         self.digests[name].add(digest)
         self.written[name] = digest
+        self._used = True
 
     def make_parents(self, path: Path) -> None:
         """Create the folders of a file below this one, which is never created again."""
@@ -204,12 +205,20 @@ class OutputFolder:
         if (gone := next((path for path in files if not os.path.lexists(path)), None)) is not None:
             raise UsageError(f"{gone} was removed while the command was writing to {self.path}; repeat it")
 
-    def open(self) -> Callable[[], None]:
-        """Create and lock the folder; returns the function that ends it, without a trace if it is unused."""
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Create and lock the folder for a block; without a trace if it is not used."""
         missing = [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
         lock, new = self.path / LOCK_FILE, not os.path.lexists(self.path / LOCK_FILE)
-
-        def close() -> None:
+        try:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                self._record = _locked(lock)
+            except OSError as error:
+                raise OutputError(f"the output folder {self.path}", error) from None
+            yield
+        finally:
             with suppress(OSError):
                 if new and self._record >= 0 and not self._used:
                     lock.unlink()
@@ -218,18 +227,6 @@ class OutputFolder:
             for handle in (self._record, self._folder):
                 if handle >= 0:
                     os.close(handle)
-
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            self._record = _locked(lock)
-        except OSError as error:
-            close()
-            raise OutputError(f"the output folder {self.path}", error) from None
-        except UsageError:
-            close()
-            raise
-        return close
 
     def read_record(self) -> None:
         """Add the files that the record lists."""
@@ -249,16 +246,6 @@ class OutputFolder:
             with suppress(ValueError):
                 name, digest = json.loads(line)
                 self.digests.setdefault(name, set()).add(digest)
-
-    def clear(self, folder: Path) -> None:
-        """Remove a folder that is empty or was cleared before: its whole content belongs to the commands."""
-        name = self.name_of(folder)
-        there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
-        if folder.is_symlink() or (there and name not in self.digests):
-            raise not_ours(folder, optional=False)
-        self._note(name, "")
-        self._used = True
-        shutil.rmtree(folder, ignore_errors=True)
 
     def withdraw(self) -> None:
         """Remove the files that this command created."""
@@ -311,8 +298,7 @@ def claim_folder(
     # A refused command creates nothing; a folder in use is locked before it is judged.
     if not os.path.lexists(path / LOCK_FILE):
         judge()
-    close = outputs.open()
-    try:
+    with outputs.opened():
         judge()
         _claims.append(outputs)
         try:
@@ -324,8 +310,6 @@ def claim_folder(
             raise
         finally:
             _claims.remove(outputs)
-    finally:
-        close()
 
 
 @contextmanager
@@ -338,9 +322,14 @@ def join_claim(path: Path) -> Iterator[OutputFolder]:
 
 
 def clear_folder(folder: Path) -> None:
-    """Remove a folder of an earlier command (:meth:`OutputFolder.clear`)."""
+    """Remove a folder that is empty or was cleared before: its whole content belongs to the commands."""
     with join_claim(folder.parent) as outputs:
-        outputs.clear(folder)
+        name = outputs.name_of(folder)
+        there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
+        if folder.is_symlink() or (there and name not in outputs.digests):
+            raise not_ours(folder, optional=False)
+        outputs.note(name, "")
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

@@ -435,8 +435,8 @@ def report_matches(
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
     warnings = list[str]()
     if 2 * len(undetermined) > len(accepted):
-        kinds = Counter(pair.configuration for pair in undetermined)
-        listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+        found = Counter(pair.configuration for pair in undetermined)
+        listed = ", ".join(f"{count} {kind}" for kind, count in sorted(found.items()))
         of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
         warnings.append(Notice("degenerate-pairs", of_all, listed))
     run.finish("matches", counts=counts, metrics=metrics, warnings=warnings)

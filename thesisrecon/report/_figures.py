@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, distinct_corners
 from thesisrecon.camera import decompose_camera, finite_cameras
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.io._meshes import distinct_corners
 from thesisrecon.records import Reconstruction, TexturedMesh, TwoView
 from thesisrecon.report._data import pictured
 from thesisrecon.report._drawing import embed_jpeg
@@ -122,7 +121,7 @@ def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
     if len(kept) == 0:
         return kept
     distance = np.linalg.norm(X[kept, :3] - np.median(X[kept, :3], axis=0), axis=1)
-    near = kept[distance <= 4.0 * np.quantile(distance, 0.8)]
+    near: I64 = kept[distance <= 4.0 * np.quantile(distance, 0.8)]
     return near[:: max(1, -(-len(near) // max_points))]
 
 
