@@ -14,7 +14,7 @@ from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.matching._seeds import _scan_correlations as scan_correlations
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline.matching import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.rectification import PlanarRectification, hartley, rectify

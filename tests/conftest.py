@@ -9,7 +9,7 @@ import sys
 import pytest
 from hypothesis import settings
 
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.errors import STRICT_VARIABLE, made
 from thesisrecon.runtime._run_folder import bytes_from_record
 from validation.scenes.real import data_root

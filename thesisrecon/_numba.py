@@ -1,8 +1,7 @@
 """Compiled functions (kernels), the threads that run them, and digests of code.
 
-numba's own disk cache looks at one file only: after an edit of a function that a kernel of another module
-calls, the old machine code would run. Here the key is a digest of the kernel's code, its constants and
-options, and the same of everything that it refers to. Results of stages are stored under such digests, too.
+numba's own disk cache looks at one file only: after an edit of a called function the old code would run. Here
+the key is a digest of all code and constants that a kernel refers to, as for the results of stages.
 """
 
 # numba's own modules have no types.
@@ -257,12 +256,10 @@ _PLAIN = {int, float, str, bytes, bool, type(None)}
 
 
 def code_digest(*values: Any) -> str:
-    """SHA-256 digest of functions, classes or objects and of all code that they refer to.
+    """SHA-256 digest of functions, classes or objects and of all code that they refer to, not of comments.
 
-    Constants, defaults, closures, base classes, methods, fields and imports inside functions are followed.
-    Of an installed library only the name is hashed, unless a value belongs to it. Comments, docstrings and
-    line numbers have no effect. Objects are hashed by their pickled state; an object that cannot be pickled
-    (of a C++ library, for example) gives a new digest each time, so stored results are never used for it.
+    Of an installed library only the name is hashed, unless a value belongs to it. An object that cannot be
+    pickled gives a new digest each time, so that stored results are never used for it.
     """
     walk = _Walk({"thesisrecon", *(_package_of(value) for value in values)} - _BY_NAME)
     walk.follow(values)

@@ -11,21 +11,6 @@ from os import PathLike, environ, fspath
 from pathlib import Path
 from typing import Any, TypeVar
 
-REMEDIES = {
-    errno.ENOSPC: "free space there",
-    errno.EDQUOT: "free space there, or increase the quota",
-    errno.EFBIG: "allow larger files (ulimit -f), or choose a place that takes them",
-    errno.EROFS: "make the place writable, or choose another one",
-    errno.EACCES: "make the place writable, or choose another one",
-    errno.EPERM: "make the place writable, or choose another one",
-    errno.EEXIST: "move the file that is in the place of a folder",
-    errno.ENOTDIR: "move the file that is in the place of a folder",
-    errno.EISDIR: "move the folder that is in the place of a file",
-    errno.ENAMETOOLONG: "choose a place with a shorter name",
-    errno.EIO: "check the disk, or choose another one",
-    errno.ENOENT: "check that the folder still exists",
-}
-"""Advice for a file that cannot be written."""
 WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors that only writing causes."""
 NOT_MADE = "output-not-made"
@@ -103,7 +88,13 @@ class Notice(str):
 def _texts() -> dict[str, str]:
     """Text of each code; "{}" stands for a value."""
     tables = tomllib.loads(Path(__file__).with_name("messages.toml").read_text(encoding="utf-8"))
-    return {code: text for table in tables.values() for code, (text, _) in table.items()}
+    entries = {code: entry for table in tables.values() for code, entry in table.items()}
+    return {code: entry if isinstance(entry, str) else entry[0] for code, entry in entries.items()}
+
+
+def remedies() -> dict[int, str]:
+    """Advice for a file that cannot be written by the number of the error."""
+    return {number: _texts()[name] for number, name in errno.errorcode.items() if name in _texts()}
 
 
 class StageFailure(Exception):
@@ -161,7 +152,7 @@ class OutputError(UsageError):
 
     def __init__(self, place: str | PathLike[str], error: OSError, kept: str | PathLike[str] = "") -> None:
         self.place, self.error, self.kept = place, error, kept
-        remedy = REMEDIES.get(error.errno or 0, "choose another place")
+        remedy = remedies().get(error.errno or 0, "choose another place")
         sentence = f"{fspath(place)} cannot be written: {error.strerror or error}; {remedy}"
         if fspath(kept):
             sentence += f", then repeat the command to resume from {fspath(kept)}"

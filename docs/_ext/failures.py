@@ -16,6 +16,10 @@ from _ext.code import PACKAGE, summary, tree_of, write
 
 TABLES = tomllib.loads((PACKAGE / "messages.toml").read_text(encoding="utf-8"))
 """Heading -> code -> text and remedy."""
+CALLS: dict[str, str] = TABLES.pop("Wrong calls")
+"""Code -> text, which contains the remedy."""
+PLACES: dict[str, str] = TABLES.pop("Places that cannot be written")
+"""Name of the error -> remedy."""
 EXPLAINED = "Failures of several stages"
 FOLDERS = (
     "api", "pipeline", "io", "matching", "epipolar", "geometry", "optimize", "projective", "selfcalibration",
@@ -77,6 +81,9 @@ def page() -> str:
     for folder, rows in sorted(stage_failures().items(), key=lambda found: FOLDERS.index(found[0])):
         title = summary(PACKAGE / folder / "__init__.py").rstrip(".") if folder else "Functions of arrays"
         lines += table(title, ("reason", "evidence", "what to do"), rows)
+    calls = [(f"`{code}`", re.sub("{[^}]*}", "…", text)) for code, text in CALLS.items()]
+    lines += table("Wrong calls", ("code", "message"), calls)
+    lines += table("Places that cannot be written", ("error", "what to do"), PLACES.items())
     return "\n".join(lines)
 
 

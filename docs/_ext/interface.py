@@ -15,7 +15,7 @@ from numpydoc.docscrape import NumpyDocString
 
 from _ext.code import write
 from thesisrecon import config
-from thesisrecon.cli.main import app as command_line
+from thesisrecon.cli.commands import app as command_line
 from thesisrecon.config import text
 
 

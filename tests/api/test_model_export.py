@@ -14,7 +14,7 @@ from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.api import export as export_module
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import SparseModel, SparseView
 

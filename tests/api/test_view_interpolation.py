@@ -13,7 +13,7 @@ from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.api import views as between
 from thesisrecon.cli import view_files as sequences
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -38,7 +38,7 @@ def known_map(d):
 
 
 def interpolated_sequence(images, frames):
-    return sequences.interpolated_sequence(images, frames, config=PipelineConfig(), seed=0)
+    return sequences.interpolated_sequence(images, frames, config=PipelineConfig(), seed=0, threads=1)
 
 
 def photograph(seed, size=(40, 30)):
@@ -162,13 +162,13 @@ def even(name, level):
 def test_a_film_of_two_goes_from_one_to_the_other(still):
     film = interpolated_sequence([even("a", 100), even("b", 200)], 5)
     assert film.captions[1] == "75 % a, 25 % b"
-    assert film.frame_metadata[4] == {"weights": [0.0, 1.0]}
-    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    assert film.entries[4] == {"weights": [0.0, 1.0]}
+    levels = [float(film.draw(k).mean()) for k in range(5)]
     assert levels[0] == 100.0
     assert levels[4] == 200.0
     # Exposures are mixed by their ratio, in which neither photograph is the darker one's.
     assert levels == sorted(levels)
-    assert film.metadata["violating_monotonicity"] == [0.0]
+    assert film.facts["violating_monotonicity"] == [0.0]
     assert "0.0 % of these violate monotonicity" in film.notes[0]
     assert still == [("a", "b")]
     assert interpolated_sequence([even("a", 100), even("b", 200)], 1).captions == ["50 % a, 50 % b"]
@@ -176,11 +176,11 @@ def test_a_film_of_two_goes_from_one_to_the_other(still):
 
 def test_a_film_of_three_crosses_the_triangle(still):
     film = interpolated_sequence([even("a", 100), even("b", 200), even("c", 50)], 5)
-    assert [place["weights"] for place in film.frame_metadata] == [
+    assert [place["weights"] for place in film.entries] == [
         [1.0, 0.0, 0.0], [0.75, 0.25, 0.0], [0.5, 0.5, 0.0], [0.25, 0.25, 0.5], [0.0, 0.0, 1.0],
     ]  # fmt: skip
     assert still == [("a", "b"), ("the interpolated view", "c")]
-    levels = [float(film.draw(k, 1).mean()) for k in range(5)]
+    levels = [float(film.draw(k).mean()) for k in range(5)]
     assert levels[0] == 100.0
     assert levels[4] == 50.0
     assert levels[1] < levels[2] > levels[3] > levels[4]

@@ -88,7 +88,7 @@ def test_cameras_in_one_place_and_one_image_twice_are_refused(found):
     refuses(StageFailure, words, match_images, *halves, config=SMALL)
     first, second = found.images
     for images, words in (((first, second, first), "2 images; got 3"), ((first, first), "the same image")):
-        refuses(UsageError, words, trilinear_sequence, images, 5, config=SMALL, seed=0)
+        refuses(UsageError, words, trilinear_sequence, images, 5, config=SMALL, seed=0, threads=1)
 
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):

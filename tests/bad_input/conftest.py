@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from tests.bad_input import files
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from validation.command import main as run_validation
 
 GROWTH_MB = 600

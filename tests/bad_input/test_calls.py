@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from tests.synthetic import texture
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 SMALL = ["--max-size", "320", "--threads", "2", "--until", "metric"]

@@ -19,7 +19,7 @@ from tests.io.test_meshes import roof
 from tests.runtime.test_run_folder import some_metric
 from thesisrecon.api.export import write_mesh
 from thesisrecon.api.models import read_cameras
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.text import config_from_tables, config_from_toml, toml_from_config
 from thesisrecon.errors import UsageError

@@ -17,7 +17,7 @@ from tests.bad_input import files
 from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import load, reconstruct
 from thesisrecon.cli import view_files
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.cli.view_files import ViewSequence
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _frames
@@ -110,7 +110,7 @@ def patched():
 
     def sequence(images, frames, **_):
         views = [np.full((8, 8, 3), 40 * k, np.uint8) for k in range(frames)]
-        return ViewSequence(["x"] * frames, lambda k, _: views[k], [], {}, [{} for _ in views])
+        return ViewSequence(lambda k: views[k], {"images": ["x"]}, [{} for _ in views], ["x"] * frames)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_frames, "_decoded", decoded)

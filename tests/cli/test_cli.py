@@ -18,7 +18,7 @@ import thesisrecon
 from tests.conftest import refuses
 from tests.pipeline.fake_stages import kept_bytes, read
 from thesisrecon.cli import common
-from thesisrecon.cli.main import app, run_command
+from thesisrecon.cli.commands import app, run_command
 from thesisrecon.io import _images
 
 ROOT = Path(__file__).parents[2]

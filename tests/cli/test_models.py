@@ -11,7 +11,7 @@ from tests.api.test_alignment import make_model, true_positions
 from tests.io.test_colmap import export as write_colmap
 from tests.io.test_colmap import scene
 from thesisrecon import compare_models, export
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.io._models import read_model
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "cameras.json"

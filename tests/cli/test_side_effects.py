@@ -35,7 +35,7 @@ def log_event(event, given):
     elif event in PROGRAMS and given[0] != sys.executable:  # kernels are compiled in processes of Python
         write("program", f"{event} {given[0]}")
 sys.addaudithook(log_event)
-from thesisrecon.cli.main import main
+from thesisrecon.cli.commands import main
 sys.argv[0] = "thesisrecon"
 main()
 """

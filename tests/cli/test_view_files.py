@@ -12,7 +12,7 @@ import pytest
 from tests.surface.sphere import SHAPE, photograph, ring_of
 from thesisrecon.api.export import write_mesh
 from thesisrecon.camera import Camera
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.io._exports import cameras_table
 from thesisrecon.io._files import write_json
 from thesisrecon.records import TexturedMesh

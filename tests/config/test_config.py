@@ -137,6 +137,7 @@ def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table():
         ("featurs.kind=harris-corners", "did you mean features"),
         ("features.kind=haris-corners", "did you mean harris-corners"),
         ("images.max_size=900", "did you mean images.max_size_px"),
+        ("metric.huber_px=1", "delete it if an earlier version wrote it"),
         ("images.max_size_px=large", "takes a whole number"),
         ("images.max_size_px=900.5", "takes a whole number"),
         ("images.max_size_px=true", "takes a whole number"), ("images.max_size_px=3", "at least 64"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from thesisrecon.errors import REMEDIES, WRITE_ERRNOS, OutputError, UsageError
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, UsageError, remedies
 from thesisrecon.io import _files as files
 from validation.studies.robustness import disk_ends
 
@@ -26,7 +26,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, number):
     with disk_ends(1, number), pytest.raises(OutputError) as refused:
         files.write_json(path, {"a": 2})
     assert entries(tmp_path) == before
-    assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {REMEDIES[number]}"
+    assert str(refused.value) == f"{path} cannot be written: {os.strerror(number)}; {remedies()[number]}"
     assert isinstance(refused.value, UsageError)
 
 
@@ -46,7 +46,7 @@ def test_the_sentence_survives_the_way_from_a_worker():
     again = pickle.loads(pickle.dumps(refused))
     assert str(again) == str(refused)
     assert str(refused).endswith("free space there, then repeat the command to resume from out")
-    assert set(WRITE_ERRNOS) <= set(REMEDIES)
+    assert set(WRITE_ERRNOS) <= set(remedies())
 
 
 def test_json_has_no_nan(tmp_path):

@@ -208,9 +208,9 @@ def test_a_damaged_text_model_is_refused(tmp_path, file, old, new, words):
 @pytest.mark.parametrize(
     ("camera", "sentence"),
     [
-        ("1 PINHOLE 0 96 100 100 64 48", "the sides must be 1 to"),
-        ("1 PINHOLE 128 -1 100 100 64 48", "the sides must be 1 to"),
-        ("1 PINHOLE 128 99999999999 100 100 64 48", "the sides must be 1 to"),
+        ("1 PINHOLE 0 96 100 100 64 48", "the sides must be whole numbers from 1 to"),
+        ("1 PINHOLE 128 -1 100 100 64 48", "the sides must be whole numbers from 1 to"),
+        ("1 PINHOLE 128 99999999999 100 100 64 48", "the sides must be whole numbers from 1 to"),
         ("1 PINHOLE 128 96 100 0 64 48", "positive focal lengths"),
         ("1 PINHOLE 128 96 100 -100 64 48", "positive focal lengths"),
         ("1 OPENCV_FISHEYE 128 96 100 -1 64 48 0 0 0 0", "positive focal lengths"),

@@ -13,7 +13,7 @@ from tests.conftest import refuses
 from tests.pipeline.fake_stages import FakeDense
 from tests.pipeline.given_scene import SIZE, given_scene
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.io._models import read_model
 from thesisrecon.pipeline import stages
 

@@ -12,7 +12,7 @@ from tests.pipeline.fake_stages import photographs
 from thesisrecon import Camera, PipelineConfig, reconstruct, render
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure, UsageError
-from thesisrecon.pipeline.image_pair import MASK_REACH
+from thesisrecon.pipeline.matching import MASK_REACH
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 FOCAL_PX = 908.6 * 480 / 1024

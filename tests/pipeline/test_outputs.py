@@ -12,7 +12,7 @@ from tests.conftest import before_each_output, failing, refuses
 from tests.pipeline.fake_stages import fake_config, photographs, read
 from thesisrecon import errors
 from thesisrecon.api.reconstruct import reconstruct
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.errors import NOT_MADE, OutputError, made
 from thesisrecon.surface.model import SurfaceModel
 from validation.studies.robustness import disk_ends

@@ -26,8 +26,8 @@ from thesisrecon.pipeline.large_sets import (
     overlapping_parts,
     reconstruct_part,
 )
-from thesisrecon.pipeline.left_over import cameras_on_tracks, pairs_of_missing
 from thesisrecon.pipeline.run import _StageLog, start_run
+from thesisrecon.pipeline.stages import cameras_on_tracks, pairs_of_missing
 from thesisrecon.records import MetricResult
 
 VIEWS, PART = 72, 45

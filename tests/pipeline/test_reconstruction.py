@@ -23,8 +23,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import SequenceWindow
 from thesisrecon.pipeline import algorithm1, matching, outputs, stages
-from thesisrecon.pipeline.job import name_images
-from thesisrecon.pipeline.run import stream
+from thesisrecon.pipeline.run import name_images, stream
 from thesisrecon.records import Image
 from thesisrecon.surface import fusion
 from thesisrecon.surface.fusion import VolumetricFusion

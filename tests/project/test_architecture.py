@@ -103,7 +103,7 @@ def test_imports_load_only_what_they_need():
     cases = [
         ("import thesisrecon; thesisrecon.__version__", HEAVY),
         (
-            "from thesisrecon.cli.main import run_command as run; run(['--version']); run(['--help'])",
+            "from thesisrecon.cli.commands import run_command as run; run(['--version']); run(['--help'])",
             HEAVY - {"typer", "rich"},
         ),
         ("import thesisrecon; thesisrecon.reconstruct; thesisrecon.match_pair", LATE),

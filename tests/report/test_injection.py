@@ -9,7 +9,7 @@ import PIL.Image
 import pytest
 
 from tests.report.synthetic import Structure, Witness, unpacked
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.report._page import strip_page
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"

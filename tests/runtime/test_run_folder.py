@@ -15,7 +15,7 @@ from tests.conftest import refuses
 from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import records
 from thesisrecon.api.reconstruct import reconstruct
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically, write_json
 from thesisrecon.io._outputs import LOCK_FILE

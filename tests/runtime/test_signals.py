@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 from thesisrecon.runtime._signals import CODES
 from validation.studies.robustness import different, outputs, stopped
 

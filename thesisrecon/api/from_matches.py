@@ -29,8 +29,7 @@ from thesisrecon.pipeline.inputs import (
     outside_masks,
     views_of,
 )
-from thesisrecon.pipeline.job import Job
-from thesisrecon.pipeline.run import Progress, RunOptions, start_run
+from thesisrecon.pipeline.run import Job, Progress, RunOptions, start_run
 from thesisrecon.records import Tracks
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run_folder import key_of

@@ -33,7 +33,7 @@ from thesisrecon.errors import Notice, StageFailure, require_word
 from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.two_view import lines_of_points
 from thesisrecon.io._images import eight_bit_images, read_image, read_pixels
-from thesisrecon.pipeline.image_pair import ImageInput, match_images
+from thesisrecon.pipeline.matching import ImageInput, match_images
 from thesisrecon.records import Image, TwoView
 
 

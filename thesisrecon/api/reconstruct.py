@@ -27,9 +27,8 @@ from thesisrecon.io._images import (
 )
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
-from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.matching import FromImages
-from thesisrecon.pipeline.run import Progress, Run, RunOptions, start_run
+from thesisrecon.pipeline.run import Job, Progress, Run, RunOptions, start_run
 from thesisrecon.results import RunResult
 
 

@@ -24,7 +24,7 @@ from thesisrecon.io._images import (
     read_levels,
     rotation_words,
 )
-from thesisrecon.pipeline.image_pair import ImageInput
+from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.records import (
     DepthMap,
     DisparityMap,

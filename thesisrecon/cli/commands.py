@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import os
 import re
+import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
+from thesisrecon import __version__
 from thesisrecon.cli.common import (
+    DEBUG_VARIABLE,
     MaxSize,
     OutputFolder,
     Overwrite,
     Seed,
     Threads,
     cap_threads,
+    exit_code_of,
     folder_argument,
     folder_option,
     interruptible,
     parse_folder,
     progress_bars,
 )
-from thesisrecon.errors import UsageError, counted, made
+from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._files import printable, read_json
 from thesisrecon.runtime._executors import available_threads
+from thesisrecon.runtime._signals import set_error_stream
 
 _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 """Small depth maps: the demo should show a model soon."""
@@ -76,13 +84,11 @@ def reconstruct(
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     if source is None:
         if images is None or images_folder is not None:
-            message = "give the folder of the images, or --from DATABASE|SPARSE with or without --images"
-            raise UsageError(message)
+            raise UsageError(Notice("no-source"))
         _run(images, out, seed, chosen | options | {"every": every})
         return
     if images is not None or chosen.pop("pairs") is not None or every is not None:
-        message = "with --from the images are given by --images, and images and pairs are those of the source"
-        raise UsageError(message)
+        raise UsageError(Notice("images-of-source"))
     _run(source, out, seed, chosen | options | {"images": images_folder}, matched=True)
 
 
@@ -151,15 +157,10 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     lines += [f"warning: {warning}" for warning in summary["warnings"]]
     if summary["failure"]:
         lines.append(f"failed: {summary['failure']}")
-    lines.append(f"{_duration(summary)}; report: {out / 'report.html'}")
-    return "\n".join(printable(line) for line in lines)
-
-
-def _duration(summary: Mapping[str, Any]) -> str:
-    """Time of this run and, if stages were cached, the computing time of all of them."""
     total = summary["seconds"]["total"]
-    elapsed = f"{summary.get('elapsed_seconds', total):.1f} s"
-    return f"{elapsed} ({total:.1f} s including cached stages)" if summary["resumed"] else elapsed
+    cached = f" ({total:.1f} s including cached stages)" if summary["resumed"] else ""
+    lines.append(f"{summary.get('elapsed_seconds', total):.1f} s{cached}; report: {out / 'report.html'}")
+    return "\n".join(printable(line) for line in lines)
 
 
 def _result(summary: Mapping[str, Any]) -> str:
@@ -187,23 +188,17 @@ def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
         if "focal_px" not in view:
             continue
         focal, x, y = (view[name] for name in ("focal_px", "principal_x_px", "principal_y_px"))
-        lines.setdefault(
-            (view["camera"], focal["value"]),
+        text = (
             f"camera {view['camera']}: focal length {focal['value']:.1f} ± {focal['std']:.1f} px "
             f"({focal['source']}), principal point ({x['value']:.1f} ± {x['std']:.1f}, "
-            f"{y['value']:.1f} ± {y['std']:.1f}) px" + _aspect_and_skew(view),
+            f"{y['value']:.1f} ± {y['std']:.1f}) px"
         )
+        for name, label, digits, unit in (("aspect", "aspect ratio", 5, ""), ("skew_px", "skew", 2, " px")):
+            # Only if it was estimated.
+            if (found := view.get(name)) is not None and found["std"] != 0.0:
+                text += f", {label} {found['value']:.{digits}f} ± {found['std']:.{digits}f}{unit}"
+        lines.setdefault((view["camera"], focal["value"]), text)
     return list(lines.values())
-
-
-def _aspect_and_skew(view: Mapping[str, Any]) -> str:
-    """Aspect ratio and skew, each only if it was estimated."""
-    text = ""
-    for name, label, digits, unit in (("aspect", "aspect ratio", 5, ""), ("skew_px", "skew", 2, " px")):
-        interval = view.get(name)
-        if interval is not None and interval["std"] != 0.0:
-            text += f", {label} {interval['value']:.{digits}f} ± {interval['std']:.{digits}f}{unit}"
-    return text
 
 
 _KINDS = "folder of a run, COLMAP model, cameras.json, or trajectory (TUM or KITTI)"
@@ -249,9 +244,11 @@ def compare(
     found = compare_models(a, b, **times)
     lines = [f"A: {a}", f"B: {b} (reference)", headline(found), *(f"note: {note}" for note in found.notes)]
     cameras, most = camera_table(found), 60
-    tables = [summary_table(found), point_table(found), cameras[: most + 1]]
-    for rows in filter(None, tables):
-        lines += ["", *_aligned(rows)]
+    for rows in filter(None, [summary_table(found), point_table(found), cameras[: most + 1]]):
+        # The first column flush left, the others flush right.
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        padded = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
+        lines += ["", *("  ".join(cells).rstrip() for cells in padded)]
     if len(cameras) > most + 1:
         lines.append(f"and {len(cameras) - 1 - most} more cameras; --json writes all")
     files = {} if json is None else {json: json_text({"a": str(a), "b": str(b), **found.as_table()})}
@@ -262,13 +259,6 @@ def compare(
     write_new(files, overwrite=overwrite, extra=page, warnings=warnings)
     lines += [f"warning: {warning}" for warning in warnings]
     typer.echo("\n".join(printable(line) for line in lines))
-
-
-def _aligned(rows: list[list[str]]) -> list[str]:
-    """The rows with columns of one width, the first one flush left and the others flush right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in rows)
-    return ["  ".join(cells).rstrip() for cells in padded]
 
 
 def export(
@@ -384,3 +374,56 @@ def interpolate(
     typer.echo(written)
     if (page := folder / STRIP).is_file():
         typer.echo(f"page: {printable(str(page))}")
+
+
+app = typer.Typer(
+    name="thesisrecon", help="From uncalibrated images to metric cameras, points and a textured model.",
+    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+)  # fmt: skip
+for _command in (reconstruct, demo, inspect, compare, render, interpolate, export):
+    app.command()(_command)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    if version:
+        typer.echo(f"thesisrecon {__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit
+
+
+def run_command(arguments: list[str]) -> int:
+    """Run one command line (without the program name); an error becomes one sentence on stderr."""
+    with warnings.catch_warnings():
+        # Unreadable images are reported by this program, in one sentence.
+        warnings.filterwarnings("ignore", module=r"PIL\.")
+        return exit_code_of(lambda: app(arguments, standalone_mode=False))
+
+
+def _silence_c_libraries() -> None:
+    """Discard messages of C libraries on stderr: libtiff prints a line for each damaged byte."""
+    try:
+        ours, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:
+        # stderr is closed.
+        return
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    set_error_stream(ours)
+    encoding = getattr(sys.stderr, "encoding", None)
+    sys.stderr = os.fdopen(ours, "w", buffering=1, encoding=encoding, errors="backslashreplace")
+
+
+def main() -> None:
+    """Run the command line of this process and exit with its code."""
+    # File names may hold characters that the terminal cannot encode.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+    if not os.environ.get(DEBUG_VARIABLE):
+        _silence_c_libraries()
+    sys.exit(run_command(sys.argv[1:]))

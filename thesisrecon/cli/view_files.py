@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -25,7 +25,7 @@ from thesisrecon.api.views import (
 from thesisrecon.arrays import U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
-from thesisrecon.errors import UsageError, counted, made
+from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._exports import frame_name, write_animation, write_image
 from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
 from thesisrecon.io._images import read_image
@@ -50,17 +50,18 @@ _MIDWAY = 0.5
 
 @dataclass(frozen=True)
 class ViewSequence:
-    """Views that ``draw`` computes from their number and the threads, with numbers for ``frames.json``."""
+    """Views that ``draw`` computes by number, and what ``frames.json`` says of all and of each frame."""
 
-    captions: list[str]
-    draw: Callable[[int, int], U8]
-    notes: list[str]
-    metadata: dict[str, Any]
-    frame_metadata: list[dict[str, Any]]
+    draw: Callable[[int], U8]
+    facts: dict[str, Any]
+    entries: Sequence[dict[str, Any]]
+    #: of the frames and of the whole on a page; without captions there is none
+    captions: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 def interpolated_sequence(
-    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int
+    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int, threads: int
 ) -> ViewSequence:
     """Interpolate from the first image to the second and, of three, across their triangle (section 1.2)."""
     require_comparable_images(images)
@@ -73,7 +74,7 @@ def interpolated_sequence(
         stops = [(0, u) if u <= _MIDWAY else (1, 2.0 * u - 1.0) for u in path]
         weights = [[1 - s, s, 0.0] if leg == 0 else [0.5 * (1 - s), 0.5 * (1 - s), s] for leg, s in stops]
 
-    def draw(k: int, threads: int) -> U8:
+    def draw(k: int) -> U8:
         leg, s = stops[k]
         return legs[leg].view(s, threads=threads)
 
@@ -81,18 +82,18 @@ def interpolated_sequence(
     # Shares of the known pixels of the first image.
     counts = [(detect_monotonicity_violations(d).sum(), np.isfinite(d).sum()) for d in maps]
     violations = [float(found / max(known, 1)) for found, known in counts]
-    metadata = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
+    facts = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
     captions = [", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights]
     notes = [
         f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
         "violate monotonicity, where near surfaces occlude far ones"
         for share, leg in zip(violations, legs, strict=True)
     ]
-    return ViewSequence(captions, draw, notes, metadata, [{"weights": w} for w in weights])
+    return ViewSequence(draw, facts, [{"weights": w} for w in weights], captions, notes)
 
 
 def trilinear_sequence(
-    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int
+    images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int, threads: int
 ) -> ViewSequence:
     """Compute views on the line through both cameras, from half a baseline before to half beyond."""
     if len(images) != 2:
@@ -105,27 +106,25 @@ def trilinear_sequence(
     pair, sizes = views.pair, (first.size, second.size)
     positions = np.linspace(-0.5, 1.5, frames).tolist() if frames > 1 else [_MIDWAY]
     path = [camera_at(pair, s, sizes=sizes) for s in positions]
-
-    def draw(k: int, threads: int) -> U8:
-        return views.render(path[k], threads=threads)
-
     names, motion = [first.name, second.name], {"R": pair.R, "t": pair.t}
-    metadata = {"images": names, "K": [pair.K1, pair.K2], "second_from_first": motion}
-    cameras = [{"R": camera.rotation, "t": camera.translation, "K": camera.K} for camera in path]
-    frame_metadata = [{"baselines": s, **camera} for s, camera in zip(positions, cameras, strict=True)]
+    facts = {"images": names, "K": [pair.K1, pair.K2], "second_from_first": motion}
+    entries = [
+        {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
+        for s, camera in zip(positions, path, strict=True)
+    ]
     note = (
         f"the focal lengths are assumed to be {pair.K1[0, 0]:.0f} and {pair.K2[0, 0]:.0f} px; lengths are in "
         "units of the distance between the two cameras"
     )
-    return ViewSequence([_caption(s, *names) for s in positions], draw, [note], metadata, frame_metadata)
-
-
-def _caption(s: float, first: str, second: str) -> str:
-    if s < 0.0:
-        return f"{-s:.2f} baselines before {first}"
-    if s > 1.0:
-        return f"{s - 1.0:.2f} baselines beyond {second}"
-    return f"{100.0 * s:.0f} % of the way from {first} to {second}"
+    captions = []
+    for s in positions:
+        if s < 0.0:
+            captions.append(f"{-s:.2f} baselines before {first.name}")
+        elif s > 1.0:
+            captions.append(f"{s - 1.0:.2f} baselines beyond {second.name}")
+        else:
+            captions.append(f"{100.0 * s:.0f} % of the way from {first.name} to {second.name}")
+    return ViewSequence(lambda k: views.render(path[k], threads=threads), facts, entries, captions, [note])
 
 
 METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
@@ -140,8 +139,12 @@ def render_run(
     """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
     with _claimed(folder, path, frames, overwrite=overwrite) as outputs:
-        width, height = size or cameras[0].scaled(min(1.0, 1000 / max(cameras[0].size))).size
-        views = _camera_path(mesh, cameras, path, frames, (width, height))
+        width, height = size = size or cameras[0].scaled(min(1.0, 1000 / max(cameras[0].size))).size
+        if path == "interpolate":
+            views = interpolate_cameras(cameras, frames, size=size)
+        else:
+            points = sample_surface(mesh)
+            views = orbit(cameras, points if len(points) else mesh.vertices, frames, size=size)
         shading = _shading(mesh, cameras, light)
 
         def draw(k: int) -> U8:
@@ -150,7 +153,7 @@ def render_run(
         facts = {"path": path, "light": light, "background": background, "width": width, "height": height}
         # The cameras as in cameras.json.
         entries = [{key: getattr(view, key) for key in ("K", "R", "t", "centre")} for view in views]
-        return _write_views(folder, path, outputs, draw, facts, entries, Workers(threads), progress)
+        return _write_views(outputs, path, ViewSequence(draw, facts, entries), Workers(threads), progress)
 
 
 def interpolate_images(
@@ -159,7 +162,14 @@ def interpolate_images(
     overwrite: bool = False,
 ) -> str:  # fmt: skip
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
-    _check_images(paths)
+    if len(paths) not in (2, 3):
+        raise UsageError(f"interpolate takes 2 or 3 images; got {len(paths)}")
+    for path in paths:
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder; interpolate takes image files")
+    for first, second in combinations(paths, 2):
+        if first.is_file() and second.is_file() and first.samefile(second):
+            raise UsageError(f"{first} is given twice; give different images")
     with _claimed(folder, method, frames, overwrite=overwrite) as outputs:
         config = PipelineConfig()
         if max_size_px is not None:
@@ -167,56 +177,44 @@ def interpolate_images(
         images = [read_image(path, max_size_px=config.images.max_size_px).images[0] for path in paths]
         report = progress or (lambda *_: None)
         report("correspondence", 0, 1)
-        sequence = METHODS[method](images, frames, config=config, seed=seed)
+        sequence = METHODS[method](images, frames, config=config, seed=seed, threads=threads)
         report("correspondence", 1, 1)
-        drawn: list[tuple[str, U8]] = []
-
-        def draw(k: int) -> U8:
-            drawn.append((sequence.captions[k], sequence.draw(k, threads)))
-            return drawn[-1][1]
-
-        def page() -> str:
-            title = "Between " + " and ".join(image.name for image in images)
-            return strip_page(title, drawn, notes=sequence.notes)
-
-        facts, entries = {"method": method, **sequence.metadata}, sequence.frame_metadata
+        sequence = replace(sequence, facts={"method": method, **sequence.facts})
         # The threads work on one view at a time.
-        return _write_views(
-            folder, method, outputs, draw, facts, entries, Workers(1), progress, milliseconds=100, page=page
-        )
+        return _write_views(outputs, method, sequence, Workers(1), progress)
 
 
-@contextmanager
-def _claimed(folder: Path, name: str, frames: int, *, overwrite: bool) -> Iterator[OutputFolder]:
+def _claimed(
+    folder: Path, name: str, frames: int, *, overwrite: bool
+) -> AbstractContextManager[OutputFolder]:
     """Claim a folder in which only these commands wrote: an image may be called frame-0001.png."""
 
     def check(outputs: OutputFolder) -> None:
         known = overwrite or any(map(_OWN.fullmatch, outputs.digests)) or not os.path.lexists(folder)
         strange = [] if known else sorted(path.name for path in folder.iterdir())
         if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
-            what = f"contains {foreign[0]!r}, which this command did not create"
-            raise UsageError(f"the folder {folder} {what}; choose an empty or a new folder")
+            raise UsageError(Notice("foreign-frames", folder, foreign[0]))
 
     names = [FRAMES, *map(frame_name, range(1, frames + 1)), f"{name}.webp", *[STRIP] * (name in METHODS)]
-    with claim_folder(folder, overwrite=overwrite, names=names, check=check) as outputs:
-        yield outputs
+    return claim_folder(folder, overwrite=overwrite, names=names, check=check)
 
 
 def _write_views(
-    folder: Path, name: str, outputs: OutputFolder, draw: Callable[[int], U8], facts: dict[str, Any],
-    entries: Sequence[dict[str, Any]], workers: Workers, progress: Progress | None, *, milliseconds: int = 40,
-    page: Callable[[], str] | None = None,
-) -> str:  # fmt: skip
-    """Write a frame for each entry, then animation, page and description; return a sentence."""
-    frames = [frame_name(k + 1) for k in range(len(entries))]
+    outputs: OutputFolder, name: str, views: ViewSequence, workers: Workers, progress: Progress | None
+) -> str:
+    """Write the frames, then animation, page and description; return a sentence."""
+    folder, frames = outputs.path, [frame_name(k + 1) for k in range(len(views.entries))]
     # Files of an earlier command, but for frames that this one replaces.
     outputs.remove([old for old in outputs.digests if _OWN.fullmatch(old) and old not in frames])
     sizes, warnings, report = set[Any](), list[str](), progress or (lambda *_: None)
     files, film, done = [folder / frame for frame in frames], folder / f"{name}.webp", 0
+    drawn: list[tuple[str, U8]] = []
 
     def write(k: int) -> None:
-        rgb = draw(k)
+        rgb = views.draw(k)
         sizes.add(rgb.shape[1::-1])
+        if views.captions:
+            drawn.append((views.captions[k], rgb))
         write_image(files[k], rgb)
 
     def finished(*_: Any) -> None:
@@ -226,29 +224,20 @@ def _write_views(
         report("views", done, len(frames) + 1)
 
     workers.run(write, [(k,) for k in range(len(frames))], finished)
-    animate = partial(write_animation, film, files, milliseconds=milliseconds)
+    animate = partial(write_animation, film, files, milliseconds=100 if views.captions else 40)
     animation = made(film.name, animate, warnings, None)
-    if page is not None:
-        made(STRIP, lambda: write_text(folder / STRIP, page()), warnings, None)
-    listed = [{"name": frame, **entry} for frame, entry in zip(frames, entries, strict=True)]
-    write_json(folder / FRAMES, facts | {"frames": listed} | ({"warnings": warnings} if warnings else {}))
+    if views.captions:
+        title = "Between " + " and ".join(views.facts["images"])
+        made(STRIP, lambda: write_text(folder / STRIP, strip_page(title, drawn, views.notes)), warnings, None)
+    listed = [{"name": frame, **entry} for frame, entry in zip(frames, views.entries, strict=True)]
+    content = views.facts | {"frames": listed} | ({"warnings": warnings} if warnings else {})
+    write_json(folder / FRAMES, content)
     finished()
     ((width, height),) = sizes
     text = f"{counted(len(frames), 'frame')} of {width} x {height} px"
     text += "" if animation is None else f" and {animation.name}"
     lines = [f"{text} written to {folder}", *(f"warning: {warning}" for warning in warnings)]
     return "\n".join(map(printable, lines))
-
-
-def _check_images(paths: Sequence[Path]) -> None:
-    if len(paths) not in (2, 3):
-        raise UsageError(f"interpolate takes 2 or 3 images; got {len(paths)}")
-    for path in paths:
-        if path.is_dir():
-            raise UsageError(f"{path} is a folder; interpolate takes image files")
-    for first, second in combinations(paths, 2):
-        if first.is_file() and second.is_file() and first.samefile(second):
-            raise UsageError(f"{first} is given twice; give different images")
 
 
 def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
@@ -259,20 +248,10 @@ def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
         warnings = summary.get("warnings", []) if isinstance(summary, dict) else []
         if failed := [str(w) for w in warnings if str(w).startswith("No surface model was built")]:
             raise UsageError(f"the run in {out} has cameras but no model: {failed[0]}")
-        command = f"thesisrecon reconstruct IMAGES -o {out}, without --until"
-        raise UsageError(f"the run in {out} has no model yet ({MODEL}); continue it with {command}")
+        raise UsageError(Notice("no-model-yet", out, MODEL))
     mesh = read_mesh(out / MODEL)
     # Views are rendered without lens distortion.
     return mesh, [replace(camera, distortion=None) for camera in read_cameras(out / CAMERAS).values()]
-
-
-def _camera_path(
-    mesh: TexturedMesh, cameras: list[Camera], path: str, frames: int, size: tuple[int, int]
-) -> list[Camera]:
-    if path == "interpolate":
-        return interpolate_cameras(cameras, frames, size=size)
-    points = sample_surface(mesh)
-    return orbit(cameras, points if len(points) else mesh.vertices, frames, size=size)
 
 
 def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[[Camera], Shading | None]:

@@ -12,7 +12,6 @@ import typing
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -330,7 +329,7 @@ class PipelineConfig:
     model: ModelBuilder = field(default_factory=SurfaceModel)
 
     def __post_init__(self) -> None:
-        for stage, kind in _stage_types().items():
+        for stage, kind in typing.get_type_hints(PipelineConfig).items():
             value = getattr(self, stage)
             if stage in KINDS:
                 object.__setattr__(self, stage, as_method(stage, value, kind))
@@ -339,11 +338,6 @@ class PipelineConfig:
         if isinstance(self.matching, FunctionMatcher) and self.tracks == AlignedTracks():
             logging.getLogger(__name__).info("matches of a function are not aligned: tracks=PlainTracks()")
             object.__setattr__(self, "tracks", PlainTracks())
-
-
-@cache
-def _stage_types() -> dict[str, type[Any]]:
-    return typing.get_type_hints(PipelineConfig)
 
 
 PRESETS: Mapping[str, PipelineConfig] = {

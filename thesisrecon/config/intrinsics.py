@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.arrays import F64, I64
-from thesisrecon.errors import UsageError
+from thesisrecon.errors import Notice, UsageError
 from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
 Mode = Literal["known", "constant", "free"]
@@ -111,8 +111,7 @@ class IntrinsicsOptions:
             if getattr(self, intrinsic) == "known" and value != type(self).__dataclass_fields__[name].default:
                 raise ValueError(f"{name} = {value} has no effect with {intrinsic} = known: leave one out")
         if self.focal_std_rel is not None and not focal_given:
-            idle = f"focal_std_rel = {self.focal_std_rel} has no effect without a focal length"
-            raise ValueError(f"{idle}: set focal_px, or exif = true")
+            raise ValueError(Notice("idle-focal-std", self.focal_std_rel))
 
 
 def _numbered(keys: Sequence[tuple[float, ...]], *, each: bool = False) -> I64:
@@ -139,11 +138,7 @@ def camera_numbers(
 def prior_from_options(
     options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
 ) -> IntrinsicsPrior:
-    """Return the prior of V views in pixels at working size.
-
-    ``exif_focal_px`` (V,) are in original pixels, NaN if missing, ``scales`` (V,) working over original size.
-    A given principal point far outside an image is a ``UsageError``.
-    """
+    """Return the prior of V views in pixels at working size; EXIF focals (V,) px or NaN, scales (V,)."""
     n = len(original_sizes)
     _check_sizes(options, original_sizes)
     group, own = _numbered(original_sizes, each=options.cameras == "per-image"), np.arange(n)
@@ -181,9 +176,7 @@ def _check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int,
     for width, height in dict.fromkeys(original_sizes):
         outside = max(-x, x - width, -y, y - height)
         if outside > max(width, height):
-            where = f"{outside:.0f} px outside an image of {width} x {height} px, more than its long side"
-            advice = "Give it in pixels of the original images"
-            raise UsageError(f"principal_point_px = ({x:g}, {y:g}) is {where}. {advice}")
+            raise UsageError(Notice("far-principal-point", x, y, outside, width, height))
 
 
 def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:

@@ -290,8 +290,7 @@ def _check_arguments(function: Callable[..., Any], fixed: Sequence[inspect.Param
         signature.bind(*[None] * (len(fixed) - len(by_name)), **by_name)
     except TypeError:
         wanted = ", ".join(p.name + "=..." * (p.kind is p.KEYWORD_ONLY) for p in fixed)
-        message = f"{what} must take the {len(fixed)} arguments ({wanted}); it takes {signature}"
-        raise UsageError(message) from None
+        raise UsageError(Notice("wrong-arguments", what, len(fixed), wanted, signature)) from None
 
 
 def text_of(value: Any) -> str:

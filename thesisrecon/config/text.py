@@ -21,7 +21,7 @@ import numpy as np
 from thesisrecon.config import KINDS, PRESETS, PipelineConfig, word_of
 from thesisrecon.config import preset as _preset
 from thesisrecon.config.plug_ins import NOT_IN_A_FILE, is_reference, load_reference, text_of
-from thesisrecon.errors import UsageError, in_words, unknown_word
+from thesisrecon.errors import Notice, UsageError, in_words, unknown_word
 from thesisrecon.io._files import read_pairs, read_text
 
 T = TypeVar("T")
@@ -39,11 +39,7 @@ def build_config(
     config: Config | None = None, *, preset: str | None = None, max_size: int | None = None,
     cameras: str | None = None, pairs: Pairs | None = None, settings: Settings = (),
 ) -> PipelineConfig:  # fmt: skip
-    """Build the configuration of a run from the options of the command and of :func:`reconstruct`.
-
-    The preset (the given one, else that of the file), the file, the options and the settings apply in this
-    order; an option and a setting of different values contradict each other.
-    """
+    """Build a configuration from the preset (given, or of the file), the file, the options, the settings."""
     options: dict[str, Table] = {
         "intrinsics": {} if cameras is None else {"cameras": cameras},
         "images": {} if max_size is None else {"max_size_px": max_size},
@@ -55,8 +51,7 @@ def build_config(
         given = over.get(stage, {})
         for key, value in options.get(stage, {}).items():
             if isinstance(given, Mapping) and given.get(key, value) != value:
-                both = f"{word} ({stage}.{key}={value}) and the setting {stage}.{key}={given[key]}"
-                raise UsageError(f"{both} contradict each other; give one of them")
+                raise UsageError(Notice("contradicting-setting", word, stage, key, value, given[key]))
     text, base = "", None
     if isinstance(config, PipelineConfig):
         base = config
@@ -68,8 +63,7 @@ def build_config(
         message = f"{unknown_word('preset', config, PRESETS)}; there is no TOML file of this name either"
         raise UsageError(message)
     elif config is not None:
-        takes = "config takes a PipelineConfig, the name of a preset or a TOML file"
-        raise UsageError(f"{takes}; got {in_words(config)}")
+        raise UsageError(Notice("no-configuration", in_words(config)))
     chosen = None if preset is None else _preset(preset)
     if base is not None and chosen not in (None, base):
         raise UsageError(f"preset={preset!r} and config contradict each other; give one of them")
@@ -99,8 +93,7 @@ def _pairs_table(value: Pairs) -> Table:
         except ValueError:
             raise UsageError(f"pairs=window:N takes a whole number of images; got {str(value)!r}") from None
     if not Path(value).is_file():
-        known = "all, overlap, window:N, or a file of pairs"
-        raise UsageError(f"pairs takes {known}; there is no file {str(value)!r}")
+        raise UsageError(Notice("no-pairs-file", str(value)))
     return {_KIND: "listed-pairs", "listed": read_pairs(Path(value))}
 
 
@@ -110,8 +103,7 @@ def config_from_toml(
 ) -> PipelineConfig:  # fmt: skip
     """Read a TOML configuration; a line ``preset = "thesis"`` selects the base, unless ``fixed_preset``.
 
-    ``changes`` are further tables, later ones override. All are merged before values are checked, so settings
-    that need each other may come from different tables.
+    ``changes`` are further tables, later ones override; settings that need each other may come from several.
     """
     try:
         tables = tomllib.loads(text)
@@ -130,15 +122,13 @@ def config_from_toml(
 
 def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
     """``over`` merged into ``under``; if the kind changes, the settings of the old kind are dropped."""
-    merged = dict(under)
+    kept = dict(under)
     for stage, table in over.items():
         old = under.get(stage)
-        if isinstance(old, Mapping) and isinstance(table, Mapping):
-            kind = old.get(_KIND, _kind_of(stage, getattr(base, stage))) if stage in KINDS else None
-            merged[stage] = table if table.get(_KIND, kind) != kind else _merged(old, table)
-        else:
-            merged[stage] = table
-    return merged
+        if stage in KINDS and isinstance(old, Mapping) and isinstance(table, Mapping):
+            kind = old.get(_KIND, _kind_of(stage, getattr(base, stage)))
+            kept[stage] = {} if table.get(_KIND, kind) != kind else old
+    return _merged(kept, over)
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,11 +181,7 @@ def _method_of_kind(stage: str, kind: Any) -> Any:
     if is_reference(kind):
         return load_reference(kind, f"{stage}.{_KIND}")
     if isinstance(kind, str) and kind.endswith(NOT_IN_A_FILE):
-        name = kind.removesuffix(NOT_IN_A_FILE)
-        raise UsageError(
-            f"{stage}: the function {name} was defined in a running program and cannot be loaded; put it in "
-            f"a file and set {stage}.kind=path/to/file.py:{name}, or pass it to reconstruct in Python"
-        )
+        raise UsageError(Notice("function-not-in-file", stage, kind.removesuffix(NOT_IN_A_FILE)))
     if not isinstance(kind, str) or kind not in KINDS[stage]:
         known = unknown_word(f"kind of {stage}", kind, KINDS[stage])
         raise UsageError(f"{known}; code in a file is path/to/file.py:name")
@@ -211,9 +197,9 @@ def tables_from_settings(settings: Settings) -> Table:
     for place, value in items:
         path = place.strip().split(".") if isinstance(place, str) else []
         if not 2 <= len(path) <= 16 or not all(path):
-            example = "for example features.kind=harris-corners"
-            option = "set" if isinstance(settings, Mapping) else "--set"
-            raise UsageError(f"{option} takes stage.field=value, {example}; got {in_words(place)}")
+            raise UsageError(
+                Notice("no-setting", "set" if isinstance(settings, Mapping) else "--set", in_words(place))
+            )
         for key in reversed(path):
             value = {key: value}
         tables = _merged(tables, value)
@@ -322,7 +308,8 @@ def _unknown_setting(where: str, key: str, names: Sequence[str]) -> UsageError:
     near = difflib.get_close_matches(key, names, n=3, cutoff=0.6)
     known = " or ".join(f"{where}.{name}" for name in near)
     hint = f"did you mean {known}?" if near else f"{where} has {', '.join(names) or 'no settings'}"
-    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint}")
+    old = "delete it if an earlier version wrote it"
+    return UsageError(f"unknown setting {in_words(f'{where}.{key}')}; {hint} ({old})")
 
 
 def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any:
@@ -340,7 +327,11 @@ def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any
             return value
         raise UsageError(unknown_word(f"value of {where}", value, [str(a) for a in arguments]))
     if origin is tuple and isinstance(value, list | tuple):
-        return _coerce_tuple(value, arguments, where)
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            arguments = (arguments[0],) * len(value)
+        if len(value) != len(arguments):
+            raise UsageError(f"{where} takes a list of {len(arguments)} values; got {len(value)}")
+        return tuple(_coerce(v, arguments[n], f"{where}[{n}]") for n, v in enumerate(value))
     if dataclasses.is_dataclass(annotation) and isinstance(annotation, type) and isinstance(value, Mapping):
         return dataclass_from_table(annotation, value, where, current)
     whole = type(value) is int and abs(value) < 2**63
@@ -348,36 +339,22 @@ def _coerce(value: Any, annotation: Any, where: str, current: Any = None) -> Any
         return float(value)
     if type(value) is annotation and (annotation in (str, bool) or whole):
         return value
-    raise UsageError(f"{where} takes {_type_words(annotation)}; got {in_words(value)}")
+    words = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    needed = words.get(annotation, "a list" if origin is tuple else "a table of settings")
+    raise UsageError(f"{where} takes {needed}; got {in_words(value)}")
 
 
 def _coerce_alternative(value: Any, several: Mapping[str, type[Any]], where: str, current: Any) -> Any:
     """One of several dataclasses from its word, or from a table with ``kind`` (default: unchanged)."""
     table = {_KIND: value} if isinstance(value, str) else value
     if not isinstance(table, Mapping):
-        one_of = f"one of {', '.join(several)} or a table of settings"
-        raise UsageError(f"{where} takes {one_of}; got {in_words(value)}")
+        raise UsageError(Notice("no-alternative", where, ", ".join(several), in_words(value)))
     kind = table.get(_KIND, word_of(type(current)))
     if not isinstance(kind, str) or kind not in several:
         raise UsageError(unknown_word(f"kind of {where}", kind, several))
     fields = {key: v for key, v in table.items() if key != _KIND}
     base = current if type(current) is several[kind] else None
     return dataclass_from_table(several[kind], fields, where, base)
-
-
-def _coerce_tuple(value: Sequence[Any], arguments: tuple[Any, ...], where: str) -> tuple[Any, ...]:
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        arguments = (arguments[0],) * len(value)
-    if len(value) != len(arguments):
-        raise UsageError(f"{where} takes a list of {len(arguments)} values; got {len(value)}")
-    return tuple(_coerce(v, arguments[n], f"{where}[{n}]") for n, v in enumerate(value))
-
-
-def _type_words(annotation: Any) -> str:
-    words = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    if annotation in words:
-        return words[annotation]
-    return "a list" if typing.get_origin(annotation) is tuple else "a table of settings"
 
 
 def toml_from_config(config: PipelineConfig) -> str:

@@ -25,7 +25,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64, U8, resizing_transform, rows_of_views
 from thesisrecon.camera import project_camera
-from thesisrecon.errors import UsageError, in_words
+from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._files import first_repeated, read_bytes, require_image_name, write_atomically
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import SparseModel, SparseView
@@ -49,6 +49,7 @@ _RADIAL = {
 }  # fmt: skip
 """Places of k1, k2, k3 among the parameters; the further ones must be zero."""
 _Row = TypeVar("_Row")
+_Point = tuple[int, tuple[float, float, float], bytes]  # number, position and colour
 
 
 class _Camera(NamedTuple):
@@ -66,23 +67,13 @@ class _Image(NamedTuple):
     point: I64
 
 
-class _Point(NamedTuple):
-    number: int
-    xyz: Sequence[float]
-    rgb: bytes
-
-
 def is_colmap_model(folder: Path) -> bool:
     """Return whether a folder holds cameras, images and points3D, all ``.bin`` or all ``.txt``."""
     return any(all((folder / (name + kind)).is_file() for name in _FILES) for kind in (".bin", ".txt"))
 
 
 def read_colmap_model(folder: Path) -> SparseModel:
-    """Read a COLMAP model, binary rather than text; UsageError if it is damaged.
-
-    The poses are those of the images; rigs and frames are not read. Of two observations of a point in an
-    image the first is kept. Views have no K if their camera has no focal length (EQUIRECTANGULAR).
-    """
+    """Read a COLMAP model, binary rather than text, without rigs, frames and repeated observations."""
     binary = all((folder / f"{name}.bin").is_file() for name in _FILES)
     readers = (_binary_camera, _binary_image, _binary_point)
     parsers: Sequence[Callable[[bytes], Iterator[Any]]] = (_text_cameras, _text_images, _text_points)
@@ -91,12 +82,11 @@ def read_colmap_model(folder: Path) -> SparseModel:
     files = [folder / f"{name}{'.bin' if binary else '.txt'}" for name in _FILES]
     cameras, images, points = (_parsed(*given) for given in zip(files, parsers, strict=True))
     known = {camera.number: camera for camera in cameras}
-    ids = np.array([point.number for point in points], np.int64)
-    view, point, xy = _observations(images, ids)
-    X = np.array([point.xyz for point in points], np.float64).reshape(-1, 3)
+    view, point, xy = _observations(images, np.array([number for number, *_ in points], np.int64))
+    X = np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3)
     if not (np.isfinite(X).all() and np.isfinite(xy).all()):
         raise UsageError(f"the COLMAP model in {folder} has coordinates that are not finite; export it again")
-    colors = np.frombuffer(b"".join(point.rgb for point in points), np.uint8).reshape(-1, 3)
+    colors = np.frombuffer(b"".join(rgb for *_, rgb in points), np.uint8).reshape(-1, 3)
     views = [_view(image, known) for image in images]
     return SparseModel(views, X, colors, view, point, xy, as_stored=True)
 
@@ -105,9 +95,7 @@ def _parsed(file: Path, parse: Callable[[bytes], Iterator[Any]]) -> list[Any]:
     try:
         return list(parse(read_bytes(file, largest=2**32)))
     except (struct.error, ValueError, OverflowError, IndexError, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        message = f"{file} is not a valid COLMAP file; it cannot be parsed: {reason}; export the model again"
-        raise UsageError(message) from None
+        raise UsageError(Notice("no-colmap-file", file, getattr(error, "strerror", error))) from None
 
 
 def _camera(number: int, kind: int, size: tuple[int, int], params: Sequence[float]) -> _Camera:
@@ -115,8 +103,7 @@ def _camera(number: int, kind: int, size: tuple[int, int], params: Sequence[floa
     if len(params) != count or not count:
         raise ValueError(f"camera {number} is of an unknown kind, or has another number of parameters")
     if not 1 <= min(size) <= max(size) <= MAX_SIDE_PX:
-        sides = f"{in_words(size[0])} x {in_words(size[1])}"
-        raise ValueError(f"camera {number} has {sides} pixels; the sides must be 1 to {MAX_SIDE_PX}")
+        raise ValueError(Notice("camera-sides", *map(in_words, (number, *size)), MAX_SIDE_PX))
     if not (np.isfinite(params).all() and min(params[: _last_focal(name) + 1]) > 0.0):
         raise ValueError(f"camera {number} needs finite parameters and positive focal lengths")
     return _Camera(number, name, size, np.array(params, np.float64))
@@ -160,7 +147,7 @@ def _binary_image(data: bytes, at: int) -> tuple[_Image, int]:
 
 def _binary_point(data: bytes, at: int) -> tuple[_Point, int]:
     number, x, y, z, rgb, _, length = struct.unpack_from("<q3d3sdQ", data, at)
-    return _Point(number, (x, y, z), rgb), at + 51 + 8 * length
+    return (number, (x, y, z), rgb), at + 51 + 8 * length
 
 
 def _lines(data: bytes) -> Iterator[str]:
@@ -193,7 +180,7 @@ def _text_points(data: bytes) -> Iterator[_Point]:
     for words in filter(None, map(str.split, _lines(data))):
         x, y, z = (float(word) for word in words[1:4])
         r, g, b = (int(word) for word in words[4:7])
-        yield _Point(int(np.int64(words[0])), (x, y, z), bytes([r, g, b]))
+        yield int(np.int64(words[0])), (x, y, z), bytes([r, g, b])
 
 
 def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
@@ -259,8 +246,7 @@ def read_database(path: Path) -> Database:
         with _opened(path) as base:
             found = _read_tables(base, path, sum(size for size, _ in before))
         if _states(path) != before:
-            message = f"{path} was changed while it was read; repeat the command when COLMAP has ended"
-            raise UsageError(message)
+            raise UsageError(Notice("changed-database", path))
         return found
     except UsageError:
         raise
@@ -290,8 +276,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         with journal.open("rb") as file:
             # SQLite may delete a file that the journal names.
             if file.read(8) == bytes.fromhex("d9d505f920a163d7"):
-                advice = "open the database once in COLMAP, which completes the change"
-                raise UsageError(f"{path} has an interrupted change in {journal.name}; {advice}")
+                raise UsageError(Notice("interrupted-database", path, journal.name))
     with TemporaryDirectory() as folder:
         place, mode = path, "mode=ro&immutable=1"
         if log.is_file() and log.stat().st_size:
@@ -334,9 +319,7 @@ def _read_tables(base: sqlite3.Connection, path: Path, size: int) -> Database:
     cameras = {}
     for camera, width, height in _rows(base, "cameras", size):
         if not all(isinstance(side, int) and 1 <= side <= MAX_SIDE_PX for side in (width, height)):
-            sides = f"{in_words(width)} x {in_words(height)}"
-            rule = f"the sides must be whole numbers from 1 to {MAX_SIDE_PX}"
-            raise ValueError(f"camera {in_words(camera)} has {sides} pixels; {rule}")
+            raise ValueError(Notice("camera-sides", *map(in_words, (camera, width, height)), MAX_SIDE_PX))
         cameras[camera] = (width, height)
     images = []
     for image, name, camera in _rows(base, "images", size):
@@ -380,11 +363,10 @@ def write_colmap_model(
     folder: str | Path, reconstruction: Reconstruction, names: Sequence[str], *, colors: U8, groups: I64,
     scales: F64, original_sizes: I64,
 ) -> int:  # fmt: skip
-    """Write a metric reconstruction as a binary COLMAP model in original pixels; return 0.
+    """Write a metric reconstruction as a binary COLMAP model in original pixels: view i as image i + 1.
 
-    It has the registered views (i is image i + 1) and the valid points (j is point j + 1) with at least two
-    inliers in them; views of one of the ``groups`` share a camera if their intrinsics and sizes are equal.
-    COLMAP has no skew: then nothing is written, and the number of such views is returned.
+    Views of one of the ``groups`` share a camera if their intrinsics and sizes are equal. COLMAP has no skew:
+    then nothing is written. Returns the number of views with skew.
     """
     r = reconstruction
     assert r.K is not None
@@ -393,9 +375,13 @@ def write_colmap_model(
         return skewed
     views = {}
     for i in np.flatnonzero(r.registered).tolist():
-        R, t = _pose(r.K[i], r.P[i])
+        # P = s K [R t] with s > 0.
+        Rt = np.linalg.solve(r.K[i], r.P[i])
+        Rt /= np.cbrt(np.linalg.det(Rt[:, :3]))
         K, (width, height) = resizing_transform(scales[i]) @ r.K[i], original_sizes[i].tolist()
-        views[i] = SparseView(names[i], R, t, K, (width, height), r.distortion[i], int(groups[i]))
+        views[i] = SparseView(
+            names[i], Rt[:, :3], Rt[:, 3], K, (width, height), r.distortion[i], int(groups[i])
+        )
     kept, every = r.used, r.tracks.point_index
     kept &= np.bincount(every[kept], minlength=len(r.X))[every] >= 2
     view, point = r.tracks.view_index[kept], every[kept]
@@ -458,13 +444,6 @@ def _write(
     files = {"rigs": rigs, "cameras": camera_parts, "frames": frames, "images": images, "points3D": parts}
     for file, records in files.items():
         write_atomically(folder / f"{file}.bin", struct.pack("<Q", len(records)) + b"".join(records))
-
-
-def _pose(K: F64, P: F64) -> tuple[F64, F64]:
-    """R (3, 3) and t (3,) of P = s K [R t] with s > 0."""
-    pose = np.asarray(np.linalg.solve(K, P), dtype=np.float64)
-    pose /= np.cbrt(np.linalg.det(pose[:, :3]))
-    return pose[:, :3], pose[:, 3]
 
 
 def _camera_params(K: F64, distortion: F64, *, pinhole: bool) -> tuple[str, tuple[float, ...]]:

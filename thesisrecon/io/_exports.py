@@ -35,7 +35,12 @@ def mask_name(to: str, image: str) -> str:
 
 def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
     """Write ``transforms.json`` (camera-to-world with OpenGL axes) and ``points.ply`` of pinhole views."""
-    cameras = [_nerfstudio_camera(view) for view in model.views]
+    cameras = []
+    for view in model.views:
+        K, (width, height), _ = view.intrinsics
+        cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
+        known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
+        cameras.append(known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0))
     shared = all(camera == cameras[0] for camera in cameras)
     frames = []
     for view, camera in zip(model.views, cameras, strict=True):
@@ -49,13 +54,6 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
     write_point_cloud(folder / "points.ply", model.X, model.point_colors)
     write_json(folder / "transforms.json", {**head, "frames": frames})
     return folder / "transforms.json"
-
-
-def _nerfstudio_camera(view: SparseView) -> dict[str, float]:
-    K, (width, height), _ = view.intrinsics
-    cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
-    known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
-    return known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
 
 
 def write_openmvs(folder: Path, model: SparseModel) -> Path:
@@ -105,7 +103,10 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
         rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
         lines += [_numbers(row) for row in rows]
     xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
-    keys = _keys(model)
+    # Number of each observation among those of its view.
+    keys = np.zeros(len(model.view_index), np.int64)
+    for here in rows_of_views(model.view_index, len(model.views)):
+        keys[here] = np.arange(len(here))
     points = zip(model.X, model.point_colors.tolist(), _observations_of_points(model), strict=True)
     for X, rgb, seen in points:
         entries = [f"{model.view_index[k]} {keys[k]} {_numbers(xy[k])}" for k in seen]
@@ -113,14 +114,6 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
     write_text(folder / "list.txt", "".join(f"images/{view.name}\n" for view in model.views))
     write_text(folder / "bundle.out", "\n".join(lines) + "\n")
     return folder / "bundle.out"
-
-
-def _keys(model: SparseModel) -> list[int]:
-    """Number of each observation among those of its view."""
-    keys = np.zeros(len(model.view_index), np.int64)
-    for here in rows_of_views(model.view_index, len(model.views)):
-        keys[here] = np.arange(len(here))
-    return keys.tolist()
 
 
 def write_opencv(folder: Path, model: SparseModel) -> Path:
@@ -249,8 +242,9 @@ def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 4
     """Write an endless WebP of frame files of the same size; equal frames give equal bytes."""
     encoded = io.BytesIO()
     # 38 dB on textured frames; a higher method saves few percent.
-    options = {"duration": milliseconds, "loop": 0, "quality": 85, "method": 2}
-    _Sequence(frames).save(encoded, "WEBP", save_all=True, **options)
+    _Sequence(frames).save(
+        encoded, "WEBP", save_all=True, duration=milliseconds, loop=0, quality=85, method=2
+    )
     write_atomically(path, encoded.getvalue())
     return path
 

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from thesisrecon.errors import OutputError, UsageError, in_words, made
+from thesisrecon.errors import Notice, OutputError, UsageError, in_words, made
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26  # Limit of text files: far above any list of pairs, far below the memory of a computer
@@ -30,22 +30,16 @@ FRAMES_FOLDER = "00-frames"
 """The frames of a video in a run folder, written before the run is identified by their pixels."""
 SPECIAL_FILE = "a pipe, a device or a socket"
 _PARTIAL = ".partial"
+_CODED = (*range(0x20), *range(0x7F, 0xA0), *range(0x2028, 0x202F), *range(0x2066, 0x206A))
+"""Control characters, line and paragraph separators, and marks that change the direction of a text."""
+_CODES = {c: f"\\x{c:02x}" if c < 256 else f"\\u{c:04x}" for c in _CODED}
 
 
 def printable(name: str) -> str:
     """Escape a file name for one line: invalid UTF-8, control characters and direction marks become codes."""
     from_bytes = all("\udc80" <= c <= "\udcff" for c in name if "\ud800" <= c <= "\udfff")
     text = name.encode("utf-8", "surrogateescape" if from_bytes else "backslashreplace")
-    return "".join(_escaped(c) for c in text.decode("utf-8", "backslashreplace"))
-
-
-def _escaped(c: str) -> str:
-    # Control characters, line and paragraph separators, and marks that change the direction of a text.
-    if unicodedata.category(c) not in ("Cc", "Zl", "Zp") and not (
-        "\u202a" <= c <= "\u202e" or "\u2066" <= c <= "\u2069"
-    ):
-        return c
-    return f"\\x{ord(c):02x}" if ord(c) < 256 else f"\\u{ord(c):04x}"
+    return text.decode("utf-8", "backslashreplace").translate(_CODES)
 
 
 def require_image_name(name: Any, source: object) -> str:
@@ -132,8 +126,7 @@ def is_partial(name: str) -> bool:
 def write_atomically(path: Path, content: bytes, *, cached: bool = False) -> None:
     """Write a file completely or not at all, flushed to the disk; OutputError, and the old file stays.
 
-    In a claimed folder other files than own ones are not replaced; ``cached`` is that of
-    :meth:`OutputFolder.admit`.
+    ``cached``: a stored result of a stage, which belongs to its run by name (:meth:`OutputFolder.admit`).
     """
     partial = path.with_name(f".{path.name}{_PARTIAL}")
     claim = claim_of(path)
@@ -253,8 +246,7 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
             continue
         names = _names(line)
         if len(names) != 2:
-            rule = "must hold two file names, quoted if they contain blanks"
-            raise UsageError(f"line {number} of {path} {rule}; got {shortened(line.strip())!r}")
+            raise UsageError(Notice("no-pair-in-line", number, path, shortened(line.strip())))
         pairs.append((names[0], names[1]))
     return pairs
 

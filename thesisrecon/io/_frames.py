@@ -102,8 +102,14 @@ class FrameSource:
         return [home / name for name in known["names"]], known["total"], known["warnings"] + warnings
 
     def _listed(self, map_all: MapAll) -> dict[str, Any]:
+        def measured(path: Path) -> float:
+            try:
+                return decode_file(path, _sharpness)
+            except UnusableImage:
+                return -1.0  # If all of a window are unreadable, one is taken and its reason reported.
+
         paths = list_images(self.path)
-        sharpness = list(map_all(_file_sharpness, paths))
+        sharpness = list(map_all(measured, paths))
         starts = range(0, len(paths), self.every)
         best = [max(range(n, min(n + self.every, len(paths))), key=sharpness.__getitem__) for n in starts]
         return {"names": [paths[n].name for n in best], "total": len(paths), "warnings": []}
@@ -142,13 +148,6 @@ def _sharpness(image: PIL.Image.Image) -> float:
     return float(gaussian_laplace(levels, 1.0).var() / (levels.var() + 64.0))
 
 
-def _file_sharpness(path: Path) -> float:
-    try:
-        return decode_file(path, _sharpness)
-    except UnusableImage:
-        return -1.0  # If all of a window are unreadable, one is taken and its reason reported.
-
-
 def _limit_memory(path: Path, video: Any, threads: int) -> None:
     """Set the threads of a decoder, each of which holds a frame; UsageError if a frame is too large."""
     codec = video.codec_context
@@ -156,14 +155,10 @@ def _limit_memory(path: Path, video: Any, threads: int) -> None:
     fixed = _FRAMES_HELD * each + _COPY_BYTES
     size = codec.width * codec.height
     if not size:
-        limit = f"{MAX_DECODED_BYTES / 2**30:.1f} GiB of memory; reduce the size of the frames"
-        raise UsageError(f"{path} contains no video frame that can be decoded within {limit}")
+        raise UsageError(Notice("undecodable-frames", path, MAX_DECODED_BYTES / 2**30))
     if size * (fixed + each) > MAX_DECODED_BYTES:
-        raise UsageError(
-            f"{path} has frames of {codec.width} x {codec.height} pixels; decoding them takes "
-            f"{size * (fixed + each) / 2**30:.1f} GiB of memory, more than the limit of "
-            f"{MAX_DECODED_BYTES / 2**30:.1f} GiB; reduce the size of the frames"
-        )
+        needed, limit = size * (fixed + each) / 2**30, MAX_DECODED_BYTES / 2**30
+        raise UsageError(Notice("large-frames", path, codec.width, codec.height, needed, limit))
     threads = max(1, min(threads, int((MAX_DECODED_BYTES / max(size, 1) - fixed) / each)))
     video.thread_type, codec.thread_count = "AUTO", threads
     # The size may change within a video; decoders count a margin around the frame.
@@ -176,9 +171,7 @@ def _decoded(path: Path, threads: int, warnings: list[str]) -> Iterator[tuple[An
     try:
         av = import_module("av")
     except ImportError:
-        install = 'install the extra video (pip install ".[video]" in the clone)'
-        frames = "or give a folder of its frames"
-        raise UsageError(f"{path} is read as a video by PyAV: {install}, {frames}") from None
+        raise UsageError(Notice("no-video-reader", path)) from None
     damaged = 0
     try:
         # A stream, since FFmpeg reads some names as addresses, and playlists name other files.

@@ -112,14 +112,12 @@ def demo_images() -> list[Path]:
         # The first six: enough neighbouring views for self-calibration, few enough for a small wheel.
         if found := sorted((home / "courtyard" / "images").glob("*.jpg"))[:6]:
             return found
-    places = f"neither in {package / 'courtyard'} nor in fixtures/courtyard of the source tree"
-    advice = "reinstall the package, or reconstruct a folder of your own"
-    raise UsageError(f"the demo images are {places}; {advice}")
+    raise UsageError(Notice("no-demo-images", package / "courtyard"))
 
 
-def image_without_pixels(name: str, size: tuple[int, int]) -> Image:
+def image_without_pixels(name: str, size: Sequence[int], original: tuple[int, int]) -> Image:
     """A grey image of (width, height) as a placeholder for one that is not available."""
-    return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), size)
+    return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), original)
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -154,17 +152,14 @@ def images_folder(source: ImageSource) -> Path | None:
     files = [Path(os.path.normpath(Path(item).absolute())) for item in source if isinstance(item, str | Path)]
     if not files or len(files) < len(source):
         return None
-    home = _common_folder(files)
-    return home if _share_names(files) or all(file.parent == home for file in files) else None
+    home, by_path = _common_folder(files)
+    return home if by_path or all(file.parent == home for file in files) else None
 
 
-def _share_names(files: Sequence[Path]) -> bool:
-    """Whether files of one name, from several folders, are distinguished by their paths."""
-    return len({file.name for file in files}) < len(files)
-
-
-def _common_folder(files: Sequence[Path]) -> Path:
-    return Path(os.path.commonpath([os.path.normpath(file.absolute().parent) for file in files]))
+def _common_folder(files: Sequence[Path]) -> tuple[Path, bool]:
+    """The innermost folder of all files, and whether files of one name are distinguished by their paths."""
+    folder = os.path.commonpath([os.path.normpath(file.absolute().parent) for file in files])
+    return Path(folder), len({file.name for file in files}) < len(files)
 
 
 def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -173,9 +168,7 @@ def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
     paths = [Path(listed.get(name, folder / name)) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if not path.is_file()]
     if missing:
-        share = f"{len(missing)} of the {len(names)} images of the model"
-        message = f"{share} are not in {folder}, such as {missing[0]!r}; give their folder with --images"
-        raise UsageError(message)
+        raise UsageError(Notice("missing-images", len(missing), len(names), folder, missing[0]))
     return paths
 
 
@@ -201,8 +194,7 @@ def read_images(
 ) -> ImageSet:  # fmt: skip
     """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
 
-    ``map_all`` is an ordered map; that of a thread pool reads several images at the same time. Files are
-    rotated upright unless they are read ``as_stored``. Names are printable; equal names are numbered.
+    ``map_all`` is an ordered map, perhaps of a thread pool. Files are rotated upright unless ``as_stored``.
     """
     items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
 
@@ -230,28 +222,20 @@ def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
     if isinstance(source, str | Path):
         source = list_images(Path(source))
     paths = [Path(item) for item in source if isinstance(item, str | Path)]
-    home = _common_folder(paths) if _share_names(paths) else None
-    width = len(str(len(source)))
-
-    def name_of(n: int, item: Any) -> str:
+    home, by_path = _common_folder(paths) if paths else (Path(), False)
+    items: dict[str, Any] = {}
+    for n, item in enumerate(source):
+        name = f"image-{n:0{len(str(len(source)))}d}"
         if isinstance(item, str | Path):
-            return Path(item).name if home is None else os.path.relpath(item, home)
-        if isinstance(item, Image):
-            return require_image_name(item.name, "an Image record")
-        return f"image-{n:0{width}d}"
-
-    names = _names(name_of(n, item) for n, item in enumerate(source))
-    items = [Path(item) if isinstance(item, str) else item for item in source]
-    return sorted(zip(names, items, strict=True), key=lambda pair: natural_key(pair[0]))
-
-
-def _names(names: Iterable[str]) -> list[str]:
-    """Make names printable; equal results are numbered."""
-    taken: dict[str, None] = {}
-    for name in map(printable, names):
-        numbered = (f"{name} ({n})" for n in count(2))
-        taken[next(one for one in chain([name], numbered) if one not in taken)] = None
-    return list(taken)
+            name = os.path.relpath(item, home) if by_path else Path(item).name
+        elif isinstance(item, Image):
+            name = require_image_name(item.name, "an Image record")
+        # Equal names are numbered.
+        name = printable(name)
+        numbered = (f"{name} ({k})" for k in count(2))
+        free = next(one for one in chain([name], numbered) if one not in items)
+        items[free] = Path(item) if isinstance(item, str) else item
+    return sorted(items.items(), key=lambda pair: natural_key(pair[0]))
 
 
 def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedImage:
@@ -359,10 +343,8 @@ def _formats() -> tuple[str, ...]:
 
 
 def load_pixels(file: PIL.Image.Image, *, as_stored: bool) -> tuple[StoredImage, float]:
-    """Decode an opened file; return the image, upright or as stored, and the 35 mm focal length or 0.
-
-    Pillow turns TIFF images itself when it loads them, and then removes their orientation.
-    """
+    """Decode an opened file; return the image, upright or as stored, and the 35 mm focal length or 0."""
+    # Pillow turns TIFF images itself when it loads them, and then removes their orientation.
     stated = _exif(file)[0]
     file.load()
     orientation, focal = _exif(file)
@@ -526,21 +508,15 @@ def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None
     size, (width, height) = full.shape[::-1], image.original_size
     # Each side of a mask of another size may be rounded.
     if abs(size[0] * height - size[1] * width) > max(width, height):
-        raise UsageError(
-            f"the mask {path} has {size[0]} x {size[1]} pixels and its image {width} x {height} "
-            f"({rotation_words(as_stored)}); a mask may have another size, but not another ratio of width to "
-            "height"
-        )
-    steps = size[0] / width / image.scale, size[1] / height / image.scale
-    x, y = (
-        np.minimum(((np.arange(image.size[k]) + 0.5) * steps[k]).astype(np.int64), size[k] - 1)
-        for k in (0, 1)
-    )
+        raise UsageError(Notice("mask-ratio", path, *size, width, height, rotation_words(as_stored)))
+    steps = np.divide(size, image.original_size) / image.scale
+    places = [
+        ((np.arange(n) + 0.5) * step).astype(np.int64) for n, step in zip(image.size, steps, strict=True)
+    ]
+    x, y = map(np.minimum, places, (size[0] - 1, size[1] - 1))
     mask = np.ascontiguousarray(full[np.ix_(y, x)])
     if image.mask is not None:
         mask &= image.mask
     if not mask.any():
-        raise UsageError(
-            f"the mask {path} leaves no pixel of {image.name}: black pixels are left out, all others are used"
-        )
+        raise UsageError(Notice("empty-mask", path, image.name))
     return None if mask.all() else mask

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import F64, I64, distinct_corners
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, as_mesh
@@ -38,7 +38,7 @@ def _require_plain_glb(content: bytes) -> None:
         if not isinstance(count, int) or not 0 <= count <= len(content) or "bufferView" not in accessor:
             raise ValueError(f"it claims {count} elements in {len(content)} bytes")
     for image in _list(header, "images"):
-        _require_texture(_viewed(header, image, content[start:]))
+        _require_texture(header, image, content[start:])
     nodes, meshes = _list(header, "nodes"), _list(header, "meshes")
     if len(meshes) != 1 or len(_list(meshes[0], "primitives")) != 1:
         raise ValueError("it must hold one mesh with one primitive")
@@ -63,20 +63,17 @@ def _header(content: bytes) -> tuple[dict[str, Any], int]:
     return header, _HEAD.size + size + 8
 
 
-def _viewed(header: dict[str, Any], image: dict[str, Any], data: bytes) -> bytes:
-    """Return the encoded bytes of an image in the file."""
+def _require_texture(header: dict[str, Any], image: dict[str, Any], data: bytes) -> None:
+    """Require an image in the file, of a size that can be decoded."""
     views, number = _list(header, "bufferViews"), image.get("bufferView")
     if not isinstance(number, int) or not 0 <= number < len(views):
         raise ValueError("its texture is missing")
     start, size = views[number].get("byteOffset", 0), views[number].get("byteLength", 0)
     if not isinstance(start, int) or not isinstance(size, int) or not 0 <= start <= start + size <= len(data):
         raise ValueError("its texture is missing")
-    return data[start : start + size]
-
-
-def _require_texture(blob: bytes) -> None:
     try:
-        with PIL.Image.open(io.BytesIO(blob), formats=("JPEG", "PNG")) as picture:
+        blob = io.BytesIO(data[start : start + size])
+        with PIL.Image.open(blob, formats=("JPEG", "PNG")) as picture:
             texels = math.prod(picture.size)
     except (PIL.UnidentifiedImageError, PIL.Image.DecompressionBombError):
         texels = _MAX_TEXELS + 1
@@ -119,7 +116,8 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
         vertices, faces = mesh.vertices[used] * _HALF_TURN, number.reshape(-1, 3)
         made: Any = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     else:
-        vertices, faces, uv = _split_seams(mesh)
+        first, number = distinct_corners(mesh.faces.ravel(), mesh.uv.reshape(-1, 2))
+        vertices, uv = mesh.vertices[mesh.faces.ravel()[first]], mesh.uv.reshape(-1, 2)[first]
         packed = io.BytesIO()
         # A quarter of the size of PNG without visible differences.
         PIL.Image.fromarray(mesh.texture).save(packed, "JPEG", quality=92, subsampling=0)
@@ -129,8 +127,11 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
         material = new_material(
             baseColorTexture=PIL.Image.open(packed), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
         )
-        visual = new_visual(uv=_normalized(uv, mesh.texture), material=material)
-        made = trimesh.Trimesh(vertices * _HALF_TURN, faces, visual=visual, process=False)
+        height, width = mesh.texture.shape[:2]
+        # From texels, y down, to [0, 1], v up.
+        normalized = np.column_stack([(uv[:, 0] + 0.5) / width, 1.0 - (uv[:, 1] + 0.5) / height])
+        visual = new_visual(uv=normalized, material=material)
+        made = trimesh.Trimesh(vertices * _HALF_TURN, number.reshape(-1, 3), visual=visual, process=False)
     return bytes(made.export(file_type="glb"))
 
 
@@ -169,7 +170,9 @@ def _mesh_of(loaded: Any) -> TexturedMesh:
     image = getattr(getattr(loaded.visual, "material", None), "baseColorTexture", None)
     if uv is not None and image is not None:
         texture = np.asarray(image.convert("RGB"))
-        corners = _texels(np.asarray(uv, dtype=np.float64), texture)[faces]
+        height, width = texture.shape[:2]
+        x, y = np.asarray(uv, dtype=np.float64).T
+        corners = np.column_stack([x * width - 0.5, (1.0 - y) * height - 0.5])[faces]
         if not np.isfinite(corners).all():
             raise ValueError("its texture coordinates are not finite")
         vertices, faces = _merged(vertices, faces)
@@ -190,29 +193,3 @@ def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
     of_vertex = np.full(len(vertices), -1, dtype=np.int64)
     of_vertex[used] = rank[number.ravel()]
     return vertices[used[first[order]]], of_vertex[faces]
-
-
-def _split_seams(mesh: TexturedMesh) -> tuple[F64, I64, F64]:
-    """Return vertices (N, 3), faces (M, 3) and texels (N, 2); vertices on seams are repeated."""
-    assert mesh.uv is not None
-    vertex, uv = mesh.faces.ravel(), mesh.uv.reshape(-1, 2)
-    # Three sorted columns are faster than np.unique of rows.
-    order = np.lexsort((uv[:, 1], uv[:, 0], vertex))
-    new = np.ones(len(order), dtype=bool)
-    new[1:] = (np.diff(vertex[order]) != 0) | (np.diff(uv[order], axis=0) != 0.0).any(axis=1)
-    number = np.empty(len(order), dtype=np.int64)
-    number[order] = np.cumsum(new) - 1
-    first = order[new]
-    return mesh.vertices[vertex[first]], number.reshape(-1, 3), uv[first]
-
-
-def _normalized(uv: F64, texture: np.ndarray) -> F64:
-    """Convert texels, y down, to texture coordinates in [0, 1], v up."""
-    height, width = texture.shape[:2]
-    return np.column_stack([(uv[:, 0] + 0.5) / width, 1.0 - (uv[:, 1] + 0.5) / height])
-
-
-def _texels(uv: F64, texture: np.ndarray) -> F64:
-    """The inverse of :func:`_normalized`."""
-    height, width = texture.shape[:2]
-    return np.column_stack([uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5])

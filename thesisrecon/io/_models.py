@@ -19,7 +19,7 @@ import scipy
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
-from thesisrecon.errors import UsageError, in_words
+from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._colmap import MAX_SIDE_PX, is_colmap_model, read_colmap_model
 from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name, shortened
 from thesisrecon.results import SparseModel, SparseView
@@ -62,9 +62,15 @@ def colmap_model_in(folder: Path) -> Path | None:
 def _read_folder(folder: Path) -> SparseModel:
     colmap = colmap_model_in(folder)
     if (folder / "cameras.json").is_file():
-        views = _read_views(folder / "cameras.json")
-        model = SparseModel(views) if colmap is None else _with_views(read_colmap_model(colmap), views)
-        return replace(model, as_stored=_from_colmap(folder))
+        model = SparseModel(_read_views(folder / "cameras.json"), as_stored=_from_colmap(folder))
+        if colmap is None:
+            return model
+        found, index = read_colmap_model(colmap), {name: i for i, name in enumerate(model.names)}
+        place = np.array([index.get(name, -1) for name in found.names], np.int64)[found.view_index]
+        kept = place >= 0
+        point, xy = found.point_index[kept], found.xy[kept]
+        points = replace(model, X=found.X, colors=found.colors)
+        return replace(points, view_index=place[kept], point_index=point, xy=xy)
     if colmap is None:
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
     # The sparse/0 of a run has the pixels of the run.
@@ -79,15 +85,6 @@ def _from_colmap(run: Path) -> bool:
     return isinstance(summary, dict) and summary.get("as_stored") is True
 
 
-def _with_views(model: SparseModel, views: list[SparseView]) -> SparseModel:
-    """The model with other ``views`` of the same names; observations in missing views are dropped."""
-    index = {view.name: i for i, view in enumerate(views)}
-    place = np.array([index.get(name, -1) for name in model.names], np.int64)[model.view_index]
-    kept = place >= 0
-    point, xy = model.point_index[kept], model.xy[kept]
-    return replace(model, views=views, view_index=place[kept], point_index=point, xy=xy)
-
-
 def _read_views(path: Path) -> list[SparseView]:
     """Views of a ``cameras.json``: a list with names, or a table by name, as some data sets have it."""
     content, views, last = read_json(path), list[SparseView](), ""
@@ -98,8 +95,7 @@ def _read_views(path: Path) -> list[SparseView]:
             last = f"; the entry {in_words(name)} cannot be used"
             views.append(_view(str(name), entry, i))
     except (TypeError, KeyError, ValueError, OverflowError, np.linalg.LinAlgError):
-        rule = "it must list them with name, finite K, R and t or C, and width and height"
-        raise UsageError(f"{path} does not hold cameras; {rule}{last}") from None
+        raise UsageError(Notice("no-cameras", path, last)) from None
     if not views:
         raise UsageError(f"{path} holds no camera; no image of this run was registered")
     return views
@@ -129,30 +125,28 @@ def _read_trajectory(path: Path) -> list[SparseView]:
         try:
             if len(words) != expected or expected not in (8, 12):
                 raise ValueError("numbers are missing")
-            R, centre = (_tum_pose if expected == 8 else _kitti_pose)(np.array(words, dtype=np.float64))
+            R, centre = _pose(np.array(words, dtype=np.float64))
         except ValueError:
-            rule = "each line needs a pose of 8 (TUM) or 12 (KITTI) numbers"
-            raise UsageError(f"line {number} of {path} is {in_words(' '.join(words))}; {rule}") from None
+            raise UsageError(Notice("no-pose-in-line", number, path, in_words(" ".join(words)))) from None
         views.append(SparseView(words[0] if expected == 8 else f"{i:06d}", R, -R @ centre))
     return views
 
 
-def _tum_pose(row: F64) -> tuple[F64, F64]:
+def _pose(row: F64) -> tuple[F64, F64]:
+    """R (3, 3), world to camera, and centre (3,) of a row of TUM (8,) or KITTI (12,), or ``ValueError``."""
     if not np.isfinite(row).all():
         raise ValueError("a number is not finite")
-    if not 1e-9 < math.hypot(*row[4:]) < 1e9:
-        raise ValueError("the quaternion has no direction")
-    return scipy.spatial.transform.Rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
-
-
-def _kitti_pose(row: F64) -> tuple[F64, F64]:
+    rotation = scipy.spatial.transform.Rotation
+    if len(row) == 8:
+        if not 1e-9 < math.hypot(*row[4:]) < 1e9:
+            raise ValueError("the quaternion has no direction")
+        return rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
     M = row.reshape(3, 4)
     # The printed digits of a pose may leave a deviation from a rotation.
-    if not (np.isfinite(M).all() and np.allclose(M[:, :3] @ M[:, :3].T, np.eye(3), atol=1e-3)):
+    orthogonal = np.allclose(M[:, :3] @ M[:, :3].T, np.eye(3), atol=1e-3)
+    if not orthogonal or np.linalg.det(M[:, :3]) < 0.0:
         raise ValueError("it is not a rotation")
-    if np.linalg.det(M[:, :3]) < 0.0:
-        raise ValueError("it is a reflection")
-    return scipy.spatial.transform.Rotation.from_matrix(M[:, :3]).as_matrix().T, M[:, 3]
+    return rotation.from_matrix(M[:, :3]).as_matrix().T, M[:, 3]
 
 
 Place = tuple[float, float, float]
@@ -202,8 +196,9 @@ def read_positions(path: Path) -> Positions:
             what = "name,x,y,z with finite numbers"
             if header.degrees:
                 what = "the name, latitude, longitude and height of an image, in decimal degrees and metres"
-            rule = f"must hold {what}, one line per image; got {shortened(','.join(cells).strip())!r}"
-            raise UsageError(f"line {number} of {path} {rule}") from None
+            raise UsageError(
+                Notice("no-position-in-line", number, path, what, shortened(",".join(cells).strip()))
+            ) from None
         found[name] = x, y, z
     if not header.degrees or not found:
         return Positions(found)
@@ -255,9 +250,7 @@ def _header_of(cells: Sequence[str], path: Path) -> _Header:
     if x is not None and y is not None and z is not None and name is not None:
         return _Header((name, x, y, z), len(cells), degrees)
     if degrees:
-        rule = "must name a column each of latitude, longitude and height, such as name,lat,lon,alt"
-        got = shortened(",".join(cells))
-        raise UsageError(f"the header of {path} {rule}, separated by commas; got {got!r}")
+        raise UsageError(Notice("header-of-positions", path, shortened(",".join(cells))))
     return _Header(_ORDER, 4)
 
 

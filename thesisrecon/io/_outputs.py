@@ -19,7 +19,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from thesisrecon.errors import OutputError, StageFailure, UsageError, WorkersLost
+from thesisrecon.errors import Notice, OutputError, StageFailure, UsageError, WorkersLost
 
 LOCK_FILE = ".lock"
 _claims: list[OutputFolder] = []
@@ -105,8 +105,7 @@ class OutputFolder:
 
     def _require_no_link(self, path: Path) -> None:
         if (link := self._link_above(path)) is not None:
-            way = "replace the link by a folder, or choose another output folder"
-            raise UsageError(f"{path} is not written, because {link} is a link; {way}")
+            raise UsageError(Notice("link-above", path, link))
 
     def require(self, names: Sequence[str | Path]) -> None:
         """Raise ``UsageError`` if a file of these names must not be written."""
@@ -133,10 +132,7 @@ class OutputFolder:
         return [path for paths in found for path in paths if os.path.lexists(path)]
 
     def admit(self, path: Path, content: bytes, *, cached: bool) -> bool:
-        """Check and record that a file is written; False if it has this content already.
-
-        ``cached``: a stored result of a stage, which belongs to its run by name and is not recorded.
-        """
+        """Check and record that a file is written, unless it is ``cached``; False if it has this content."""
         self.require_present()
         there = os.path.lexists(path)
         if there or not cached:
@@ -149,13 +145,13 @@ class OutputFolder:
         same = there and has_content(path, [digest])
         if there and not same:
             self.require_own(path)
-        self._note(name, digest)
-        self._used = True
+        self.note(name, digest)
         if not there:
             self._created.append(path)
         return not same
 
-    def _note(self, name: str, digest: str) -> None:
+    def note(self, name: str, digest: str) -> None:
+        """Record the digest of a file that is written; an empty one for a folder."""
         new = digest not in self.digests.setdefault(name, set())
         if new and self._record >= 0:
             before = os.fstat(self._record)
@@ -168,6 +164,7 @@ class OutputFolder:
             os.utime(self._record, ns=(before.st_atime_ns, before.st_mtime_ns))
         self.digests[name].add(digest)
         self.written[name] = digest
+        self._used = True
 
     def make_parents(self, path: Path) -> None:
         """Create the folders of a file below this one, which is never created again."""
@@ -199,10 +196,7 @@ class OutputFolder:
         with suppress(OSError):
             if os.path.samestat(self.path.stat(), os.fstat(self._folder)):
                 return
-        way = "repeat the command, which continues if the folder is back in its place"
-        raise UsageError(
-            f"the output folder {self.path} was moved or removed while the command was writing to it; {way}"
-        )
+        raise UsageError(Notice("folder-gone", self.path))
 
     def require_complete(self, names: Iterable[str]) -> None:
         """Raise ``UsageError`` if these files, or others that the command wrote, are no longer there."""
@@ -211,12 +205,20 @@ class OutputFolder:
         if (gone := next((path for path in files if not os.path.lexists(path)), None)) is not None:
             raise UsageError(f"{gone} was removed while the command was writing to {self.path}; repeat it")
 
-    def open(self) -> Callable[[], None]:
-        """Create and lock the folder; returns the function that ends it, without a trace if it is unused."""
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Create and lock the folder for a block; without a trace if it is not used."""
         missing = [folder for folder in (self.path, *self.path.parents) if not folder.exists()]
         lock, new = self.path / LOCK_FILE, not os.path.lexists(self.path / LOCK_FILE)
-
-        def close() -> None:
+        try:
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                self._record = _locked(lock)
+            except OSError as error:
+                raise OutputError(f"the output folder {self.path}", error) from None
+            yield
+        finally:
             with suppress(OSError):
                 if new and self._record >= 0 and not self._used:
                     lock.unlink()
@@ -225,18 +227,6 @@ class OutputFolder:
             for handle in (self._record, self._folder):
                 if handle >= 0:
                     os.close(handle)
-
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
-            self._record = _locked(lock)
-        except OSError as error:
-            close()
-            raise OutputError(f"the output folder {self.path}", error) from None
-        except UsageError:
-            close()
-            raise
-        return close
 
     def read_record(self) -> None:
         """Add the files that the record lists."""
@@ -257,16 +247,6 @@ class OutputFolder:
                 name, digest = json.loads(line)
                 self.digests.setdefault(name, set()).add(digest)
 
-    def clear(self, folder: Path) -> None:
-        """Remove a folder that is empty or was cleared before: its whole content belongs to the commands."""
-        name = self.name_of(folder)
-        there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
-        if folder.is_symlink() or (there and name not in self.digests):
-            raise not_ours(folder, optional=False)
-        self._note(name, "")
-        self._used = True
-        shutil.rmtree(folder, ignore_errors=True)
-
     def withdraw(self) -> None:
         """Remove the files that this command created."""
         with suppress(OSError, UsageError):
@@ -286,8 +266,7 @@ def _locked(lock: Path) -> int:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(handle)
-            message = f"another run is writing to the output folder {lock.parent}; choose another one"
-            raise UsageError(message) from None
+            raise UsageError(Notice("folder-in-use", lock.parent)) from None
         # A command that was refused removes the file that it created.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), lock.stat()):
@@ -302,10 +281,9 @@ def claim_folder(
     path: Path, *, overwrite: bool | None = False, names: Sequence[str | Path] = (),
     check: Callable[[OutputFolder], object] = lambda _: None,
 ) -> Iterator[OutputFolder]:  # fmt: skip
-    """Lock an output folder for the block, in which :func:`write_atomically` obeys the rule.
+    """Lock an output folder, unless ``check`` refuses it, for the block; the command writes ``names`` there.
 
-    ``names``: files that the command writes; ``overwrite``: None if the command has no such option; ``check``
-    may refuse the folder.
+    ``overwrite``: None if the command has no such option.
     """
     outputs = OutputFolder(path, overwrite=overwrite)
 
@@ -320,8 +298,7 @@ def claim_folder(
     # A refused command creates nothing; a folder in use is locked before it is judged.
     if not os.path.lexists(path / LOCK_FILE):
         judge()
-    close = outputs.open()
-    try:
+    with outputs.opened():
         judge()
         _claims.append(outputs)
         try:
@@ -333,8 +310,6 @@ def claim_folder(
             raise
         finally:
             _claims.remove(outputs)
-    finally:
-        close()
 
 
 @contextmanager
@@ -347,9 +322,14 @@ def join_claim(path: Path) -> Iterator[OutputFolder]:
 
 
 def clear_folder(folder: Path) -> None:
-    """Remove a folder of an earlier command (:meth:`OutputFolder.clear`)."""
+    """Remove a folder that is empty or was cleared before: its whole content belongs to the commands."""
     with join_claim(folder.parent) as outputs:
-        outputs.clear(folder)
+        name = outputs.name_of(folder)
+        there = os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir()))
+        if folder.is_symlink() or (there and name not in outputs.digests):
+            raise not_ours(folder, optional=False)
+        outputs.note(name, "")
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -89,7 +88,11 @@ class StoredImage:
     def rows(self, start: int, stop: int) -> PIL.Image.Image:
         """Rows ``start`` to ``stop`` of the upright image in RGB; in RGBa (premultiplied) if ``layered``."""
         part = self._stored_part(start, stop)
-        levels = self._eight_bit(part) if self._deep else _eight_bit_colours(part)
+        if self._deep:
+            levels = self._eight_bit(part)
+        else:
+            # Resampling averages colours times alpha, so that those of transparent pixels have no weight.
+            levels = part.convert("RGBA").convert("RGBa") if self.layered else part.convert("RGB")
         return levels if self.transform is None else levels.transpose(self.transform)
 
     @property
@@ -154,11 +157,6 @@ def _finite(part: PIL.Image.Image) -> F64:
     return np.nan_to_num(np.asarray(part).astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _eight_bit_colours(part: PIL.Image.Image) -> PIL.Image.Image:
-    # Resampling averages colours times alpha, so that those of transparent pixels have no weight.
-    return part.convert("RGBA").convert("RGBa") if StoredImage(part).layered else part.convert("RGB")
-
-
 def resized_to(image: StoredImage, max_size_px: int) -> U8:
     """Reduce an image by one exact scale s, (x + 0.5) s - 0.5, to (H, W, 3), or (H, W, 4) if ``layered``."""
     width, height = image.size
@@ -193,11 +191,7 @@ def _straight(levels: PIL.Image.Image) -> U8:
 
 
 def _resized(image: StoredImage, size: tuple[int, int], extent: tuple[float, float]) -> U8:
-    """Resize the top left ``extent``: block averages, then the filter along rows, then along columns.
-
-    These are the steps of Pillow's ``resize`` with a ``reducing_gap``, all but the last stripe by stripe.
-    (Pillow itself may begin with the columns if an image is more than twice as high as wide.)
-    """
+    """Resize the top left ``extent`` by the steps of Pillow (blocks, rows, columns), stripe by stripe."""
     # The filter reduces by 3; larger reductions average whole pixels first.
     by = [max(int(e / s / 3.0), 1) for e, s in zip(extent, size, strict=True)]
     mode = "RGBa" if image.layered else "RGB"
@@ -231,17 +225,26 @@ def refuse_raw_file(stream: BinaryIO, suffix: str) -> None:
         return
     if suffix.lower() in RAW_SUFFIXES:
         raise UnusableImage(RAW_FILE)
-    pages = list(_tiff_pages(stream, head))
+    at, pages = _directory(stream, head).next, dict[int, ImageFileDirectory_v2]()
+    # Until the file ends or repeats.
+    while at and at not in pages and len(pages) < 1000:
+        pages[at] = _directory(stream, head, at)
+        at = pages[at].next
     if not pages:
         return
-    first, size = pages[0], _size(pages[0])
-    inner = [tags for page in pages for tags in _inner_images(page, stream, head)]
+    first, *others = pages.values()
+    size, inner = _size(first), list[_Tags]()
+    for page in pages.values():
+        # The tags of the images inside a page, which has at most a few.
+        places = page.get(330, ())
+        places = places if isinstance(places, tuple) else (places,)
+        inner += [_directory(stream, head, at) for at in places[:16]]
     # Colour filter array, or linear raw; the version of a DNG.
-    sensor = any(tags.get(262) in (32803, 34892) for tags in chain(pages, inner)) or 50706 in first
+    sensor = any(tags.get(262) in (32803, 34892) for tags in [*pages.values(), *inner]) or 50706 in first
     if sensor or any(math.prod(_size(tags)) > math.prod(size) for tags in inner):
         raise UnusableImage(RAW_FILE)
     reduced = first.get(254, 0) & 1 or first.get(255, 0) == 2
-    if (reduced and len(pages) > 1) or any(_enlarges(_size(page), size) for page in pages[1:]):
+    if (reduced and others) or any(_enlarges(_size(page), size) for page in others):
         raise UnusableImage(Notice("reduced-image", size[0], size[1]))
 
 
@@ -261,19 +264,3 @@ def _directory(stream: BinaryIO, head: bytes, at: int = 0) -> ImageFileDirectory
         stream.seek(min(at, 2**62))
         tags.load(stream)
     return tags
-
-
-def _tiff_pages(stream: BinaryIO, head: bytes) -> Iterator[_Tags]:
-    """The tags of each page, until the file ends or repeats."""
-    at, seen = _directory(stream, head).next, set[int]()
-    while at and at not in seen and len(seen) < 1000:
-        seen.add(at)
-        tags = _directory(stream, head, at)
-        yield tags
-        at = tags.next
-
-
-def _inner_images(tags: _Tags, stream: BinaryIO, head: bytes) -> list[_Tags]:
-    """The tags of the images inside a page, which has at most a few."""
-    places = tags.get(330, ())
-    return [_directory(stream, head, at) for at in (places if isinstance(places, tuple) else (places,))[:16]]

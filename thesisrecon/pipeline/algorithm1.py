@@ -15,9 +15,12 @@ from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
-from thesisrecon.pipeline.job import Job, name_images
-from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
-from thesisrecon.pipeline.left_over import groups_left_over, join_left_over, known_cameras, register_more
+from thesisrecon.pipeline.large_sets import (
+    calibrated_part,
+    cameras_from_parts,
+    from_metric,
+    prior_of_views,
+)
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (
     REPLACED_FILES,
@@ -26,12 +29,16 @@ from thesisrecon.pipeline.outputs import (
     best_result,
     write_outputs,
 )
-from thesisrecon.pipeline.run import Run
+from thesisrecon.pipeline.run import Job, Run, name_images
 from thesisrecon.pipeline.stages import (
     build_model,
     estimate_depth_maps,
+    groups_left_over,
+    join_left_over,
+    known_cameras,
     reconstruct_projective,
     refine_metric,
+    register_more,
     report_depth_maps,
     report_metric,
     report_projective,
@@ -198,11 +205,11 @@ def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
 def _with_further_models(job: Job, result: RunResult) -> RunResult:
     """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
     run, folder, places, further = job.run, job.run.directory.path, dict[int, str](), list[RunResult]()
-    known = known_cameras(job.prior, result.metric)
+    prior = known_cameras(job.prior, result.metric)
     pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *_unregistered_groups(job, result)])
     while pending:
         views, name = pending.popleft(), f"group-{len(run.groups) + 2}"
-        part, found = _run_group(job, result, name, views, prior_of_views(known, views))
+        part, found = _run_group(job, result, name, views, prior_of_views(prior, views))
         pending.extend([views[k] for k in rest] for rest in _unregistered_groups(part, found))
         if (model := found.best_reconstruction) is not None:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
@@ -213,7 +220,12 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
         RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
     here = result.best_reconstruction
     if here is not None and job.until != "projective":
-        _name_linked_images(job, result.pairs, {*np.flatnonzero(here.registered).tolist(), *places})
+        # Images in no model that accepted pairs connect with one.
+        known = {*np.flatnonzero(here.registered).tolist(), *places}
+        ends = {end for p in result.pairs if p.accepted and {p.i, p.j} & known for end in (p.i, p.j)}
+        if linked := [job.names[i] for i in sorted(ends - known)]:
+            names = ", ".join(linked[:MAX_NAMED]) + (", ..." if len(linked) > MAX_NAMED else "")
+            run.warnings.append(Notice("linked-images", counted(len(linked), "image"), names))
     if not run.groups:
         return result
     registered = 0 if here is None else int(here.registered.sum())
@@ -232,14 +244,6 @@ def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
     if model is None or not model.registered.any() or job.until == "projective":
         return []
     return groups_left_over(job, pairs_of_group(job, result.pairs), model)
-
-
-def _name_linked_images(job: Job, pairs: Sequence[TwoView], registered: set[int]) -> None:
-    """Warn of images in no model that accepted pairs connect with one."""
-    ends = {end for p in pairs if p.accepted and {p.i, p.j} & registered for end in (p.i, p.j)}
-    if linked := [job.names[i] for i in sorted(ends - registered)]:
-        names = ", ".join(linked[:MAX_NAMED]) + (", ..." if len(linked) > MAX_NAMED else "")
-        job.run.warnings.append(Notice("linked-images", counted(len(linked), "image"), names))
 
 
 def _run_group(
@@ -277,11 +281,12 @@ def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResu
         elsewhere = {i: Notice("other-group", name) for i, name in places.items()}
         return replace(found, reasons=tuple(elsewhere.get(i, why) for i, why in enumerate(found.reasons)))
 
-    projective = None if result.projective is None else named(result.projective)
-    metric = result.metric
-    if metric is not None:
-        metric = replace(metric, reconstruction=named(metric.reconstruction))
-    return replace(result, projective=projective, metric=metric)
+    projective, metric = result.projective, result.metric
+    return replace(
+        result,
+        projective=projective and named(projective),
+        metric=metric and replace(metric, reconstruction=named(metric.reconstruction)),
+    )
 
 
 @contextmanager

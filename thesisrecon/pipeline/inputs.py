@@ -14,7 +14,7 @@ import scipy
 
 from thesisrecon.arrays import F64, I64, numbers, rows_of_views
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import UsageError, counted
+from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import (
     DecodedImage,
@@ -27,11 +27,16 @@ from thesisrecon.io._images import (
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.projection import Observations, sort_observations
-from thesisrecon.pipeline.image_pair import values_at, verify_matches
-from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import tracks_of_part
-from thesisrecon.pipeline.matching import FromImages, report_choice, report_matches, report_tracks
-from thesisrecon.pipeline.run import Batch, Run, stream
+from thesisrecon.pipeline.matching import (
+    FromImages,
+    report_choice,
+    report_matches,
+    report_tracks,
+    values_at,
+    verify_matches,
+)
+from thesisrecon.pipeline.run import Batch, Job, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView, common_points
 from thesisrecon.runtime._run_folder import key_of
 
@@ -124,14 +129,13 @@ class Views:
     def _read(self, run: Run, i: int, digest: str) -> DecodedImage:
         width, height = (int(side) for side in self.sizes[i])
         if self.images is None:
-            return DecodedImage(image_without_pixels(self.names[i], (width, height)), digest)
+            return DecodedImage(image_without_pixels(self.names[i], (width, height), (width, height)), digest)
         source = self.images / self.names[i] if isinstance(self.images, Path) else self.images[i]
         size = run.config.images.max_size_px
         (found,) = read_image(source, max_size_px=size, as_stored=self.as_stored).decoded
         if found.image.original_size != (width, height):
-            is_now = "{} x {}".format(*found.image.original_size)
-            rule = f"width and height must be those of the image {rotation_words(self.as_stored)}"
-            raise UsageError(f"image {self.names[i]!r} is {is_now}, not {width} x {height}: {rule}")
+            now, rule = found.image.original_size, rotation_words(self.as_stored)
+            raise UsageError(Notice("wrong-image-size", self.names[i], *now, width, height, rule))
         image = replace(found.image, name=self.names[i])
         return replace(found, image=image, digest=key_of(digest, found.digest))
 
@@ -153,8 +157,7 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
         folder = Path(images)
         missing = [name for name in names if not (folder / name).is_file()]
         if missing:
-            some = f"{len(missing)} of the {count} images"
-            raise UsageError(f"{some} are not in {folder}, such as {missing[0]!r}")
+            raise UsageError(Notice("missing-named-images", len(missing), count, folder, missing[0]))
         images = folder
     elif images is not None:
         if len(images) != count:
@@ -170,8 +173,7 @@ def given_matches(
     if keypoints is not None and len(keypoints) != count:
         raise UsageError(f"there are keypoints of {len(keypoints)} images and {count} sizes")
     if not isinstance(matches, Mapping):
-        wanted = "a table {(i, j): rows or positions}"
-        raise UsageError(f"matches must be {wanted}; got a {type(matches).__name__}")
+        raise UsageError(Notice("no-table-of-matches", type(matches).__name__))
     corners = None if keypoints is None else [_positions(xy, i, views) for i, xy in enumerate(keypoints)]
     found: list[Matches] = []
     for key, given in sorted(matches.items()):
@@ -180,8 +182,7 @@ def given_matches(
         if isinstance(given, tuple | list) and len(given) == 2 and np.ndim(given[0]) == 2:
             xy1, xy2 = _positions(given[0], i, views), _positions(given[1], j, views)
             if len(xy1) != len(xy2):
-                rule = "need as many positions in both images"
-                raise UsageError(f"{where} {rule}; got {len(xy1)} and {len(xy2)}")
+                raise UsageError(Notice("unequal-positions", where, len(xy1), len(xy2)))
             rows = np.full((len(xy1), 2), -1)
         elif corners is None:
             raise UsageError(f"{where} are rows of keypoints, but keypoints is None")
@@ -206,8 +207,7 @@ def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
     except (TypeError, ValueError):
         raise UsageError(f"a key of matches is (i, j), two image numbers; got {key!r}") from None
     if i == j or not (0 <= i < count and 0 <= j < count):
-        rule = f"two different numbers from 0 to {count - 1} are needed"
-        raise UsageError(f"matches of images {i} and {j}: {rule}")
+        raise UsageError(Notice("no-images-of-matches", i, j, count - 1))
     if i > j and (j, i) in matches:
         raise UsageError(f"matches of images {j} and {i} are given twice")
     return i, j
@@ -229,9 +229,7 @@ def _positions(xy: Any, i: int, views: Views) -> F64:
     outside = np.maximum(-found, found - size + 1).max()
     if outside > MAX_OUTSIDE_REL * size.max():
         x, y = found.max(axis=0)
-        where = f"reach ({x:.0f}, {y:.0f}), {outside:.0f} px outside {size[0]} x {size[1]} px"
-        advice = "sizes are (width, height), positions (x, y)"
-        raise UsageError(f"keypoints of {name!r} {where}: {advice}")
+        raise UsageError(Notice("keypoints-outside", name, x, y, outside, *size))
     return found
 
 
@@ -244,8 +242,7 @@ def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
     if rows.size == 0:
         return np.zeros((0, 2), dtype=np.int64)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        rule = "must be (M, 2) whole numbers, rows of keypoints"
-        raise UsageError(f"{where} {rule}; got {rows.shape} {rows.dtype}")
+        raise UsageError(Notice("no-rows-of-keypoints", where, rows.shape, rows.dtype))
     one, two = (len(corners[view]) for view in pair)
     if rows.min() < 0 or (rows.max(axis=0) >= (one, two)).any():
         raise UsageError(f"{where} point to a keypoint that does not exist ({one} and {two} are given)")
@@ -298,8 +295,7 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
         _, a, b = np.intersect1d(point[here[i]], point[here[j]], return_indices=True)
         found.append(_match_record((i, j), a, b, corners[i][a], corners[j][b]))
     if not found:
-        points = counted(tracks.n_points, "point")
-        raise UsageError(f"no two images share {MIN_COMMON_POINTS} of the {points}")
+        raise UsageError(Notice("no-shared-tracks", MIN_COMMON_POINTS, counted(tracks.n_points, "point")))
     _, number = np.unique(point, return_inverse=True)
     return Given(corners, found, Tracks(view, number, xy, count, int(number.max()) + 1))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice, product
+from itertools import chain, islice, product
 from typing import NamedTuple
 
 import numpy as np
@@ -19,14 +19,14 @@ import scipy
 
 from thesisrecon._numba import code_digest
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
+from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.matching.pair_selection import strong_pairs
 from thesisrecon.optimize.bundle.projection import MetricModel, image_points
-from thesisrecon.pipeline.job import Job
-from thesisrecon.pipeline.run import Batch, stream
+from thesisrecon.pipeline.run import Batch, Job, stream
 from thesisrecon.records import (
     IntrinsicsPrior,
     Reconstruction,
@@ -54,24 +54,19 @@ _IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 def calibrate_with_core(
     method: SelfCalibrator, projective: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
 ) -> SelfCalibration:
-    """Calibrate all views, or a core of them if that fails: the first core that determines the calibration.
-
-    ``K`` is zero for the views that are not in the core. Raises the failure of all views if no core succeeds.
-    """
-    try:
-        return method.calibrate(projective, prior=prior, rng=rng)
-    except StageFailure as failure:
-        found = list[SelfCalibration]()
-        for views in _cores(projective):
-            try:
-                found.append(method.calibrate(restrict_views(projective, views), prior=prior, rng=rng))
-            except StageFailure:
-                continue
-            if found[-1].identifiable:
-                return found[-1]
-        if not found:
-            raise failure from None
-        return found[0]
+    """Calibrate all views, else the first core of them that determines the calibration; other K are zero."""
+    found, failures = list[SelfCalibration](), list[StageFailure]()
+    for part in chain([projective], (restrict_views(projective, views) for views in _cores(projective))):
+        try:
+            found.append(method.calibrate(part, prior=prior, rng=rng))
+        except StageFailure as failure:
+            failures.append(failure)
+            continue
+        if part is projective or found[-1].identifiable:
+            return found[-1]
+    if not found:
+        raise failures[0]
+    return found[0]
 
 
 def calibrated_part(projective: Reconstruction, calibration: SelfCalibration) -> Reconstruction:
@@ -161,11 +156,7 @@ def _connected_views(graph: scipy.sparse.csr_array) -> list[I64]:
 
 
 def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
-    """Divide the views until a part has at most ``part_views``, or every cut severs too many common points.
-
-    The views of a part are numbered such that neighbours are close (reverse Cuthill-McKee); the cut between
-    consecutive numbers with the smallest fraction of severed points divides it.
-    """
+    """Divide the views until parts have at most ``part_views``, or each cut severs too many common points."""
     left, parts = _connected_views(graph), list[I64]()
     while left:
         views = left.pop()
@@ -178,6 +169,7 @@ def divide_views(graph: scipy.sparse.csr_array, part_views: int) -> list[I64]:
 
 
 def _best_cut(graph: scipy.sparse.csr_array, views: I64) -> list[I64] | None:
+    """The cut in reverse Cuthill-McKee order (near neighbours) that severs the smallest share of points."""
     inside = graph[views][:, views]
     order = scipy.sparse.csgraph.reverse_cuthill_mckee(inside.tocsr(), symmetric_mode=True)
     ties, place = inside.tocoo(), np.argsort(order)
@@ -249,24 +241,21 @@ def prior_of_views(prior: IntrinsicsPrior, views: I64 | Sequence[int]) -> Intrin
 def reconstruct_part(
     config: PipelineConfig, given: PartInput, number: int, seed: int, attempts: int
 ) -> list[Reconstruction]:
-    """Reconstruct a part, from one initial pair after another until the result is trusted.
+    """Reconstruct a part until the result of an initial pair is trusted, else with no camera registered.
 
-    If no result is trusted, no camera is registered: the views are then registered with the other parts. The
-    model is returned without the observations, which the caller has: the result of a task is small.
+    The model is returned without the observations, which the caller has: the result of a task is small.
     """
-    tracks, prior = given.tracks, given.prior
-    n, N = len(given.sizes), tracks.n_points
+    tracks, sizes, prior = given.tracks, given.sizes, given.prior
+    n, N = len(sizes), tracks.n_points
     model = Reconstruction(
         "metric", np.zeros((n, 3, 4)), np.zeros((N, 4)), registered=np.zeros(n, dtype=bool),
         valid=np.zeros(N, dtype=bool), inlier=np.zeros(len(tracks.xy), dtype=bool), tracks=tracks,
-        sizes=given.sizes, sigma_px=1.0, reasons=("",) * n, K=np.zeros((n, 3, 3)),
-        distortion=np.zeros((n, 3)),
+        sizes=sizes, sigma_px=1.0, reasons=("",) * n, K=np.zeros((n, 3, 3)), distortion=np.zeros((n, 3)),
     )  # fmt: skip
     for attempt in range(attempts):
         rng = stream(seed, "part", number, attempt)
         try:
-            pairs, sizes = given.pairs, given.sizes
-            projective = config.projective.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt)
+            projective = config.projective.reconstruct(tracks, given.pairs, sizes, rng=rng, attempt=attempt)
             calibration = calibrate_with_core(config.selfcalibration, projective, prior=prior, rng=rng)
             start = calibrated_part(projective, calibration)
             metric = config.metric.refine(start, calibration, prior=prior, rng=rng, threads=1)
@@ -293,8 +282,7 @@ def align_parts(
 ) -> Reconstruction | None:
     """Cameras and points of all parts that can be aligned with the largest one, in its frame, or None.
 
-    ``own`` are the ``views`` of each part without the overlap, which take their camera from it. The
-    observations of the ``models`` are those of ``tracks``.
+    ``own`` are the ``views`` of each part without the overlap, which take their camera from it.
     """
     parts = []
     for here, model in zip(views, models, strict=True):
@@ -333,15 +321,12 @@ def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
     if not len(pa):
         return 0, _IDENTITY
     Xb = homogenize(found.apply(b.model.X[pb, :3] / b.model.X[pb, 3:]))
-    offset = _project_each(a.model.P[view], a.model.X[pa]) - _project_each(a.model.P[view], Xb)
+    x = np.einsum("nij,mnj->mni", a.model.P[view], np.stack([a.model.X[pa], Xb]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.nan_to_num(x[..., :2] / x[..., 2:], nan=np.inf)
+        offset = xy[0] - xy[1]
     close = np.linalg.norm(offset, axis=1) < MAX_OFFSET_REL * a.model.sizes[view].max(axis=1)
     return (int(close.sum()), found) if close.mean() >= MIN_AGREEMENT else (0, _IDENTITY)
-
-
-def _project_each(P: F64, X: F64) -> F64:
-    x = np.einsum("nij,nj->ni", P, X)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.nan_to_num(x[:, :2] / x[:, 2:], nan=np.inf))
 
 
 def _poses(model: Reconstruction, views: I64) -> tuple[F64, F64]:
@@ -384,10 +369,11 @@ def _in_one_frame(
     inlier = np.zeros(len(tracks.xy), dtype=bool)
     inlier[k] = np.nan_to_num(offset, nan=np.inf) < MAX_OFFSET_REL * sizes[view].max(axis=1)
     valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=tracks.n_points) >= 2)
-    sigma = float(np.median([part.model.sigma_px for part, _ in placed.values()]))
-    P = K @ np.concatenate([R, t[:, :, None]], axis=2)
-    found = (registered, valid, inlier & valid[tracks.point_index], tracks, sizes, sigma)
-    return Reconstruction("metric", P, X, *found, ("",) * tracks.n_views, K, distortion)
+    return Reconstruction(
+        "metric", compose_camera(K, R, t), X, registered, valid, inlier & valid[tracks.point_index], tracks,
+        sizes, sigma_px=float(np.median([part.model.sigma_px for part, _ in placed.values()])),
+        reasons=("",) * tracks.n_views, K=K, distortion=distortion,
+    )  # fmt: skip
 
 
 def _cameras_in_one_frame(

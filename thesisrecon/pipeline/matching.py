@@ -6,24 +6,26 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
+from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, rows_of_views
-from thesisrecon.config import PipelineConfig
+from thesisrecon.config import KINDS, PipelineConfig
+from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.imaging.on_demand import RecentlyUsed
-from thesisrecon.matching._prepared import strongest_corners, strongest_share
+from thesisrecon.matching._prepared import select_found, strongest_corners, strongest_share
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
-from thesisrecon.pipeline.image_pair import detect_features, match_views, oblique_pairs, prepare_oblique
-from thesisrecon.pipeline.job import Job
 from thesisrecon.pipeline.large_sets import has_narrow_cut
-from thesisrecon.pipeline.run import Batch, Run, stream
-from thesisrecon.records import Features, Image, PairChoice, Tracks, TwoView
+from thesisrecon.pipeline.run import Batch, Job, Run, stream
+from thesisrecon.records import Features, Image, Matches, PairChoice, Seeds, Tracks, TwoView
 
 FEWER, FINAL = "-fewer", "final"
 """Suffix of the records of pairs matched with part of the corners, and name of the record of final pairs."""
@@ -39,6 +41,96 @@ MAX_BATCH, BATCHES_PER_WORKER, MAX_RESULT_BYTES = 64, 8, 2**25
 PAIR_BYTES, MATCH_BYTES = 2**14, 80
 """Pickled bytes of a :class:`TwoView` without matches, at most, and of each match."""
 Prepare = Callable[[Image, Features], Any]
+OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
+ImageInput = str | Path | ArrayLike | Image
+"""A file, an array of levels (H, W), (H, W, 3) or (H, W, 4), a Pillow image, or an :class:`Image`."""
+MASK_REACH = 4.0  # half width, in pixels of its scale, of the window that determines the position of a corner
+
+
+def match_images(config: PipelineConfig, images: tuple[Image, Image], seed: int) -> TwoView:
+    """Match two images; if they do not match, again with seeds of simulated oblique views."""
+    views = [config.matching.prepare(image, detect_features(config, image)) for image in images]
+    masks = images[0].mask, images[1].mask
+    pair = match_views(config, views[0], views[1], (0, 1), seed, masks)
+    if pair.accepted or not oblique_pairs(config):
+        return pair
+    features = [view.features for view in views]
+    views = [prepare_oblique(config, *given) for given in zip(images, features, strict=True)]
+    again = match_views(config, views[0], views[1], (0, 1), seed, masks)
+    return again if again.accepted else pair
+
+
+def detect_features(config: PipelineConfig, image: Image) -> Features:
+    """Detect the features of an image; those with a masked pixel within ``MASK_REACH`` are dropped."""
+    found, clear = config.features.detect(image), _distance_to_mask(image)
+    corners: Features = _unmasked(found, clear)
+    return corners if found.seeds is None else replace(corners, seeds=_unmasked(found.seeds, clear))
+
+
+def oblique_pairs(config: PipelineConfig) -> int:
+    """Number of pairs of an image that are matched again with seeds of simulated oblique views."""
+    wanted: int = getattr(config.matching, "oblique_pairs", 0)
+    return wanted if getattr(config.features, "oblique_tilts", ()) else 0
+
+
+def prepare_oblique(config: PipelineConfig, image: Image, features: Features) -> Any:
+    """Prepare an image for matching with seeds of simulated oblique views."""
+    found: Seeds = config.features.oblique_seeds(image)  # type: ignore[attr-defined]
+    seeds = _unmasked(found, _distance_to_mask(image))
+    return config.matching.prepare(image, replace(features, oblique=seeds))
+
+
+def _distance_to_mask(image: Image) -> Any:
+    """Distance (H, W) px of each pixel to the nearest masked one; None without a mask."""
+    if image.mask is None or image.mask.all():
+        return None
+    return scipy.ndimage.distance_transform_cdt(image.mask, "chessboard")
+
+
+def _unmasked(found: Any, clear: Any) -> Any:
+    if clear is None:
+        return found
+    return select_found(found, values_at(clear, found.xy) > MASK_REACH * found.scale)
+
+
+def values_at(pixels: Any, xy: Any) -> Any:
+    """Values (N,) of an array (H, W) at the nearest pixels."""
+    x, y = (np.clip(np.rint(xy[:, k]).astype(np.int64), 0, pixels.shape[1 - k] - 1) for k in (0, 1))
+    return pixels[y, x]
+
+
+def match_views(
+    config: PipelineConfig, view1: Any, view2: Any, pair: tuple[int, int], seed: int,
+    masks: tuple[B8 | None, B8 | None] = (None, None),
+) -> TwoView:  # fmt: skip
+    """Match two prepared views, estimate F and verify it; a pair without F is rejected with a reason."""
+    rng = stream(seed, "matches", *pair)
+    try:
+        estimate = config.epipolar.estimate
+        matches = config.matching.match(view1, view2, pair=pair, estimate_fundamental=estimate, rng=rng)
+        if type(config.matching) not in OWN_MATCHERS:
+            matches = matches_of(config.matching, matches, pair, (view1, view2))
+    except StageFailure as failure:
+        return _rejected_pair(pair, 0, str(failure))
+    for mask, side in zip(masks, ("xy1", "xy2"), strict=True):
+        if mask is not None:
+            matches = select_found(matches, values_at(mask, getattr(matches, side)))
+    return verify_matches(config, matches, rng)
+
+
+def verify_matches(config: PipelineConfig, matches: Matches, rng: np.random.Generator) -> TwoView:
+    """Estimate F of matches and verify them; a pair without F is rejected with a reason."""
+    try:
+        fit = config.epipolar.estimate(matches.xy1, matches.xy2, rng)
+        return config.verification.verify(matches, fit, rng)
+    except StageFailure as failure:
+        return _rejected_pair((matches.i, matches.j), len(matches.xy1), str(failure))
+
+
+def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoView:
+    index, xy, nan = np.zeros(0, dtype=np.int64), np.zeros((0, 2)), float("nan")
+    F, affine = np.zeros((3, 3)), np.zeros((0, 2, 2))
+    return TwoView(*pair, F, nan, index, index, xy, xy, affine, candidates, nan, False, reason)
 
 
 class FromImages:
@@ -59,7 +151,8 @@ class FromImages:
 
     def prepare(self, job: Job, features: Sequence[Features]) -> Any:
         """The views prepared by the matching method, which tracks are aligned with too."""
-        return _prepared(job, features, job.config.matching.prepare)
+        views = dict(enumerate(zip(job.images, features, strict=True)))
+        return PreparedViews(job.config.matching.prepare, views)
 
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
         """Select the pairs of images to match."""
@@ -194,10 +287,9 @@ class PreparedViews(Sequence[Any]):
 def batch_pairs(
     pairs: Sequence[tuple[int, int]], numbers: Sequence[int], workers: int | None, corners: Sequence[int]
 ) -> list[list[int]]:
-    """Divide the ``numbers`` of pairs into batches, each of pairs of few different views.
+    """Divide the ``numbers`` of pairs (i < j) into batches of few different views.
 
-    The smaller view is first in a pair. A corner is matched once in a pair, so the ``corners`` of each view
-    bound the bytes of a result. ``workers`` None: batches of one pair, in an order that reuses cached views.
+    The ``corners`` of each view bound the bytes of a result. ``workers`` None: batches of one pair.
     """
     first, second = ([pairs[n][side] for n in numbers] for side in (0, 1))
     left = {pairs[numbers[k]]: numbers[k] for k in cached_pair_order(first, second)}
@@ -242,10 +334,6 @@ def _pairs_of_few_views(
             ties.update(near[view])
 
 
-def _prepared(job: Job, features: Sequence[Features], prepare: Prepare) -> PreparedViews:
-    return PreparedViews(prepare, dict(enumerate(zip(job.images, features, strict=True))))
-
-
 def _detect(config: PipelineConfig, image: Image) -> list[Features]:
     return [detect_features(config, image)]
 
@@ -253,10 +341,9 @@ def _detect(config: PipelineConfig, image: Image) -> list[Features]:
 def _matched_in_turn(
     job: Job, views: PreparedViews, pairs: Sequence[tuple[int, int]]
 ) -> tuple[list[TwoView], list[str]]:
-    """Match pairs; in large sets first with part of the corners, then with all where this is not enough.
+    """Match pairs, and return the kind of record of each too; in large sets first with part of the corners.
 
-    It is not enough for weak pairs, and for all pairs of a long sequence, where errors accumulate. Returns
-    the pairs, and the kind of record of each.
+    That is not enough for weak pairs, and for all pairs of a long sequence, where errors accumulate.
     """
     features, matching = views.features, job.config.matching
     if not isinstance(matching, SeedsAndGrowth) or len(features) <= matching.many_images:
@@ -334,8 +421,8 @@ def report_matches(
 ) -> Sequence[TwoView]:  # fmt: skip
     """Report the matched pairs; return them.
 
-    If the final pairs are not exactly the stored records, another record lists the final ones with their
-    ``kinds``, and the reasons of those that are ``rejected`` (by number) because of other pairs.
+    Unless they are the stored records, another record lists their ``kinds``, and the reasons of those that
+    are ``rejected`` (by number) because of other pairs.
     """
     run, rejected, kinds = job.run, rejected or {}, kinds or [""] * len(pairs)
     items = [_item(pair.i, pair.j, kind) for pair, kind in zip(pairs, kinds, strict=True)]
@@ -343,14 +430,17 @@ def report_matches(
         final = {"items": items, "rejected": {items[n]: reason for n, reason in rejected.items()}}
         run.cached("matches", FINAL, run.key("matches", FINAL, final), lambda: final)
     accepted = [pair for pair in pairs if pair.accepted]
-    counts = {
-        "pairs": len(pairs),
-        "accepted": len(accepted),
-        "verified": sum(pair.inliers for pair in accepted),
-        "undetermined": sum(pair.undetermined for pair in accepted),
-    }
+    undetermined = [pair for pair in accepted if pair.undetermined]
+    counts = {"pairs": len(pairs), "accepted": len(accepted)}
+    counts |= {"verified": sum(p.inliers for p in accepted), "undetermined": len(undetermined)}
     metrics = {"median_sigma_px": float(np.median([p.sigma_px for p in accepted]))} if accepted else {}
-    run.finish("matches", counts=counts, metrics=metrics, warnings=_degenerate_pairs(accepted))
+    warnings = list[str]()
+    if 2 * len(undetermined) > len(accepted):
+        found = Counter(pair.configuration for pair in undetermined)
+        listed = ", ".join(f"{count} {kind}" for kind, count in sorted(found.items()))
+        of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
+        warnings.append(Notice("degenerate-pairs", of_all, listed))
+    run.finish("matches", counts=counts, metrics=metrics, warnings=warnings)
     return pairs
 
 
@@ -365,17 +455,6 @@ def final_pairs(records: Mapping[str, Any], features: Sequence[Features]) -> tup
     for item, reason in final["rejected"].items():
         pairs[item] = replace(pairs[item], accepted=False, reason=reason)
     return tuple(pairs.values())
-
-
-def _degenerate_pairs(accepted: Sequence[TwoView]) -> list[str]:
-    """A warning if the epipolar geometry of most pairs is degenerate."""
-    undetermined = [pair for pair in accepted if pair.undetermined]
-    if 2 * len(undetermined) <= len(accepted):
-        return []
-    kinds = Counter(pair.configuration for pair in undetermined)
-    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    of_all = f"{len(undetermined)} of {len(accepted)} accepted pairs"
-    return [Notice("degenerate-pairs", of_all, listed)]
 
 
 def require_accepted_pair(pairs: Sequence[TwoView]) -> None:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import wait
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,10 +25,9 @@ from thesisrecon.io._files import as_read, read_json, write_atomically, write_js
 from thesisrecon.io._images import image_without_pixels
 from thesisrecon.io._meshes import box_in_file, glb_bytes
 from thesisrecon.io._outputs import claim_folder
-from thesisrecon.pipeline.job import name_images
 from thesisrecon.pipeline.matching import final_pairs
-from thesisrecon.pipeline.run import FOLDERS, Run, Until
-from thesisrecon.records import Image, Reconstruction, TexturedMesh
+from thesisrecon.pipeline.run import FOLDERS, Run, Until, name_images
+from thesisrecon.records import Reconstruction, TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult
@@ -69,10 +67,12 @@ def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
     """Write all results of a run; return it with warnings, reports and summary."""
-    result = with_image_names(result)
-    later = _later_end(run.directory.path, until) if failure is None else None
-    if later is None:
+    result, stages = with_image_names(result), get_args(Until)
+    there = read_json(run.directory.path / SUMMARY)
+    later = there.get("until") if isinstance(there, dict) and not there.get("failure") else None
+    if failure is not None or later not in stages[stages.index(until) + 1 :]:
         return _write(run, result, until, failure)
+    # An earlier, longer run in this folder.
     run.warnings.append(Notice("older-outputs", later, "its summary and report are kept"))
     return _described(run, result, until, failure)
 
@@ -82,8 +82,8 @@ def with_image_names(result: RunResult) -> RunResult:
     names = [image.name for image in result.images]
 
     def named(record: Any, *fields: str) -> Any:
-        texts = {name: [name_images(text, names) for text in getattr(record, name)] for name in fields}
-        return replace(record, **{name: tuple(found) for name, found in texts.items()})
+        texts = {field: tuple(name_images(t, names) for t in getattr(record, field)) for field in fields}
+        return replace(record, **texts)
 
     metric, calibration = result.metric, result.calibration
     if metric is not None:
@@ -93,15 +93,6 @@ def with_image_names(result: RunResult) -> RunResult:
         if (report := calibration.identifiability) is not None:
             calibration = replace(calibration, identifiability=named(report, "sentences"))
     return replace(result, metric=metric, calibration=calibration)
-
-
-def _later_end(out: Path, until: str) -> str | None:
-    """The last stage of an earlier, longer run in this folder, if there is one."""
-    summary = read_json(out / SUMMARY)
-    if not isinstance(summary, dict) or summary.get("failure"):
-        return None
-    stages, there = get_args(Until), summary.get("until")
-    return there if there in stages[stages.index(until) + 1 :] else None
 
 
 def _described(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
@@ -124,19 +115,12 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
         colors, affine, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
+        model = made("the model in report.html", for_page.result, warnings, None)
+        depths = made("a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]())
         page = ReportData.of(
-            result,
-            title=run.title,
-            config_text=config,
-            colors=colors,
-            affine=affine,
-            model=made("the model in report.html", for_page.result, warnings, None),
-            depths=made(
-                "a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]()
-            ),
-            until=None if until == "model" else until,
-            end=failure,
-        )
+            result, title=run.title, config_text=config, colors=colors, affine=affine, model=model,
+            depths=depths, until=None if until == "model" else until, end=failure,
+        )  # fmt: skip
         made(PAGE, lambda: write_text(out / PAGE, render_report(page, warnings)), warnings, None)
     run.finish("outputs", counts={})
     summary = {**result.summary, "warnings": [*result.warnings, *warnings], **_run_facts(run, until)}
@@ -197,12 +181,11 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
     tiles = made(TILES, lambda: write_tiles(directory, mesh, smaller), warnings, 0)
     if not tiles:
         directory.remove(TILE_FILES)
-    faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces"
-    limit = f"model.max_glb_mb={max_mb:g}"
     whole_in = [f"{counted(tiles, 'tile')} ({TILES}) hold all in parts"] if tiles else []
     whole_in += [f"{whole.name} holds all"] if whole.is_file() else []
-    reduced_to = f"model.glb is reduced to {faces} and fewer texels ({limit})"
-    return [*warnings, "; ".join([reduced_to, *filter(None, [", and ".join(whole_in)])])]
+    faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces and fewer texels (model.max_glb_mb={max_mb:g})"
+    parts = [f"model.glb is reduced to {faces}", ", and ".join(whole_in)]
+    return [*warnings, "; ".join(filter(None, parts))]
 
 
 def _write_records(directory: RunDirectory, result: RunResult) -> None:
@@ -355,11 +338,16 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
     stages: dict[str, dict[str, Any]] = {stage: {} for stage in FOLDERS}
     stages |= {stage: _records(path) for stage, path in finished.items() if stage != "dense"}
     views, projective = summary["cameras"], list(stages["projective"].values())
-    sizes = projective[0].sizes if projective else [_working_size(view) for view in views]
+    sides = ("width_px", "height_px")
+    scaled = [[int(view[side] * view["working_scale"] + 1e-9) for side in sides] for view in views]
+    sizes = projective[0].sizes.tolist() if projective else scaled
     names = [view["name"] for view in views]
     unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
     features = tuple(stages["features"].values())
-    images = tuple(_image(view, size) for view, size in zip(views, sizes, strict=True))
+    images = tuple(
+        image_without_pixels(view["name"], size, (view["width_px"], view["height_px"]))
+        for view, size in zip(views, sizes, strict=True)
+    )
     groups = np.array([view["camera"] for view in views], dtype=np.int64)
     result = RunResult(
         folder, images, unread, features, final_pairs(stages["matches"], features), groups, run["settings"],
@@ -369,11 +357,13 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         warnings=tuple(summary["warnings"]), summary=summary, failure=summary["failure"] or "",
         further_models=tuple(_further_models(folder, summary)),
     )  # fmt: skip
-    calibration, metric = stages["selfcalibration"].get, partial(_last_metric, stages["metric"])
-    attempts = [
-        replace(result, projective=model, calibration=calibration(item), metric=metric(item))
-        for item, model in stages["projective"].items()
-    ]
+    attempts = list[RunResult]()
+    for item, model in stages["projective"].items():
+        # The last of the metric records of an attempt.
+        found = [stages["metric"].get(f"{item}{suffix}") for suffix in ("-joined", "-more", "")]
+        metric = next((record for record in found if record is not None), None)
+        calibration = stages["selfcalibration"].get(item)
+        attempts.append(replace(result, projective=model, calibration=calibration, metric=metric))
     return with_image_names(best_result(attempts or [result]))
 
 
@@ -382,11 +372,6 @@ def _further_models(folder: Path, summary: Mapping[str, Any]) -> Iterator[RunRes
         part, run = (read_json(folder / group["folder"] / name) for name in (SUMMARY, RUN_FILE))
         if group["registered"] and isinstance(part, dict) and isinstance(run, dict):
             yield load_run(folder / group["folder"], part, run)
-
-
-def _last_metric(records: Mapping[str, Any], item: str) -> Any:
-    """The last of the metric records of an attempt, or None."""
-    return next((records[name] for name in (f"{item}-joined", f"{item}-more", item) if name in records), None)
 
 
 def _keys(folder: Path) -> dict[str, str]:
@@ -399,12 +384,3 @@ def _records(folder: Path) -> dict[str, Any]:
     stage = StageFolder(folder)
     found = {item: stage.load(item, key) for item, key in sorted(_keys(folder).items())}
     return {item: record for item, record in found.items() if record is not None}
-
-
-def _working_size(view: Mapping[str, Any]) -> I64:
-    return np.array([int(view[side] * view["working_scale"] + 1e-9) for side in ("width_px", "height_px")])
-
-
-def _image(view: Mapping[str, Any], size: I64) -> Image:
-    grey = image_without_pixels(view["name"], (int(size[0]), int(size[1])))
-    return Image(grey.name, grey.rgb, (view["width_px"], view["height_px"]))

@@ -3,24 +3,37 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypedDict, get_args
+from typing import Any, Literal, Protocol, TypedDict, get_args
 
 import numpy as np
 
 from thesisrecon._numba import code_digest
+from thesisrecon.arrays import I64
 from thesisrecon.config import PipelineConfig
+from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
-from thesisrecon.errors import Notice, OutputError, UsageError, WorkersLost, counted, unknown_word
+from thesisrecon.errors import (
+    Notice,
+    OutputError,
+    StageFailure,
+    UsageError,
+    WorkersLost,
+    counted,
+    unknown_word,
+)
 from thesisrecon.io._files import read_json
+from thesisrecon.io._images import ImageSet
 from thesisrecon.io._outputs import LOCK_FILE
-from thesisrecon.records import StageReport
+from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
 from thesisrecon.runtime._executors import Workers, available_threads
 from thesisrecon.runtime._run_folder import (
     MANIFEST_FILE,
@@ -58,8 +71,7 @@ class RunOptions(TypedDict, total=False):
 
 def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
     """The random generator of one task (view or pair numbers), which depends only on the arguments."""
-    entropy = [_checked_seed(seed), zlib.crc32(stage.encode()), *ids]
-    return np.random.default_rng(np.random.SeedSequence(entropy))
+    return np.random.default_rng([_checked_seed(seed), zlib.crc32(stage.encode()), *ids])
 
 
 def _checked_seed(seed: Any) -> int:
@@ -98,11 +110,8 @@ class StoredRecords(Sequence[Any]):
             return [self[k] for k in range(*n.indices(len(self)))]
         item, key = self._keys[n]
         record = self._held.get(n % len(self._keys))
-        if record is None:
-            record = self._folder.load(item, key)
-        if record is None:
-            place = f"{self._folder.path}/{item}.npz"
-            raise UsageError(f"{place} was removed or changed while the run used it; repeat the command")
+        if record is None and (record := self._folder.load(item, key)) is None:
+            raise UsageError(Notice("record-lost", self._folder.path / f"{item}.npz"))
         return record
 
 
@@ -119,19 +128,17 @@ class Run:
     images_folder: Path | None = None  #: folder of all images; None: several folders, or images in memory
     masks_folder: Path | None = None
     as_stored: bool = False  #: pixels are those of the files without EXIF rotation, as in COLMAP
-    logs: dict[str, _StageLog] = field(default_factory=dict)
-    reports: dict[str, StageReport] = field(default_factory=dict)
-    resumed: list[str] = field(default_factory=list)  #: stages read from the cache
-    warnings: list[str] = field(default_factory=list)
-    groups: list[dict[str, Any]] = field(default_factory=list)  #: results of the runs inside this one
-    started: float = field(default_factory=time.perf_counter)
-    _stage: str = ""  # the one being computed
+    logs: dict[str, _StageLog] = field(default_factory=dict, init=False)
+    reports: dict[str, StageReport] = field(default_factory=dict, init=False)
+    resumed: list[str] = field(default_factory=list, init=False)  #: stages read from the cache
+    warnings: list[str] = field(default_factory=list, init=False)
+    groups: list[dict[str, Any]] = field(default_factory=list, init=False)  #: results of runs inside this one
+    started: float = field(default_factory=time.perf_counter, init=False)
+    _stage: str = field(default="", init=False)  # the one being computed
 
     def inside(self, directory: RunDirectory) -> Run:
         """A run of a part of the images in a folder of its own, by the same workers."""
-        options = (self.config, self.seed, self.workers, directory, self.progress)
-        title = f"{self.title}, {directory.path.name}"
-        return Run(*options, title, self.images_folder, self.masks_folder, self.as_stored)
+        return replace(self, directory=directory, title=f"{self.title}, {directory.path.name}")
 
     @contextmanager
     def clock(self, stage: str) -> Iterator[_StageLog]:
@@ -146,8 +153,8 @@ class Run:
     def variant_key(self, stage: str) -> list[Any]:
         """The part of a key that identifies the method of a stage: class, parameters and code."""
         variant = getattr(self.config, stage)
-        module = type(variant).__module__
-        return [module, type(variant).__qualname__, table_from_dataclass(variant), code_digest(variant)]
+        kind = type(variant)
+        return [kind.__module__, kind.__qualname__, table_from_dataclass(variant), code_digest(variant)]
 
     def cached(self, stage: str, item: str, key: str, compute: Callable[[], Any]) -> Any:
         """Return the record of one item, from the cache or computed."""
@@ -184,16 +191,13 @@ class Run:
     ) -> StoredRecords:  # fmt: skip
         """The records of all items (item -> key) of a stage, missing ones computed by the workers.
 
-        Records beyond ``max_bytes`` are read when used; ``silent``: no progress; ``here``: in threads
-        of this process, for tasks of little work with large arguments.
+        Records beyond ``max_bytes`` are read when used; ``here``: in threads, for tasks with large arguments.
         """
         progress = (lambda *_: None) if silent else self.progress
         with self.clock(stage) as log:
             log.keys.update(keys)
-            folder = self.directory.stage(FOLDERS[stage])
-            names = list(keys)
+            folder, names, missing = self.directory.stage(FOLDERS[stage]), list(keys), list[int]()
             records = StoredRecords(folder, keys, max_bytes)
-            missing = []
             for n, record in enumerate(self._loaded(stage, keys)):
                 if record is None:
                     missing.append(n)
@@ -226,9 +230,7 @@ class Run:
         try:
             yield
         except WorkersLost as lost:
-            kept = f"Finished work is kept in {self.directory.path}"
-            advice = "repeat the command to resume, with this executor or another"
-            raise WorkersLost(f"{lost} (in the stage {self._stage}). {kept}: {advice}") from None
+            raise WorkersLost(Notice("workers-lost", lost, self._stage, self.directory.path)) from None
         except OutputError as refused:
             raise OutputError(refused.place, refused.error, self.directory.path) from None
 
@@ -255,6 +257,93 @@ class Run:
     def key(self, stage: str, *parts: Any) -> str:
         """Cache key of an item; ``parts`` are everything it depends on: settings, code and inputs."""
         return key_of(FOLDERS[stage], *parts)
+
+
+class FrontEnd(Protocol):
+    """The first stages of Algorithm 1: computed from images, or taken from other programs or another run."""
+
+    @property
+    def divides(self) -> bool:
+        """Whether groups of images that do not overlap are reconstructed one by one."""
+
+    def detect(self, job: Job) -> Sequence[Features]:
+        """Features of each image (4.2.1)."""
+
+    def prepare(self, job: Job, features: Sequence[Features]) -> Sequence[Any]:
+        """The views as matching and tracks take them, made when they are used."""
+
+    def select(self, job: Job, features: Sequence[Features]) -> PairChoice | None:
+        """The pairs of images to match."""
+
+    def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
+        """Matches and epipolar geometry of the pairs (4.2.2, chapter 5)."""
+
+    def track(
+        self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
+    ) -> Tracks:
+        """Tracks through the accepted pairs; ``among``: images of this front end that the job consists of."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What Algorithm 1 works on, and the last stage that is wanted."""
+
+    run: Run
+    inputs: ImageSet
+    front: FrontEnd
+    until: Until
+    surface_required: bool = False  # whether a surface that fails is a failure; otherwise it is a warning
+    known: IntrinsicsPrior | None = None
+    """Prior of the intrinsics, if another model determined them."""
+
+    @property
+    def config(self) -> PipelineConfig:
+        """The settings of the run."""
+        return self.run.config
+
+    @cached_property
+    def images(self) -> Sequence[Image]:
+        """The images at working size."""
+        return self.inputs.images
+
+    @property
+    def names(self) -> list[str]:
+        """File names of the images."""
+        return [image.name for image in self.images]
+
+    @cached_property
+    def sizes(self) -> I64:
+        """Working sizes (V, 2) of the images."""
+        return np.array([image.size for image in self.images], dtype=np.int64)
+
+    @cached_property
+    def prior(self) -> IntrinsicsPrior:
+        """Prior of the intrinsics at working size."""
+        if self.known is not None:
+            return self.known
+        scales = np.array([image.scale for image in self.images])
+        sizes = [image.original_size for image in self.images]
+        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+
+    def require_images(self) -> None:
+        """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""
+        found, needed = len(self.images), 1 if self.until == "features" else 2
+        if found < needed:
+            unread = [f"{name} {reason}" for name, reason in self.inputs.refused.items()]
+            more = [f"and {len(unread) - 3} more"] if len(unread) > 3 else []
+            wanted = f"at least {'two different ones are' if needed == 2 else 'one is'} needed"
+            reason = counted(found, "usable image") if found else "no usable images"
+            evidence = "; ".join([wanted, *unread[:3], *more])
+            raise StageFailure(reason, evidence, "add images of the scene from other places")
+
+
+def name_images(text: str, names: Sequence[str]) -> str:
+    """Replace the image numbers (``#number``) in a sentence of a stage by file names."""
+    # A file name such as "a #1.jpg" in the sentence is left alone.
+    named = re.sub(
+        r"(?<![^\s(])#(\d+)(?!\.?\w)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text
+    )
+    return Notice.of(text.code, named) if isinstance(text, Notice) else named
 
 
 def start_run(
@@ -286,7 +375,12 @@ def run_position(folder: Path) -> str:
     if not isinstance(content, dict):
         return ""
     stage, items, since = _latest_stage(folder)
-    total = _total(folder, stage, len(content.get("images", ())))
+    total = len(content.get("images", ())) if stage == "features" else 0
+    if stage == "matches":
+        manifest = read_json(folder / FOLDERS["pairs"] / MANIFEST_FILE)
+        keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
+        choice = read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
+        total = 0 if choice is None else len(choice.pairs)
     where = f"{stage} begins" if not items else f"{stage}, {counted(len(items), 'item')} done"
     if items and total:
         where = f"{stage}, {len(items)} of {total} done" if len(items) < total else f"{stage} is done"
@@ -311,25 +405,11 @@ def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
     return found
 
 
-def _total(folder: Path, stage: str, images: int) -> int:
-    """Number of items of a stage, 0 if it is not known."""
-    if stage == "features":
-        return images
-    if stage == "matches":
-        manifest = read_json(folder / FOLDERS["pairs"] / MANIFEST_FILE)
-        keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
-        choice = read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
-        return 0 if choice is None else len(choice.pairs)
-    return 0
-
-
 def _seconds_left(items: Sequence[float], total: int, since: float) -> float:
     """Remaining time at the rate of this run's items, without those of an earlier run; 0 if unknown."""
-    new = [when for when in items if when > since]
-    if len(new) < 3 or len(items) >= total:
-        return 0.0
-    rate = (time.time() - since) / len(new)
-    return rate * (total - len(items))
+    new = sum(when > since for when in items)
+    known = new >= 3 and len(items) < total
+    return (time.time() - since) / new * (total - len(items)) if known else 0.0
 
 
 def _in_words(seconds: float) -> str:

@@ -73,18 +73,21 @@ def assess(data: ReportData) -> Assessment:
 
 def key_facts(data: ReportData, overall: ResidualSummary | None) -> list[Fact]:
     """Key facts of a run, if available: cameras, intrinsics, residuals, points and time."""
-    facts = [_registered(data)]
+    facts, best = [_registered(data)], data.best_reconstruction
     if data.metric is not None:
         facts += _intrinsic_facts(data)
     elif data.pairs:
-        facts.append(_pair_fact(data.pairs))
+        accepted = [pair for pair in data.pairs if pair.accepted]
+        note = count_of(sum(pair.inliers for pair in accepted), "verified match")
+        if undetermined := sum(pair.undetermined for pair in accepted):
+            note += f"; {count_of(undetermined, 'pair')} with degenerate epipolar geometry"
+        facts.append(Fact("Pairs accepted", f"{len(accepted)} of {len(data.pairs)}", note))
     if overall is not None:
         note = f"{overall.rms_px:.2f} px RMS over {count_of(overall.count, 'observation')}"
         scales = {image.scale for image in data.images}
         if len(scales) == 1 and scales != {1.0}:
             note += f"; at working size {overall.median_px * scales.pop():.2f} px median"
         facts.append(Fact("Reprojection residual", f"{overall.median_px:.2f} px median", note))
-    best = data.best_reconstruction
     if best is not None:
         points = int(best.valid.sum())
         seen = f"{overall.count / points:.1f} observations per point" if overall and points else ""
@@ -109,14 +112,6 @@ def _registered(data: ReportData) -> Fact:
     return Fact(label, f"{registered} of {total}", note)
 
 
-def _pair_fact(pairs: Sequence[TwoView]) -> Fact:
-    accepted = [pair for pair in pairs if pair.accepted]
-    note = count_of(sum(pair.inliers for pair in accepted), "verified match")
-    if undetermined := sum(pair.undetermined for pair in accepted):
-        note += f"; {count_of(undetermined, 'pair')} with degenerate epipolar geometry"
-    return Fact("Pairs accepted", f"{len(accepted)} of {len(pairs)}", note)
-
-
 def pair_text(pair: TwoView) -> str:
     """Matches, noise and degeneracy of a pair."""
     share = f" ({100 * pair.inliers / pair.candidates:.0f} %)" if pair.candidates else ""
@@ -134,10 +129,9 @@ def pair_selection_text(data: ReportData) -> str:
     """How many of the possible pairs were matched and how they were selected; empty if unknown."""
     if data.pair_choice is None:
         return ""
-    views = len(data.images)
-    possible, tried = views * (views - 1) // 2, len(data.pairs)
-    were = "was" if tried == 1 else "were"
-    return f"{grouped(tried)} of {count_of(possible, 'pair')} {were} matched: {data.pair_choice.how}."
+    tried, views = len(data.pairs), len(data.images)
+    share = f"{grouped(tried)} of {count_of(views * (views - 1) // 2, 'pair')}"
+    return f"{share} {'was' if tried == 1 else 'were'} matched: {data.pair_choice.how}."
 
 
 def model_text(mesh: TexturedMesh) -> str:
@@ -235,9 +229,8 @@ def duration(seconds: float) -> str:
 def _named_number(name: str, value: float) -> tuple[str, str]:
     """Format a key and its value with the unit of its suffix: sigma_px -> ("sigma", "0.31 px")."""
     stem, _, suffix = name.rpartition("_")
-    unit = (
-        {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB", "rel": "%"}.get(suffix) if stem else None
-    )
+    units = {"px": "px", "deg": "°", "s": "s", "mb": "MB", "gb": "GB", "rel": "%"}
+    unit = units.get(suffix) if stem else None
     text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     if unit == "%":
         text = f"{100 * value:.3g}"

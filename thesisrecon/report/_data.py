@@ -27,9 +27,9 @@ MAX_PICTURED = 100
 """Maximum number of images with thumbnails on the page, evenly spread; a table lists the others."""
 
 
-def pictured(images: int) -> list[int]:
-    """Numbers of the images with thumbnails on the page."""
-    spread = np.rint(np.linspace(0, images - 1, min(images, MAX_PICTURED)))
+def pictured(images: int, most: int = MAX_PICTURED) -> list[int]:
+    """Numbers of the images that the page shows: at most so many, evenly spread."""
+    spread = np.rint(np.linspace(0, images - 1, min(images, most)))
     return [int(number) for number in np.unique(spread)]
 
 
@@ -111,10 +111,11 @@ def summarize(result: RunResult) -> dict[str, Any]:
     original = [d / image.scale for d, image in zip(working, result.images, strict=True)]
     everything = np.concatenate([np.zeros(0), *original])
     views = [_view_summary(result, best, i, distances) for i, distances in enumerate(original)]
-    calibration = result.calibration
+    calibration, metric, pairs = result.calibration, result.metric, result.pair_choice
     start = None if calibration is None else calibration.identifiability
-    returned = None if result.metric is None else result.metric.identifiability
+    returned = None if metric is None else metric.identifiability
     tested = returned or calibration
+    accepted = [pair for pair in result.pairs if pair.accepted]
     return {
         "failure": result.failure or None,
         "stratum": best.stratum if best is not None else None,
@@ -125,21 +126,21 @@ def summarize(result: RunResult) -> dict[str, Any]:
         "reprojection_rms_px": _rms(everything),
         "reprojection_median_px": _median(everything),
         "reprojection_median_working_px": _median(np.concatenate([np.zeros(0), *working])),
-        "trusted": result.metric.trusted if result.metric is not None else None,
-        "failed_checks": list(result.metric.failed_checks) if result.metric is not None else [],
-        "limitations": list(result.metric.limitations) if result.metric is not None else [],
+        "trusted": None if metric is None else metric.trusted,
+        "failed_checks": [] if metric is None else list(metric.failed_checks),
+        "limitations": [] if metric is None else list(metric.limitations),
         "identifiable": None if tested is None else tested.identifiable,
         "motion": _motion(returned or start),
         "self_calibration": _start(calibration),
-        "self_check": dict(result.metric.self_check) if result.metric is not None else {},
+        "self_check": {} if metric is None else dict(metric.self_check),
         "pairs": {
-            "selection": result.pair_choice.how if result.pair_choice is not None else None,
+            "selection": None if pairs is None else pairs.how,
             "possible": len(result.images) * (len(result.images) - 1) // 2,
-            "compared": result.pair_choice.compared if result.pair_choice is not None else None,
+            "compared": None if pairs is None else pairs.compared,
             "matched": len(result.pairs),
-            "accepted": sum(pair.accepted for pair in result.pairs),
-            "verified_matches": sum(pair.inliers for pair in result.pairs if pair.accepted),
-            "undetermined": sum(pair.undetermined for pair in result.pairs if pair.accepted),
+            "accepted": len(accepted),
+            "verified_matches": sum(pair.inliers for pair in accepted),
+            "undetermined": sum(pair.undetermined for pair in accepted),
         },
         "depth_maps": _depth_maps(result),
         "model": _model(result),

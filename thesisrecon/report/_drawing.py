@@ -96,29 +96,26 @@ def _spread_matches(xy: F64, count: int) -> I64:
 def _clip_line(line: F64, width: float, height: float) -> tuple[Point, Point] | None:
     """Clip a line a x + b y + c = 0 to an image; None if it misses the image."""
     a, b, c = (float(v) for v in line)
-    low, right, bottom = -0.5, width - 0.5, height - 0.5
-    hits: list[Point] = []
-    if b != 0:
-        hits += [(x, -(a * x + c) / b) for x in (low, right)]
-    if a != 0:
-        hits += [(-(b * y + c) / a, y) for y in (low, bottom)]
-    slack = 1e-6 * max(width, height)
-    low, right, bottom = low - slack, right + slack, bottom + slack
-    inside = [(x, y) for x, y in hits if low <= x <= right and low <= y <= bottom]
+    hits = [(x, -(a * x + c) / b) for x in (-0.5, width - 0.5) if b != 0]
+    hits += [(-(b * y + c) / a, y) for y in (-0.5, height - 0.5) if a != 0]
+    low = -0.5 - 1e-6 * max(width, height)
+    inside = [(x, y) for x, y in hits if low <= x <= width - 1 - low and low <= y <= height - 1 - low]
     return (min(inside), max(inside)) if len(inside) >= 2 else None
 
 
 def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
     """Draw dots, numbers and lines on one image; at twice the size, then reduced for smooth edges."""
-    picture, s = _faded(image)
-    draw = ImageDraw.Draw(picture)
     width, height = image.size
+    s, colour = 2.0 * 640 / max(width, height), _sampled(image)
+    faded = PillowImage.blend(colour.convert("L").convert("RGB"), colour, 0.45).point(lambda v: 0.78 * v)
+    even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
+    picture = faded.resize(even, PillowImage.Resampling.BILINEAR)
+    draw = ImageDraw.Draw(picture)
     r = 3 if len(xy) <= 600 else 2
     for x, y in _to_drawing(xy, s):
         draw.ellipse((x - r, y - r, x + r, y + r), fill="#ffffff", outline="#1b2733")
     for n, line in enumerate(lines):
-        ends = _clip_line(line, width, height)
-        if ends is not None:
+        if (ends := _clip_line(line, width, height)) is not None:
             draw.line([tuple(p) for p in _to_drawing(np.array(ends), s)], fill=HUES[n], width=3)
     font = ImageFont.load_default(size=30)
     for n, (x, y) in enumerate(_to_drawing(xy[chosen], s)):
@@ -127,17 +124,6 @@ def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Im
         at = (x + 15 if x < picture.width - 64 else x - 50, min(max(y - 34, 2), picture.height - 38))
         draw.text(at, str(n + 1), font=font, fill="white", stroke_width=3, stroke_fill="#101418")
     return picture.reduce(2)
-
-
-def _faded(image: Image) -> tuple[PillowImage.Image, float]:
-    """Return the dimmed image at twice the panel size, and its scale from working pixels."""
-    width, height = image.size
-    s = 2.0 * 640 / max(width, height)
-    even = (max(2, 2 * round(s * width / 2)), max(2, 2 * round(s * height / 2)))
-    colour = _sampled(image)
-    grey = colour.convert("L").convert("RGB")
-    faded = PillowImage.blend(grey, colour, 0.45).point(lambda v: 0.78 * v)
-    return faded.resize(even, PillowImage.Resampling.BILINEAR), s
 
 
 def _to_drawing(xy: F64, s: float) -> list[Point]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64, I64, distinct_corners
 from thesisrecon.camera import decompose_camera, finite_cameras
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -91,8 +91,7 @@ def _scene(X: F64, index: I64, views: I64, cameras: tuple[F64, F64, list[F64]], 
 def upright_rotation(rotations: F64) -> F64:
     """Rotation (3, 3) of the world that puts z up and the mean viewing direction along +y.
 
-    Cameras are assumed to be held level: up is orthogonal to their x axes. A small weight on the optical axes
-    decides if all x axes are parallel; the sign is that of the mean upward image direction.
+    Cameras are assumed to be held level: up is orthogonal to their x axes, else to the optical axes.
     """
     x_axes, y_axes, z_axes = rotations[:, 0], rotations[:, 1], rotations[:, 2]
     _, vectors = np.linalg.eigh(x_axes.T @ x_axes + 0.1 * z_axes.T @ z_axes)
@@ -118,14 +117,12 @@ def _near(reconstruction: Reconstruction, views: I64) -> B8:
 
 
 def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
-    kept = np.flatnonzero(valid & np.isfinite(X).all(axis=1)).astype(np.int64)
+    kept = np.flatnonzero(valid & np.isfinite(X).all(axis=1))
     if len(kept) == 0:
         return kept
-    X = X[kept, :3]
-    distance = np.linalg.norm(X - np.median(X, axis=0), axis=1)
-    near: I64 = kept[distance <= 4.0 * np.quantile(distance, 0.8)].astype(np.int64)
-    step = max(1, int(np.ceil(len(near) / max_points)))
-    return near[::step]
+    distance = np.linalg.norm(X[kept, :3] - np.median(X[kept, :3], axis=0), axis=1)
+    near: I64 = kept[distance <= 4.0 * np.quantile(distance, 0.8)]
+    return near[:: max(1, -(-len(near) // max_points))]
 
 
 def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
@@ -139,8 +136,7 @@ def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
 
 def _pyramid_depth(centres: F64, points: F64) -> float:
     """Choose a depth that separates neighbouring pyramids, 4 to 15 % of the scene radius."""
-    everything = np.concatenate([centres, points])
-    reach = float(np.linalg.norm(np.ptp(everything, axis=0))) / 2 or 1.0
+    reach = float(np.linalg.norm(np.ptp(np.concatenate([centres, points]), axis=0))) / 2 or 1.0
     if len(centres) < 2:
         return 0.15 * reach
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)
@@ -155,7 +151,12 @@ def scene_figure(
     scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | str | None, *, accent: str = _ACCENT
 ) -> Figure:
     """Cameras and points as a plotly.js figure; ``colors`` are those of the points X, or one for all."""
-    scene, digits = _about_middle(scene), _useful_digits(scene)
+    # About the middle: WebGL draws in single precision, too coarse far from the origin.
+    parts, middle = ("points", "centres", "corners", "low", "high"), 0.5 * (scene.low + scene.high)
+    scene = replace(scene, **{name: getattr(scene, name) - middle for name in parts})
+    # Decimals that keep 1e-4 of the size.
+    largest = float((scene.high - scene.low).max())
+    digits = int(np.clip(4 - np.floor(np.log10(max(largest, 1e-12))), 0, 15))
     paint: object = "#9fb4c7" if colors is None else colors
     if isinstance(colors, np.ndarray):
         paint = [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
@@ -178,12 +179,6 @@ def scene_figure(
     return {"data": [points, _pyramids(scene, digits, accent), centres], "layout": layout}
 
 
-def _about_middle(scene: Scene) -> Scene:
-    """The scene about its middle: WebGL draws in single precision, too coarse far from the origin."""
-    names, middle = ("points", "centres", "corners", "low", "high"), 0.5 * (scene.low + scene.high)
-    return replace(scene, **{name: getattr(scene, name) - middle for name in names})
-
-
 def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
     marker = {"size": size, "color": color, "line": {"width": 0}}
     return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
@@ -192,8 +187,7 @@ def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
 def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
     """Draw pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
     rows: list[list[float] | None] = []
-    count = len(scene.centres)
-    shown = np.unique(np.rint(np.linspace(0, count - 1, min(count, MAX_PYRAMIDS))).astype(int))
+    shown = pictured(len(scene.centres), MAX_PYRAMIDS)
     for centre, corners in zip(scene.centres[shown], scene.corners[shown], strict=True):
         top = corners[:2].mean(axis=0) + 0.25 * (corners[:2].mean(axis=0) - corners.mean(axis=0))
         strokes = [[*corners, corners[0]], [corners[0], top, corners[1]]]
@@ -293,25 +287,16 @@ def histograms(distances: Sequence[F64], *, width: float, height: float) -> tupl
     for d in distances:
         counts, _ = np.histogram(np.minimum(d, limit_px), bins=28, range=(0.0, limit_px))
         shares.append(counts / max(len(d), 1))
-    tallest = max((float(s.max()) for s in shares), default=1.0)
-    return limit_px, [_histogram_path(s, tallest, width, height) for s in shares]
-
-
-def _histogram_path(shares: F64, tallest: float, width: float, height: float) -> str:
-    """Draw the bars; the share ``tallest`` fills the box."""
-    step = width / max(len(shares), 1)
-    strokes = []
-    for n, share in enumerate(shares.tolist()):
-        bar = min(share / max(tallest, 1e-12), 1.0) * height
-        if bar > 0:
-            strokes.append(f"M{n * step:.1f} {height:.1f}v-{bar:.1f}h{0.86 * step:.2f}v{bar:.1f}z")
-    return "".join(strokes)
-
-
-def _useful_digits(scene: Scene) -> int:
-    """Return the decimals that keep 1e-4 of the scene size."""
-    extent = float((scene.high - scene.low).max())
-    return int(np.clip(4 - np.floor(np.log10(max(extent, 1e-12))), 0, 15))
+    tallest, step = max((float(s.max()) for s in shares), default=1.0), width / 28
+    bars = [np.minimum(s / max(tallest, 1e-12), 1.0) * height for s in shares]
+    return limit_px, [
+        "".join(
+            f"M{n * step:.1f} {height:.1f}v-{bar:.1f}h{0.86 * step:.2f}v{bar:.1f}z"
+            for n, bar in enumerate(own.tolist())
+            if bar > 0
+        )
+        for own in bars
+    ]
 
 
 def _xyz(points: F64, digits: int) -> Figure:
@@ -334,11 +319,13 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     """Build the JSON data of the 3D viewer; z is up.
 
     ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
-    uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` a JPEG; ``viewpoints`` of the
-    images with pictures, the most central one as ``start``. Faces beyond 8 times the 95 % quantile from the
-    median are left out.
+    uint8, ``indices`` (M, 3) uint32, each little-endian in base64; ``texture`` is a JPEG.
     """
-    mesh = _without_outliers(mesh)
+    distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
+    keep = (distance <= 8.0 * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
+    if keep.any():
+        # Far faces would leave few quantization levels for the rest.
+        mesh = replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
     views = np.flatnonzero(reconstruction.registered).tolist()
     rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
     upright = upright_rotation(rotations)
@@ -358,15 +345,6 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     }  # fmt: skip
 
 
-def _without_outliers(mesh: TexturedMesh) -> TexturedMesh:
-    """Remove far faces, which would leave few quantization levels for the rest, if there is a rest."""
-    distance = np.linalg.norm(mesh.vertices - np.median(mesh.vertices, axis=0), axis=1)
-    keep = (distance <= 8.0 * np.quantile(distance, 0.95))[mesh.faces].all(axis=1)
-    if not keep.any():
-        return mesh
-    return replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
-
-
 def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
     """Return the colour data, the faces (M, 3) and the vertex of each corner."""
     every = np.arange(len(mesh.vertices))
@@ -378,23 +356,16 @@ def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
     height, width = mesh.texture.shape[:2]
     # (0, 0) is the centre of the first texel; WebGL counts from its corner.
     uv = np.clip((mesh.uv + 0.5) / (width, height), 0.0, 1.0)
-    corners = np.column_stack([mesh.faces.ravel(), np.rint(LEVELS * uv.reshape(-1, 2)).astype(np.int64)])
-    # Sorting one integer key per corner is ten times faster than sorting rows.
-    key = (corners[:, 0] * (LEVELS + 1) + corners[:, 1]) * (LEVELS + 1) + corners[:, 2]
-    _, first, index = np.unique(key, return_index=True, return_inverse=True)
-    texture = embed_jpeg(_within(mesh.texture), quality=82).uri
-    color = {"uv": _packed(corners[first, 1:].astype("<u2")), "texture": texture}
-    return color, index.reshape(-1, 3).astype(np.int64), corners[first, 0]
-
-
-def _within(texture: NDArray[np.uint8]) -> PillowImage.Image:
-    """Reduce the texture to at most ``MAX_TEXELS``."""
-    picture = PillowImage.fromarray(texture)
+    vertex, levels = mesh.faces.ravel(), np.rint(LEVELS * uv.reshape(-1, 2)).astype(np.int64)
+    first, index = distinct_corners(vertex, levels)
+    picture = PillowImage.fromarray(mesh.texture)
     scale = np.sqrt(MAX_TEXELS / (picture.width * picture.height))
-    if scale >= 1.0:
-        return picture
-    size = max(1, int(scale * picture.width)), max(1, int(scale * picture.height))
-    return picture.resize(size, PillowImage.Resampling.BOX)
+    if scale < 1.0:
+        size = max(1, int(scale * picture.width)), max(1, int(scale * picture.height))
+        picture = picture.resize(size, PillowImage.Resampling.BOX)
+    texture = embed_jpeg(picture, quality=82).uri
+    color = {"uv": _packed(levels[first].astype("<u2")), "texture": texture}
+    return color, index.reshape(-1, 3), vertex[first]
 
 
 def _viewpoints(

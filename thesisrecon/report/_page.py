@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from thesisrecon import __version__
@@ -37,7 +36,6 @@ from thesisrecon.report._data import (
 )
 from thesisrecon.results import ModelComparison
 
-_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT = 200.0, 44.0
 _INTRINSICS = {
     "focal_px": "Focal length (px)", "aspect": "Aspect (fy/fx)", "skew_px": "Skew (px)",
     "principal_x_px": "Principal x (px)", "principal_y_px": "Principal y (px)", "k1": "k1", "k2": "k2",
@@ -99,9 +97,7 @@ def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]
     return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
 
 
-def strip_page(
-    title: str, frames: Sequence[tuple[str, NDArray[np.uint8]]], *, notes: Sequence[str] = ()
-) -> str:
+def strip_page(title: str, frames: Sequence[tuple[str, U8]], notes: Sequence[str] = ()) -> str:
     """Render the page of a view sequence."""
     script, shown = page_resource("strip.js"), []
     for caption, rgb in frames:
@@ -145,7 +141,7 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
     overall = summarize_distances(np.concatenate([np.zeros(0), *distances]))
-    size = {"width": _HISTOGRAM_WIDTH, "height": _HISTOGRAM_HEIGHT}
+    size = {"width": 200.0, "height": 44.0}
     drawn = pictures.make("the histograms of the residuals", figures.histograms, distances, **size)
     limit_px, bars = drawn or (1.0, [""] * len(distances))
     plotted, shown, omitted = _figures(data, names, pictures)
@@ -166,39 +162,30 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     scripts, content = _figure_content(plotted)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     cards = _cards(data, distances, bars, pictures)
+    estimated = {"focal_px", "principal_x_px", "principal_y_px", "k1"}.union(
+        name for view in data.original_intrinsics for name, found in view.items() if found.std != 0.0
+    )
+    lists = {name: value for name, value in data.summary.items() if isinstance(value, list)}
+    sizes = {name: len(value) for name, value in lists.items() if len(value) > MAX_PICTURED}
+    long = {name: f"{size} entries, see summary.json" for name, size in sizes.items()}
     return render_page(
         page_resource("template.html.j2"), [*scripts, *model_scripts],
         filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
-        count_of=words.count_of, data=data, version=__version__, assessment=words.assess(data),
-        facts=words.key_facts(data, overall), overall=overall, cards=cards,
-        unpictured=[card for card in cards if card["picture"] is None],
-        intrinsic_columns=_intrinsic_columns(data), limit_px=limit_px, model=model,
-        model_text=words.model_text(data.model) if data.model is not None else "", depths=depths,
-        held_out=held_out, scale=drawing.SCALE, difference_limit=round(drawing.DIFFERENCE_LIMIT), **content,
-        shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS,
+        text=words, data=data, version=__version__, overall=overall, cards=cards, depths=depths, model=model,
+        intrinsic_columns=[(name, heading) for name, heading in _INTRINSICS.items() if name in estimated],
+        limit_px=limit_px, held_out=held_out, scale=drawing.SCALE, stages=_stages(data.reports), **content,
+        difference_limit=round(drawing.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
+        shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
-        pair_selection=words.pair_selection_text(data), drawn_pairs=_drawn_pairs(data, pictures),
-        listed_pairs=sorted(data.pairs, key=lambda pair: -pair.inliers)[:120], stages=_stages(data.reports),
-        warnings=_warnings(data, pictures.warnings), limit_known=drawn is not None,
-        self_check=words.named_numbers(data.metric.self_check) if data.metric is not None else [],
-        summary_text=json.dumps(_shortened(data.summary), indent=2, ensure_ascii=False, default=str),
-        model_scripts=model_scripts, histogram_size=(_HISTOGRAM_WIDTH, _HISTOGRAM_HEIGHT),
+        warnings=_warnings(data, pictures.warnings), model_scripts=model_scripts,
+        histogram_size=tuple(size.values()),
+        summary_text=json.dumps({**data.summary, **long}, indent=2, ensure_ascii=False, default=str),
     )  # fmt: skip
 
 
 def _sharing(images: int) -> int:
     """Number of thumbnails that share a size budget: that of the images, at most twice ``MAX_PICTURED``."""
     return min(images, 2 * MAX_PICTURED)
-
-
-def _shortened(summary: Mapping[str, object]) -> dict[str, object]:
-    """The summary without lists of more than ``MAX_PICTURED`` entries."""
-    return {
-        name: f"{len(value)} entries, see summary.json"
-        if isinstance(value, list) and len(value) > MAX_PICTURED
-        else value
-        for name, value in summary.items()
-    }
 
 
 def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
@@ -252,13 +239,6 @@ def _cards(
         estimated = {name: words.plus_minus(v.value, v.std) for name, v in intrinsics[i].items()}
         cards.append({**card, "intrinsics": estimated})
     return cards
-
-
-def _intrinsic_columns(data: ReportData) -> list[tuple[str, str]]:
-    """Return (name, heading) of the table columns: the usual intrinsics and all estimated ones."""
-    views, usual = data.original_intrinsics, {"focal_px", "principal_x_px", "principal_y_px", "k1"}
-    shown = usual | {name for view in views for name, interval in view.items() if interval.std != 0.0}
-    return [(name, text) for name, text in _INTRINSICS.items() if name in shown]
 
 
 def _state(data: ReportData, i: int) -> tuple[str, str, str]:

@@ -27,7 +27,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
-from thesisrecon.errors import UsageError, WorkersLost, unknown_word
+from thesisrecon.errors import Notice, UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
 
 P = ParamSpec("P")
@@ -51,8 +51,7 @@ def _dask_place(executor: str) -> str:
     """HOST:PORT of ``dask://HOST:PORT``."""
     found = re.fullmatch(r"dask://((?:[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5}))", executor)
     if found is None or not 0 < int(found[2]) < 65536:
-        form = "dask://HOST:PORT, for example dask://localhost:8786"
-        raise UsageError(f"a Dask scheduler must be given as {form}; got {executor!r}")
+        raise UsageError(Notice("no-scheduler-address", executor))
     return found[1]
 
 
@@ -74,8 +73,7 @@ class Cluster:
         now = time.monotonic()
         self._alone_since = 0.0 if self._threads() else self._alone_since or now
         if self._alone_since and now - self._alone_since > WORKERLESS_S:
-            alone = f"has had no worker for {WORKERLESS_S:.0f} s"
-            raise WorkersLost(f"the Dask scheduler at {self.address} {alone}")
+            raise WorkersLost(Notice("cluster-alone", self.address, WORKERLESS_S))
 
     def lost(self) -> WorkersLost:
         """The error for tasks that were cancelled."""
@@ -90,6 +88,14 @@ class Cluster:
         return found
 
 
+class _Remote(NamedTuple):
+    """A running executor, its number of workers and its cluster, if any."""
+
+    executor: futures.Executor
+    parallel: Callable[[], int]
+    cluster: Cluster | None = None
+
+
 @contextmanager
 def _connect_dask(executor: str) -> Iterator[Cluster]:
     """Connect to a Dask scheduler for the duration of a block."""
@@ -98,24 +104,19 @@ def _connect_dask(executor: str) -> Iterator[Cluster]:
         import dask
         from distributed import Client
     except ImportError:
-        missing = "needs the package distributed, which is not installed; install the extra distributed"
-        raise UsageError(f"--executor {executor} {missing}") from None
+        raise UsageError(Notice("no-distributed", executor)) from None
     # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
     with _quiet("distributed"), dask.config.set(settings):
         try:
             client = Client(f"tcp://{place}", timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
-            raise UsageError(
-                f"no Dask scheduler answers at {place} within {ANSWER_S:.0f} s; "
-                "start one there (dask scheduler) and its workers (dask worker), or correct the address"
-            ) from None
+            raise UsageError(Notice("no-scheduler", place, ANSWER_S)) from None
         try:
             try:
                 client.wait_for_workers(1, timeout=ANSWER_S)
             except (OSError, futures.TimeoutError):
-                advice = f"start some with: dask worker tcp://{place}"
-                raise UsageError(f"the Dask scheduler at {place} has no workers; {advice}") from None
+                raise UsageError(Notice("no-dask-workers", place)) from None
             # By default results pass through the scheduler. Arguments must: scattered ones would be lost with
             # their worker.
             client.direct_to_workers = _reachable(client.nthreads())
@@ -181,8 +182,7 @@ class Workers:
         if self.threads < 1:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
         if not isinstance(self.executor, str | futures.Executor):
-            known = f"{', '.join(NAMES)} or a concurrent.futures.Executor"
-            raise UsageError(f"executor must be {known}; got {self.executor!r}")
+            raise UsageError(Notice("no-executor", ", ".join(NAMES), self.executor))
         if _is_dask_address(self.executor):
             _dask_place(str(self.executor))
         elif isinstance(self.executor, str) and self.executor not in NAMES:
@@ -234,7 +234,10 @@ class Workers:
 
     def map_all(self, function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
         """Map a function over items in threads, for short tasks such as reading files."""
-        with _thread_pool(self.threads) as pool:
+        # Imported here: `thesisrecon --help` needs no compiler.
+        from thesisrecon._numba import ThreadPool
+
+        with ThreadPool(self.threads) as pool:
             return list(pool.map(function, items))
 
     @contextmanager
@@ -245,7 +248,9 @@ class Workers:
             with _connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
         elif self.executor == "local" or (pool := _processes(self.threads)) is None:
-            with _thread_pool(self.threads) as threads:
+            from thesisrecon._numba import ThreadPool
+
+            with ThreadPool(self.threads) as threads:
                 yield _Remote(threads, lambda: self.threads)
         else:
             try:
@@ -254,13 +259,6 @@ class Workers:
             finally:
                 # After an error the processes end at once.
                 pool.abandon()
-
-
-def _thread_pool(threads: int) -> futures.ThreadPoolExecutor:
-    # Imported here: `thesisrecon --help` needs no compiler.
-    from thesisrecon._numba import ThreadPool
-
-    return ThreadPool(threads)
 
 
 def _processes(count: int) -> ProcessPool | None:
@@ -276,14 +274,6 @@ def _processes(count: int) -> ProcessPool | None:
             return None
         opened.pop_all()
         return pool
-
-
-class _Remote(NamedTuple):
-    """A running executor, its number of workers and its cluster, if any."""
-
-    executor: futures.Executor
-    parallel: Callable[[], int]
-    cluster: Cluster | None = None
 
 
 def _run_all(
@@ -309,7 +299,11 @@ def _run_all(
                 answer = future.result()
                 finished(waiting.pop(future), pickle.loads(answer) if pickled else answer)
     except (futures.BrokenExecutor, futures.CancelledError) as error:
-        raise _lost(remote, error) from None
+        if remote.cluster is not None:
+            raise remote.cluster.lost() from None
+        if isinstance(error, futures.BrokenExecutor):
+            raise WorkersLost("a worker process ended unexpectedly (killed, or out of memory)") from None
+        raise WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled its tasks") from None
     finally:
         for future in waiting:
             future.cancel()
@@ -320,25 +314,14 @@ def _pickled(task: Any) -> bytes:
         return pickle.dumps(task, 5)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         # A lambda, an inner function, or an object that belongs to this process.
-        advice = "define it at the top of a file, or use the executor local"
-        raise UsageError(f"a method cannot be sent to another process ({error}); {advice}") from None
-
-
-def _lost(remote: _Remote, error: BaseException) -> WorkersLost:
-    if remote.cluster is not None:
-        return remote.cluster.lost()
-    if isinstance(error, futures.BrokenExecutor):
-        return WorkersLost("a worker process ended unexpectedly (killed, or out of memory)")
-    return WorkersLost(f"the executor ({type(remote.executor).__name__}) cancelled its tasks")
+        raise UsageError(Notice("unpicklable-method", error)) from None
 
 
 def _answer(key: str, task: bytes) -> bytes:
     """Run a pickled task in a worker; other code would give results with a wrong cache key."""
     if package_key() != key:
-        raise UsageError(
-            f"a worker ({multiprocessing.current_process().name} on {os.uname().nodename}) runs another "
-            "version of thesisrecon than this program; install the same version there"
-        )
+        worker = f"{multiprocessing.current_process().name} on {os.uname().nodename}"
+        raise UsageError(Notice("other-version", worker))
     try:
         function, given = pickle.loads(task)
     except (ImportError, AttributeError) as error:

@@ -51,8 +51,12 @@ def listed_kernels(until: str) -> list[str]:
 def kernel_and_types(line: str) -> tuple[Any, tuple[Any, ...]]:
     """Kernel of a line of the list, and the types of its arguments."""
     name, _, arguments = line.partition("(")
-    names = vars(types) | {"tuple_of": _tuple_of, "__builtins__": {}}
-    return _named(name), eval(f"({arguments}", names)
+
+    def tuple_of(kind: str, *parts: Any) -> Any:
+        named = _named(kind) if kind else None
+        return types.BaseTuple.from_types(parts, named)  # type: ignore[no-untyped-call]
+
+    return _named(name), eval(f"({arguments}", vars(types) | {"tuple_of": tuple_of, "__builtins__": {}})
 
 
 def _named(name: str) -> Any:
@@ -60,16 +64,13 @@ def _named(name: str) -> Any:
     return getattr(importlib.import_module(f"{PACKAGE.name}.{module}"), attribute)
 
 
-def _tuple_of(kind: str, *parts: Any) -> Any:
-    return types.BaseTuple.from_types(  # type: ignore[no-untyped-call]
-        parts, _named(kind) if kind else None
-    )
-
-
 def precompile(until: str, workers: int, progress: Callable[[str, int, int], None]) -> None:
     """Compile the kernels of the stages up to one with several processes, unless that was done before."""
     lines = listed_kernels(until)
-    done = cache_folder() / f"complete-{_code_and_machine(lines)}"
+    dispatcher: Any = copy_to
+    processor = dispatcher.targetctx.codegen().magic_tuple()
+    key = key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
+    done = cache_folder() / f"complete-{key}"
     if done.exists() or not lines or vars(numba.config)["DISABLE_JIT"]:
         return
     progress("kernels", 0, len(lines))
@@ -78,12 +79,6 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
     if finished == len(lines):
         with suppress(OSError):
             done.touch()
-
-
-def _code_and_machine(lines: Sequence[str]) -> str:
-    dispatcher: Any = copy_to
-    processor = dispatcher.targetctx.codegen().magic_tuple()
-    return key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon import records
-from thesisrecon.errors import OutputError, UsageError
+from thesisrecon.errors import Notice, OutputError, UsageError
 from thesisrecon.io._files import (
     as_read,
     is_partial,
@@ -269,27 +269,21 @@ class RunDirectory:
             paths = sorted(self.path.iterdir()) if os.path.lexists(self.path) else []
             strange = [p.name for p in paths if p.is_symlink() or not outputs.lists(outputs.name_of(p))]
             if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
-                what = f"{foreign[0]!r}, which thesisrecon did not create; choose an empty or a new folder"
-                raise UsageError(f"the output folder {self.path} holds {what}")
+                raise UsageError(Notice("foreign-file", self.path, foreign[0]))
             return False
-        there, difference = self._identity()
+        there, difference = None, ""
+        try:
+            there = json.loads(read_bytes(self.path / RUN_FILE).decode("utf-8"))
+        except OSError as error:
+            difference = f"its {RUN_FILE} cannot be read: {error.strerror or error}"
+        except (ValueError, RecursionError):
+            difference = f"its {RUN_FILE} is damaged, or was not written by thesisrecon"
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
         difference = difference or next(_differences(there, as_read(identity)), "")
         if difference and not overwrite:
-            advice = "use --overwrite (overwrite=True) to replace it (unaffected stages are reused)"
-            held = f"the output folder {self.path} holds another run ({difference})"
-            raise UsageError(f"{held}; choose another folder, or {advice}")
+            raise UsageError(Notice("another-run", self.path, difference))
         return bool(difference)
-
-    def _identity(self) -> tuple[Any, str]:
-        """The content of the run file, and why it cannot be read."""
-        try:
-            return json.loads(read_bytes(self.path / RUN_FILE).decode("utf-8")), ""
-        except OSError as error:
-            return None, f"its {RUN_FILE} cannot be read: {error.strerror or error}"
-        except (ValueError, RecursionError):
-            return None, f"its {RUN_FILE} is damaged, or was not written by thesisrecon"
 
 
 def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:

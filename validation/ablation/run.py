@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, unknown_word
 from thesisrecon.io._files import read_json, write_json
-from thesisrecon.io._outputs import join_claim
+from thesisrecon.io._outputs import clear_folder, join_claim
 from thesisrecon.runtime._executors import ProcessPool, available_threads
 from validation.ablation.changes import Setting, Source, loaded_sources
 from validation.ablation.plan import Plan, PlannedRow, plan_study
@@ -78,8 +78,8 @@ def ablate(
     ``on_progress`` gets a sentence when a row or a shared step has ended. Errors of a row are stored in it.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
-    with join_claim(store.path) as outputs:
-        outputs.clear(store.path / WORK)
+    with join_claim(store.path):
+        clear_folder(store.path / WORK)
         store.prepare()
         todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
         with _workers(executor, threads) as workers:

@@ -16,7 +16,7 @@ from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.io._images import read_images
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline.matching import match_views
 from thesisrecon.records import Image, TwoView
 from validation.metrics.fundamental_precision import RIGHT_PX, rms_epipolar_distance
 from validation.references.libraries import NoReference

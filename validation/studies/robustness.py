@@ -25,8 +25,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from thesisrecon.cli.main import run_command
-from thesisrecon.errors import NOT_MADE, REMEDIES
+from thesisrecon.cli.commands import run_command
+from thesisrecon.errors import NOT_MADE, remedies
 from thesisrecon.runtime._signals import CODES
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import Rows, text_table
@@ -47,7 +47,7 @@ def torn(descriptor):
         os.kill(os.getpid(), signal.SIGKILL)
     sync(descriptor)
 os.fsync = torn
-from thesisrecon.cli.main import run_command
+from thesisrecon.cli.commands import run_command
 sys.exit(run_command(sys.argv[1:]))
 """  # Program that kills itself with its n-th file half written
 
@@ -87,7 +87,7 @@ class Ended:
         complete = self.code == 0 and NOT_MADE in self.message
         more = {
             "names no place": " cannot be written: " not in self.message,
-            "does not say what to do": not any(words in self.message for words in REMEDIES.values()),
+            "does not say what to do": not any(words in self.message for words in remedies().values()),
             f"strange files: {', '.join(self.strange)}": bool(self.strange),
         }
         return self.faults(None if complete else 2, more)

@@ -20,7 +20,7 @@ from thesisrecon.config import PipelineConfig, preset
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import symmetric_residuals
-from thesisrecon.pipeline.image_pair import match_images
+from thesisrecon.pipeline.matching import match_images
 from thesisrecon.records import Image
 from validation.references.libraries import cv2
 from validation.references.sift import sift_front_end

@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.io._images import read_images
-from thesisrecon.pipeline.image_pair import match_views
+from thesisrecon.pipeline.matching import match_views
 from thesisrecon.records import Image
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
