@@ -382,10 +382,11 @@ class ModelComparison(Record):
                 path = 0.0
         if len(ends) < 2:
             raise ValueError(f"the path of {steps.sum():.4g} is shorter than the distance {distance:g}")
-        i, j = np.array(ends[:-1]), np.array(ends[1:])
-        E = np.linalg.solve(np.linalg.solve(B[i], B[j]), np.linalg.solve(A[i], A[j]))
+        first, last = np.array(ends[:-1]), np.array(ends[1:])
+        motion, motion_b = np.linalg.solve(A[first], A[last]), np.linalg.solve(B[first], B[last])
+        E = np.linalg.solve(motion_b, motion)
         angle = scipy.spatial.transform.Rotation.from_matrix(E[:, :3, :3]).magnitude()
-        pairs = np.stack([order[i], order[j]], axis=1)
+        pairs = np.stack([order[first], order[last]], axis=1)
         return RelativeErrors(pairs, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(angle))
 
     def as_table(self) -> dict[str, Any]:
