@@ -141,8 +141,9 @@ def as_cameras(
 
 def named_cameras(caller: str, cameras: Any) -> Any:
     """The cameras by name of a run, a folder or a model of other kinds; anything else as it is."""
-    known = Reconstruction | Mapping | list | tuple | np.ndarray
-    if cameras is None or isinstance(cameras, known | int | float):
+    if cameras is None or isinstance(
+        cameras, Reconstruction | Mapping | list | tuple | np.ndarray | int | float
+    ):
         return cameras
     if not isinstance(cameras, Sequence) or isinstance(cameras, str):
         return cameras_by_name(caller, cameras)
@@ -187,7 +188,7 @@ def calibrated_arrays(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F6
     return K, R, t
 
 
-def checked_sizes(caller: str, sizes: I64, n: int) -> I64:
+def checked_sizes(caller: str, sizes: I64 | F64, n: int) -> I64:
     """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
     (given,) = numbers(caller, sizes=sizes)
     if given.shape not in ((2,), (n, 2)):

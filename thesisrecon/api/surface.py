@@ -259,7 +259,7 @@ def fuse_depth_maps(
     if not isinstance(model, SurfaceModel):
         raise UsageError(f"fuse_depth_maps needs a SurfaceModel as config.model; got {type(model).__name__}")
     if all(isinstance(one, DepthMap) for one in depth_maps):
-        return model.surface_of(depth_maps, threads=threads)  # type: ignore[arg-type]
+        return model.surface_of(depth_maps, threads=threads)
     if cameras is None:
         raise ValueError("fuse_depth_maps needs the cameras of plain depths")
     views = as_cameras("fuse_depth_maps", cameras, sizes)
@@ -267,7 +267,7 @@ def fuse_depth_maps(
         message = f"fuse_depth_maps needs a camera per depth map; got {len(views)} and {len(depth_maps)}"
         raise ValueError(message)
     given = enumerate(zip(depth_maps, views, strict=True))
-    return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)  # type: ignore[arg-type]
+    return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)
 
 
 def texture(
