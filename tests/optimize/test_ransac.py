@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon import StageFailure, estimate_fundamental, estimate_homography, resect
+from thesisrecon.epipolar.homography import _add_equations, squared_plane_distances
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import _real_quartic_roots
 from thesisrecon.optimize.ransac import draw_samples
@@ -70,7 +71,7 @@ def test_a_small_budget_ends_the_search_and_is_named():
     refuses(StageFailure, "best of 64 samples", resect, X, xy, max_samples=64)
     for call, data in ((estimate_homography, (xy1, xy2)), (resect, (X, xy))):
         refuses(ValueError, "confidence must lie between 0 and 1; got 1", call, *data, confidence=1.0)
-        refuses(ValueError, "max_samples must be a whole number", call, *data, max_samples=0)
+        refuses(ValueError, "a whole number of at least 1 as max_samples", call, *data, max_samples=0)
 
 
 @pytest.mark.parametrize("n", [20, 200])
@@ -164,3 +165,37 @@ def test_roots_of_quartics_are_those_of_the_companion_matrix():
         np.testing.assert_allclose(np.sort(found[row == k]), true, rtol=1e-6)
     assert len(found[row == len(c)]) == 0
     np.testing.assert_allclose(np.sort(found[row == len(c) + 1]), [1.0, 2.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [6, 8, 12])
+def test_few_right_data_are_accepted(n):
+    for seed in range(10):
+        xy1, xy2 = matches_of_plane(n, 0.0, seed, sigma=1.0)
+        assert estimate_homography(xy1, xy2, threshold_px=3.0, seed=seed).inliers.sum() >= 0.7 * n
+        X, xy, R = points_of_camera(n, 0.0, seed)
+        assert np.abs(resect(X, xy, K, threshold_px=1.5, seed=seed).R - R).max() < 0.1
+
+
+def test_matches_on_a_line_along_an_axis_are_refused():
+    line = np.column_stack([np.full(10, 5.0), np.linspace(0.0, 100.0, 10)])
+    for xy1, xy2 in ((line, line[:, ::-1]), (line, np.random.default_rng(0).uniform(0.0, 99.0, (10, 2)))):
+        for threshold in (None, 1.0):
+            words = "do not determine a homography"
+            refuses(StageFailure, words, estimate_homography, xy1, xy2, threshold_px=threshold)
+
+
+def test_the_gradient_of_the_sampson_distance_is_that_of_differences():
+    rng = np.random.default_rng(0)
+    points, h, step = rng.normal(size=(30, 4)), rng.normal(size=9), 1e-6
+    G, g = np.zeros((9, 9)), np.zeros(9)
+    total = _add_equations(h.reshape(3, 3), points, np.ones(30), True, G, g)
+    cost = [
+        squared_plane_distances(h.reshape(3, 3) + d.reshape(3, 3), points).sum() for d in step * np.eye(9)
+    ]
+    less = [
+        squared_plane_distances(h.reshape(3, 3) - d.reshape(3, 3), points).sum() for d in step * np.eye(9)
+    ]
+    assert total == pytest.approx(squared_plane_distances(h.reshape(3, 3), points).sum(), rel=1e-12)
+    np.testing.assert_allclose(
+        2.0 * g, (np.array(cost) - less) / (2.0 * step), rtol=1e-5, atol=1e-5 * np.abs(g).max()
+    )

@@ -175,6 +175,9 @@ def test_only_records_are_made(tmp_path):
     for kind in ("Path", "annotations", "__builtins__", "field", "soup", "F64"):
         assert refused(saved(path, {"type": kind, "fields": {}}))
     assert refused(saved(path, {"array": "array0"}), "array0")
+    np.savez(path, description=np.array([{"key": "key"}], dtype=object))
+    path.write_bytes(sealed(path.read_bytes()))
+    assert refused(path, "allow_pickle")
     assert read_record(saved(path, {"array": "array0"}, array0=np.arange(3)), "k").tolist() == [0, 1, 2]
 
 

@@ -18,7 +18,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
+from thesisrecon.optimize.ransac import CHANCE, MORE_AGREE, REACHES, Budget, log10_false_alarms, search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
@@ -97,7 +97,7 @@ def _add_equations(H: F64, points: F64, weight: F64, nearest: bool, G: F64, g: F
 
     Returns sum r'r. Whitened by the Cholesky factor L of J J' (L r = c), at the matches or at the ``nearest``
     exact ones, to first order x - J' v with v = (J J')^-1 c: the gradient of c' v is twice v' times their
-    coefficients there.
+    coefficients there, without the product of both steps in x1 and x2, as c is bilinear.
     """
     J, row, total = empty((2, 2)), zeros((2, 9)), 0.0
     for k in range(len(points)):
@@ -120,8 +120,10 @@ def _add_equations(H: F64, points: F64, weight: F64, nearest: bool, G: F64, g: F
         s, t = weight[k] / l11, weight[k] / l22
         for j in range(3):
             x = x1 if j == 0 else (y1 if j == 1 else 1.0)
-            row[0, j], row[0, 6 + j] = s * x, -s * x2 * x
-            row[1, j], row[1, 3 + j], row[1, 6 + j] = -t * b / a * x, t * x, -t * (y2 - b / a * x2) * x
+            step = x - points[k, j] if j < 2 else 0.0
+            across, down = x2 * x - w * v0 * step, y2 * x - w * v1 * step
+            row[0, j], row[0, 6 + j] = s * x, -s * across
+            row[1, j], row[1, 3 + j], row[1, 6 + j] = -t * b / a * x, t * x, -t * (down - b / a * across)
         for i in range(9):
             g[i] += row[0, i] * r0 + row[1, i] * r1
             for j in range(i, 9):
@@ -239,7 +241,6 @@ def fit_homography(
     else:
         gate = threshold_px * frame.scale
         H, samples = _search(points, gate, budget, rng)
-        _require_more_than_chance(H, points, gate, samples)
         for k in range(_ROUNDS):
             before = inliers
             distance = np.sqrt(squared_plane_distances(H, points))
@@ -255,6 +256,7 @@ def fit_homography(
             if k > 0 and np.array_equal(inliers, before):
                 break
             H, inverse = _refine(H, points[inliers])
+        _require_more_than_chance(H, points, limit, samples)
     r = homography_sampson_residuals(H, points[inliers, :2], points[inliers, 2:])
     left = (r.size - _PARAMETERS) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(r**2) / left)) if left else float("nan")
@@ -265,37 +267,34 @@ def fit_homography(
     return HomographyFit(unit_norm(h.reshape(3, 3)), inliers, sigma / frame.scale, covariance)
 
 
-def _undetermined(evidence: str) -> StageFailure:
-    return StageFailure(
-        "the matches do not determine a homography",
-        evidence,
-        "use four or more matches of one plane, or of a rotating camera, no three of them on one line",
-    )
+def _undetermined(evidence: str, advice: str = "") -> StageFailure:
+    usual = "use four or more matches of one plane, or of a rotating camera, no three of them on one line"
+    return StageFailure("the matches do not determine a homography", evidence, advice or usual)
 
 
-def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
+def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -> None:
     """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers, equal ones once.
 
     A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
+    Nothing was chosen if all matches are inliers.
     """
-    squared = squared_plane_distances(H, points)
-    near = squared <= gate**2
-    n, k = len(points), len(np.unique(points[near], axis=0))
-    if n == _SAMPLE:
-        return
-    limit = max(float(squared[near].max(initial=0.0)), _EXACT**2)
+    squared, n = squared_plane_distances(H, points), len(points)
     x1, x2 = homogenize(points[:, :2]), points[:, 2:]
     w = x1 @ H[2]
     A = H[:2, :2] - x2[:, :, None] * H[2, :2]
     ellipse = np.sqrt(np.linalg.det(A @ A.swapaxes(1, 2) + (w**2)[:, None, None] * np.eye(2)))
     sizes = np.prod(np.ptp(points, axis=0).reshape(2, 2), axis=1)
     with np.errstate(divide="ignore"):
-        areas = np.pi * limit * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
-    share = float(np.minimum(areas, 1.0).max(axis=0).mean())
-    if log10_false_alarms(k, n, chance=share, free=_SAMPLE) > CHANCE:
-        raise _undetermined(
-            f"{k} of {n} different matches agree with the best of {samples} samples, which chance explains"
-        )
+        unit = np.pi * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
+    for reach in REACHES:
+        near = squared <= max(reach * limit, _EXACT) ** 2
+        largest = max(float(squared[near].max()), _EXACT**2)
+        chance = float(np.minimum(largest * unit, 1.0).max(axis=0).mean())
+        k = len(np.unique(points[near], axis=0))
+        if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=_SAMPLE) <= CHANCE:
+            return
+    evidence = f"{k} of {n} different matches agree with the best of {samples} samples, which chance explains"
+    raise _undetermined(evidence, f"use more matches; {MORE_AGREE}")
 
 
 @kernel
@@ -347,7 +346,9 @@ def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F
         refit, rng, len(points), _SAMPLE, budget,
     )  # fmt: skip
     if found is None:
-        raise _undetermined("all samples of four matches have three on one line")
+        raise _undetermined(
+            "samples of four matches have three on one line, or a triangle of the other orientation"
+        )
     return found.model, found.samples
 
 
@@ -357,6 +358,8 @@ def _refine(H: F64, points: F64) -> tuple[F64, F64]:
     for _ in range(50):
         G, g = np.zeros((9, 9)), np.zeros(9)
         now = _add_equations(h.reshape(3, 3), points, every, True, G, g)
+        if not np.isfinite(now) and not np.isfinite(cost):
+            raise _undetermined(f"the equations of {counted(len(points), 'match')} have rank below 8")
         if now <= cost:
             tangent = np.linalg.svd(h[None])[2][1:]
             information = tangent @ G @ tangent.T

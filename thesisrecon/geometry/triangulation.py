@@ -286,7 +286,12 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
-    """Positive real roots of quartics c (B, 5), highest power first, with their rows (Ferrari)."""
+    """Positive real roots of quartics c (B, 5), highest power first, with their rows (Ferrari).
+
+    Those of the reversed quartic are 1 / x: the larger of both ends leads.
+    """
+    small = np.abs(c[:, 0]) < np.abs(c[:, 4])
+    c = np.where(small[:, None], c[:, ::-1], c)
     good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))
     a3, a2, a1, a0 = c[good, 1:].T / c[good, 0] + 0j
     # y^4 + p y^2 + q y + r with x = y - a3 / 4, and the resolvent m^3 + p m^2 + (p^2 / 4 - r) m - q^2 / 8.
@@ -304,7 +309,9 @@ def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
     for _ in range(2):
         slope = ((4.0 * x + 3.0 * a3) * x + 2.0 * a2) * x + a1
         x -= ((((x + a3) * x + a2) * x + a1) * x + a0) / np.where(slope == 0.0, 1.0, slope)
-    sample, which = np.nonzero(((np.abs(x.imag) < 1e-4 * (1.0 + np.abs(x.real))) & (x.real > 0.0)).T)
+    x = np.where(small[good], 1.0 / np.where(x == 0.0, 1e-300, x), x)
+    real = (np.abs(x.imag) < 1e-4 * (1.0 + np.abs(x.real))) & (x.real > 0.0) & (x.real < 1e100)
+    sample, which = np.nonzero(real.T)
     return np.asarray(x.real[which, sample], dtype=np.float64), np.flatnonzero(good)[sample]
 
 

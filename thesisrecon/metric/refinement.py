@@ -191,9 +191,8 @@ def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> Met
     # Noise and inliers change less each time.
     for _ in range(2):
         model = adjustment.run(_model.select_inliers(model, **gate))[0]
-    return adjustment.run(_model.select_inliers(model, **gate), settled=_adjustment.SETTLED, keep_noise=True)[
-        0
-    ]
+    model = _model.select_inliers(model, **gate)
+    return adjustment.run(model, settled=_adjustment.SETTLED, keep_noise=True)[0]
 
 
 def _adjust_to_precise_points(

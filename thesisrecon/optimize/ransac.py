@@ -26,8 +26,12 @@ FIRST, SCORED = 48, 2000
 # Probability that a good model is rejected by its first data, and the quantile of the normal distribution.
 LOST, LOST_SIGMAS = 0.05, 1.645
 AT_ONCE = 2**17  # residuals of models computed at once
+WITHOUT = 100_000  # samples without any model after which there is none
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
+MORE_AGREE = "a threshold_px of three times the noise, or None if all are right, lets more of them agree"
+REACHES = 1.0, 3.0
+"""Inlier limits at which chance is tested: right data with the noise of the limit lie within three."""
 
 
 class Budget(NamedTuple):
@@ -73,18 +77,20 @@ def search_models(
         batch = min(batch, budget.max_samples - drawn)
         models = solve(draw_samples(rng, batch, n, size))
         drawn += batch
-        if len(models):
+        for some in np.array_split(models, len(models) * len(scored) // AT_ONCE + 1):
             # As many data as a good model needs not to be among the worst.
             tried = min(max(FIRST, int(LOST_SIGMAS**2 * (1.0 - share) / max(share, 1e-9)) + 1), len(scored))
-            inside = np.count_nonzero(squared(models, scored[:tried]) < 1.0, axis=1)
-            models = models[inside >= tried * share - LOST_SIGMAS * np.sqrt(tried * share * (1.0 - share))]
-        for some in np.array_split(models, len(models) * len(scored) // AT_ONCE + 1) if len(models) else ():
+            inside = np.count_nonzero(squared(some, scored[:tried]) < 1.0, axis=1)
+            least_inside = tried * share - LOST_SIGMAS * np.sqrt(tried * share * (1.0 - share))
+            if not (inside >= least_inside).any():
+                continue
+            some = some[inside >= least_inside]
             cost = np.minimum(squared(some, scored), 1.0).mean(axis=1)
             if cost.min() < least:
                 best, least, inliers = _refitted(some[cost.argmin()], squared, refit, scored)
                 share = len(inliers) / len(scored)
         good = (1.0 - LOST) * min(share**size, 1.0 - 1e-9)
-        if drawn * np.log1p(-good) < np.log1p(-budget.confidence):
+        if drawn * np.log1p(-good) < np.log1p(-budget.confidence) or (best is None and drawn >= WITHOUT):
             break
         batch = min(2 * batch, most)
     return None if best is None else Found(best, drawn, inliers)
@@ -178,9 +184,6 @@ def resect_robust(
     start, inliers, samples = found
     if inliers.any() and threshold_px is None:
         inliers[:] = True
-    elif start is not None:
-        P, size = (start, _SAMPLE) if K is None else (K @ start, 3)
-        _require_more_than_chance(X, xy, P, inliers, samples, size)
     for _ in range(_ROUNDS):
         if start is None or inliers.sum() < needed:
             raise _no_camera(
@@ -198,26 +201,33 @@ def resect_robust(
         inliers = front & (distance <= limit)
         if np.array_equal(inliers, fit.inliers):
             break
+    if threshold_px is not None:
+        _require_more_than_chance(X, xy, fit.P, limit, samples, _SAMPLE if K is None else 3)
     left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(distance[fit.inliers] ** 2) / left)) if left > 0 else float("nan")
     return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
 
 
-def _require_more_than_chance(X: F64, xy: F64, P: F64, inliers: B8, samples: int, size: int) -> None:
-    """Raise ``StageFailure`` if a camera of wrong points would have as many inliers, equal ones once."""
-    n, k = len(X), len(np.unique(np.column_stack([X, xy])[inliers], axis=0))
-    if n <= max(size, 4):
-        return
-    distance = np.linalg.norm(project(P, X[inliers]) - xy[inliers], axis=1)
-    limit = max(float(distance.max(initial=0.0)), _EXACT_PX)
-    share = np.pi * limit**2 / max(float(np.prod(np.ptp(xy, axis=0))), limit**2)
-    if log10_false_alarms(k, n, chance=min(share, 1.0), free=size) > CHANCE:
-        raise _no_camera(f"{k} of {n} agree with the best of {samples} samples, which chance explains")
+def _require_more_than_chance(X: F64, xy: F64, P: F64, limit: float, samples: int, size: int) -> None:
+    """Raise ``StageFailure`` if a camera of wrong points would have as many inliers, equal ones once.
+
+    Nothing was chosen if all points are inliers.
+    """
+    distance, n = np.sqrt(_squared_residuals(P[None], homogenize(X), xy)[0]), len(X)
+    for reach in REACHES:
+        near = distance <= max(reach * limit, _EXACT_PX)
+        largest = max(float(distance[near].max(initial=0.0)), _EXACT_PX)
+        chance = np.pi * largest**2 / max(float(np.prod(np.ptp(xy, axis=0))), largest**2)
+        k = len(np.unique(np.column_stack([X, xy])[near], axis=0))
+        if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=size) <= CHANCE:
+            return
+    evidence = f"{k} of {n} agree with the best of {samples} samples, which chance explains"
+    raise _no_camera(evidence, f"use more points; {MORE_AGREE}")
 
 
-def _no_camera(evidence: str) -> StageFailure:
-    advice = "check that points and pixels correspond, and that the points are in right-handed coordinates"
-    return StageFailure("no camera explains the points", evidence, advice)
+def _no_camera(evidence: str, advice: str = "") -> StageFailure:
+    usual = "check that points and pixels correspond, and that the points are in right-handed coordinates"
+    return StageFailure("no camera explains the points", evidence, advice or usual)
 
 
 def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:

@@ -212,7 +212,7 @@ def _add_blocks_of_six(first: int, by_view: ByView, pair: I64, A: F64, Z: F64, b
 
 @kernel(inline="always", fastmath={"contract"}, forceinline=True)
 def _subtract_product_of_six(blocks: F64, n: int, Z: F64, k: int, m: int) -> None:
-    """Subtract W_k' W_m from block n."""
+    """Subtract Z_k' Z_m from block n."""
     x0, x1, x2, x3, x4, x5 = Z[m, 0, 0], Z[m, 0, 1], Z[m, 0, 2], Z[m, 0, 3], Z[m, 0, 4], Z[m, 0, 5]
     y0, y1, y2, y3, y4, y5 = Z[m, 1, 0], Z[m, 1, 1], Z[m, 1, 2], Z[m, 1, 3], Z[m, 1, 4], Z[m, 1, 5]
     z0, z1, z2, z3, z4, z5 = Z[m, 2, 0], Z[m, 2, 1], Z[m, 2, 2], Z[m, 2, 3], Z[m, 2, 4], Z[m, 2, 5]
