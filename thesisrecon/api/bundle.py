@@ -36,7 +36,7 @@ from thesisrecon.optimize.bundle.projection import (
     image_points,
     sort_observations,
 )
-from thesisrecon.optimize.noise import MAD_FACTOR
+from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 from thesisrecon.results import RunResult
 
