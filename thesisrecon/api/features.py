@@ -7,7 +7,7 @@ from typing import Literal
 from thesisrecon.config import Detector
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners
 from thesisrecon.io._images import eight_bit_images, full_image
-from thesisrecon.pipeline.image_pair import ImageInput
+from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.records import Features
 
 
@@ -49,8 +49,8 @@ def detect_corners(
     >>> from thesisrecon import detect_corners
     >>> image = np.zeros((60, 80), np.uint8)
     >>> image[20:40, 30:60] = 200
-    >>> sorted(map(tuple, detect_corners(image).xy.round().astype(int).tolist()))
-    [(30, 20), (30, 39), (59, 20), (59, 39)]
+    >>> sorted(map(tuple, detect_corners(image).xy.round().astype(int).tolist()))  # by smoothing inside
+    [(31, 21), (31, 38), (58, 21), (58, 38)]
     """
     if detector is None:
         detector = HarrisCorners(max_corners, threshold_rel, measure=CornerMeasure(formula))

@@ -14,7 +14,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_fr
 from thesisrecon.imaging.resampling import undistort_image as resampled
 from thesisrecon.imaging.resampling import warp_image
 from thesisrecon.io._images import read_pixels
-from thesisrecon.pipeline.image_pair import ImageInput
+from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.stereo.rectification import rotation_along_baseline
 
 

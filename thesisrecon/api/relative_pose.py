@@ -136,8 +136,8 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     >>> from thesisrecon import recover_pose
     >>> E = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # t along x, no rotation
     >>> pose = recover_pose(E, np.array([[0.0, 0.0]]), np.array([[-0.5, 0.0]]), np.eye(3))
-    >>> pose.R.round(9).tolist(), pose.t.tolist(), pose.depths.round(9).tolist()
-    ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], [-1.0, 0.0, 0.0], [[2.0, 2.0]])
+    >>> np.allclose(pose.R, np.eye(3)), np.allclose(pose.t, [-1, 0, 0]), pose.depths.round(9).tolist()
+    (True, True, [[2.0, 2.0]])
     """
     caller, E = "recover_pose", np.asarray(E, dtype=np.float64)
     require_shapes(caller, E=(E, (3, 3)))
@@ -193,8 +193,8 @@ def decompose_homography(
     >>> H = np.eye(3) + np.outer([0.2, 0, 0], [0, 0, 1.0])  # along x, before a plane z = 1
     >>> found = decompose_homography(H, np.eye(3), xy1=np.array([[0.0, 0.0], [0.3, 0.2]]))
     >>> k = int(np.argmax(found.normal[:, 2]))
-    >>> found.t[k].round(9).tolist(), found.normal[k].round(9).tolist(), len(found.R)
-    ([0.2, 0.0, 0.0], [0.0, 0.0, 1.0], 2)
+    >>> len(found.R), np.allclose(found.t[k], [0.2, 0, 0]), np.allclose(found.normal[k], [0, 0, 1])
+    (2, True, True)
     """
     caller, H = "decompose_homography", np.asarray(H, dtype=np.float64)
     require_shapes(caller, H=(H, (3, 3)))

@@ -12,7 +12,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import homogenize, unit_norm
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
 from thesisrecon.geometry.relative_pose import (
     depths_of_matches,
     essential_five_points,
@@ -21,7 +21,6 @@ from thesisrecon.geometry.relative_pose import (
 )
 from thesisrecon.optimize.least_squares import (
     INLIER_SIGMAS,
-    DenseProblem,
     DenseSystem,
     run_levenberg_marquardt,
     trimmed_noise_scale,
@@ -30,6 +29,11 @@ from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, sear
 
 _SAMPLE, _UNKNOWN = 5, 5
 _ROUNDS = 6
+# Minimal samples amplify the noise: inliers of a refit are first those of wider gates, in thresholds.
+_GATES = (3.0, 2.0, 1.0)
+# A refit of a model up to this much worse than the best one may be better.
+_NEAR = 1.1
+_REFITTED = 1000  # matches of a refit
 # Residuals in units of the frame below which they are rounding errors.
 _EXACT = 1e-9
 
@@ -49,8 +53,8 @@ class EssentialFit:
         Matches within the noise; those that meet in front of both cameras; standard deviation of one image
         coordinate.
     covariance : ndarray (6, 6)
-        Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera; it
-        has no part along t.
+        Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as
+        if all inliers were right; it has no part along t.
     """
 
     E: F64
@@ -101,7 +105,7 @@ class _Pair:
     def tangent(self, R: F64, t: F64) -> tuple[F64, F64]:
         """Derivatives (9, 5) of F by rotation and by the two directions (2, 3) across t."""
         across = np.linalg.svd(t[None])[2][1:]
-        turns = [essential_from_pose(t, essential_from_pose(R, axis)) for axis in np.eye(3)]
+        turns = [essential_from_pose(essential_from_pose(R, axis), t) for axis in np.eye(3)]
         moves = [essential_from_pose(R, axis) for axis in across]
         return across, np.asarray(self.fundamental(np.array([*turns, *moves])).reshape(5, 9).T)
 
@@ -140,15 +144,24 @@ def fit_essential(
 def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int, I64]:
     """The E of least truncated squared distances, the number of samples and its inliers among scored data."""
 
+    some = rng.permutation(len(pair.points))[:_REFITTED]
+
     def refit(E: F64, rows: I64) -> F64:
         if len(rows) <= _SAMPLE:
             return E
-        return unit_norm(essential_from_pose(*_refined(pair, pair.pose(E, rows), rows[:500], iterations=5)))
+        pose = pair.pose(E, rows)
+        for wide in _GATES:
+            distance = pair.squared(essential_from_pose(*pose)[None], some)[0]
+            inside = some[distance < (wide * gate) ** 2]
+            if len(inside) <= _SAMPLE:
+                return E
+            pose = _refined(pair, pose, inside, iterations=5)
+        return unit_norm(essential_from_pose(*pose))
 
     found = search_models(
         lambda samples: essential_five_points(pair.x1[samples], pair.x2[samples]),
         lambda E, rows: pair.squared(E, rows) / gate**2,
-        refit, rng, len(pair.points), _SAMPLE, budget,
+        refit, rng, len(pair.points), _SAMPLE, budget, near=_NEAR,
     )  # fmt: skip
     if found is None or not len(found.inliers):
         raise _undetermined("no sample of five matches has an essential matrix")
@@ -174,8 +187,7 @@ def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pos
     def cost(state: Pose) -> float:
         return 0.5 * float(pair.squared(essential_from_pose(*state)[None], rows).sum())
 
-    problem = DenseProblem(linearize, retract, cost)
-    return run_levenberg_marquardt(problem, pose, max_iterations=iterations).state
+    return run_levenberg_marquardt(linearize, retract, cost, pose, max_iterations=iterations).state
 
 
 def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFit:
@@ -190,7 +202,8 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     sigma = float(np.sqrt(2.0 * cost / max(len(rows) - _UNKNOWN, 1)))
     values, vectors = np.linalg.eigh(J.T @ G @ J)
     half = np.zeros((6, 5))
-    half[:3, :3], half[3:, 3:] = np.eye(3), across.T
+    # t moves by w x t + d.
+    half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), across.T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = (depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
     return EssentialFit(unit_norm(E), R, t, inliers, front, sigma / scale, half @ half.T)

@@ -10,7 +10,9 @@ from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import cross_matrix, unit_norm
 
 # Monomials of degree 3 in (x, y, z, 1): first those of degree 3 in x, y, z alone.
-_MONOMIALS = sorted(combinations_with_replacement(range(4), 3), key=lambda m: (m.count(3), m))
+_MONOMIALS: list[tuple[int, ...]] = sorted(
+    combinations_with_replacement(range(4), 3), key=lambda m: (m.count(3), m)
+)
 _OF_PRODUCT = np.array([_MONOMIALS.index(tuple(sorted(m))) for m in product(range(4), repeat=3)])
 _COLLECT = np.eye(20)[_OF_PRODUCT]
 # Where x times each of the lower monomials stands.
@@ -62,7 +64,7 @@ def depths_of_matches(R: F64, t: F64, x1: F64, x2: F64) -> F64:
     at, bt = np.einsum("...na,...a->...n", a, t), np.einsum("na,...a->...n", x2, t)
     determinant = aa * bb - ab**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack([ab * bt - bb * at, aa * bt - ab * at], axis=-1) / determinant[..., None]
+        return np.asarray(np.stack([ab * bt - bb * at, aa * bt - ab * at], axis=-1) / determinant[..., None])
 
 
 def essential_from_pose(R: F64, t: F64) -> F64:
