@@ -40,6 +40,8 @@ from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 from thesisrecon.results import RunResult
 
+Chosen = I64 | B8 | Sequence[int]
+"""Numbers of cameras or points, or a mask."""
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
     "k3": (7,),
@@ -90,8 +92,8 @@ def bundle_adjust(
     cameras: CameraInput, X: F64 | None = None, xy: F64 | Tracks | Observations | None = None, *,
     sizes: I64 | None = None, shared: bool | I64 = True, free: Sequence[str] = ("focal", "k1"),
     prior: Mapping[str, float | F64] | None = None, loss: str = "huber", loss_px: float | None = None,
-    sigma_px: float | None = None, covariances: F64 | None = None, fixed_cameras: I64 | B8 = (),
-    fixed_points: I64 | B8 = (), gauge: Literal["inner", "two-cameras"] = "inner",
+    sigma_px: float | None = None, covariances: F64 | None = None, fixed_cameras: Chosen = (),
+    fixed_points: Chosen = (), gauge: Literal["inner", "two-cameras"] = "inner",
     positions: F64 | None = None, position_std: float | F64 = 1.0, control_points: F64 | None = None,
     control_std: float | F64 = 1.0, max_iterations: int = 200,
 ) -> BundleAdjustment:  # fmt: skip
@@ -194,7 +196,7 @@ def bundle_adjust(
     # Only for its checks of the list.
     sort_observations(observed, len(views), len(X))
     root, inside = _whitening(covariances, dense, observed), _inside(views, observed)
-    observed = Observations(*(np.asarray(part)[inside] for part in observed))
+    observed = observed.at(inside)
     known = BundleKnowledge(
         loss if loss_px is None or loss_px < np.inf else "squared", None if root is None else root[inside],
         _mask("fixed_cameras", fixed_cameras, len(views), observed.view_index),
@@ -267,8 +269,8 @@ def _problem(
     cameras = cameras.reconstruction if isinstance(cameras, RunResult) else cameras
     views = as_cameras("bundle_adjust", cameras, sizes)
     if isinstance(cameras, Reconstruction) and X is None and xy is None:
-        X, *observed = points_of_reconstruction(cameras)
-        return views, X, Observations(*observed), None
+        X, view, point, pixels = points_of_reconstruction(cameras)
+        return views, X, Observations(view, point, pixels), None
     if X is None or xy is None:
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
     (X,), shape = numbers("bundle_adjust", X=X), None
@@ -333,7 +335,7 @@ def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequen
     return IntrinsicsPrior.unshared(table, std)
 
 
-def _mask(name: str, chosen: I64 | B8, n: int, seen: I64) -> B8 | None:
+def _mask(name: str, chosen: Chosen, n: int, seen: I64) -> B8 | None:
     """Mask (n,) of the ``seen`` ones of numbers or of a mask; None without any."""
     index = np.asarray(chosen)
     if index.dtype == bool and index.shape == (n,):
@@ -436,8 +438,7 @@ def _residuals(start: MetricCameras, X: F64, o: Observations) -> F64:
 
 def _check_convention(start: MetricCameras, X: F64, o: Observations) -> None:
     """Raise ``ValueError`` if poses of another convention fit at least ten times better."""
-    some = slice(None, None, max(len(o.xy) // 20000, 1))
-    seen = Observations(*(np.ascontiguousarray(part[some]) for part in o))
+    seen = o.at(slice(None, None, max(len(o.xy) // 20000, 1)))
     back, turned = np.swapaxes(start.R, 1, 2), np.diag([1.0, -1.0, -1.0])
     by_inverse, by_centre = (-np.einsum("vij,vj->vi", R, start.t) for R in (back, start.R))
     poses = {

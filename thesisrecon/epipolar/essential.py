@@ -78,7 +78,7 @@ class _Pair:
 
     @classmethod
     def of(cls, frame: PairFrame, xy1: F64, xy2: F64, K1: F64, K2: F64) -> _Pair:
-        inverse1, inverse2 = (np.linalg.inv(T @ K) for T, K in zip(frame.transforms, (K1, K2), strict=True))
+        inverse1, inverse2 = np.linalg.inv(np.stack(frame.transforms) @ np.stack([K1, K2]))
         points = frame.points(xy1, xy2)
         x1, x2 = homogenize(points[:, :2]) @ inverse1.T, homogenize(points[:, 2:]) @ inverse2.T
         return cls(points, inverse1, inverse2, x1, x2)
@@ -205,7 +205,7 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     # t moves by w x t + d.
     half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), across.T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
-    front = (depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
+    front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(unit_norm(E), R, t, inliers, front, sigma / scale, half @ half.T)
 
 

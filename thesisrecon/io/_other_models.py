@@ -102,7 +102,8 @@ def read_transforms(path: Path) -> SparseModel:
     """
 
     def read() -> SparseModel:
-        content, views = read_json(path), []
+        content = read_json(path)
+        views: list[SparseView] = []
         for frame in content["frames"]:
             M = np.array(frame["transform_matrix"], dtype=np.float64)
             if M.shape not in ((3, 4), (4, 4)):
@@ -150,7 +151,8 @@ def read_bundler(path: Path) -> SparseModel:
         words = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
         n, points = (int(word) for word in words[0])
         names = _bundler_names(path.parent / "list.txt", n)
-        views, centres, kept = [], np.full((n, 2), np.nan), np.full(n, -1)
+        views: list[SparseView] = []
+        centres, kept = np.full((n, 2), np.nan), np.full(n, -1)
         for i in range(n):
             (f, k1, k2), *rows = (np.array(row, dtype=np.float64) for row in words[1 + 5 * i : 6 + 5 * i])
             if not f > 0.0:

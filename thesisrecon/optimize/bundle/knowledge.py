@@ -97,14 +97,12 @@ class BundleKnowledge:
 
     def observations(self, seen: Observations) -> Observations:
         """The observations, followed by two of each prior of a view or a point with observations."""
-        view, point, xy = (np.asarray(a) for a in seen)
-        first, rows = [np.arange(len(view))], []
-        for prior, number in ((self.centres, view), (self.points, point)):
+        first, rows = [np.arange(len(seen.xy))], []
+        for prior, number in ((self.centres, seen.view_index), (self.points, seen.point_index)):
             known, place = np.unique(number, return_index=True)
             rows.append(place[np.searchsorted(known, prior.index)])
         first.append(np.repeat(np.concatenate(rows), 2).astype(np.int64))
-        order = np.concatenate(first)
-        return Observations(view[order], point[order], xy[order])
+        return seen.at(np.concatenate(first))
 
 
 @dataclass(frozen=True)
