@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64, require_calibration, require_finite, require
 from thesisrecon.camera import Camera
 from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.relative_pose import depths_of_matches, poses_from_essential, poses_from_homography
+from thesisrecon.geometry.relative_pose import pose_in_front, poses_from_homography
 
 Calibration = F64 | Camera
 """K (3, 3), or a camera, whose lens counts too and whose pose does not."""
@@ -146,10 +146,7 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     if not len(x1):
         raise ValueError("recover_pose needs at least one match, which decides between four poses; got none")
     rays1, rays2 = _rays(caller, K1, x1), _rays(caller, K1 if K2 is None else K2, x2)
-    R, t = poses_from_essential(E)
-    depths = depths_of_matches(R, t, rays1, rays2)
-    best = int((depths > 0.0).all(axis=2).sum(axis=1).argmax())
-    return RelativePose(R[best], t[best], depths[best])
+    return RelativePose(*pose_in_front(E, rays1, rays2))
 
 
 def decompose_homography(

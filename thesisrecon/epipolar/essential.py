@@ -17,7 +17,7 @@ from thesisrecon.geometry.relative_pose import (
     depths_of_matches,
     essential_five_points,
     essential_from_pose,
-    poses_from_essential,
+    pose_in_front,
 )
 from thesisrecon.optimize.least_squares import (
     INLIER_SIGMAS,
@@ -97,10 +97,7 @@ class _Pair:
 
     def pose(self, E: F64, rows: I64) -> Pose:
         """R and t of E that place most matches in front of both cameras."""
-        R, t = poses_from_essential(E)
-        front = (depths_of_matches(R, t, self.x1[rows], self.x2[rows]) > 0.0).all(axis=2).sum(axis=1)
-        best = int(front.argmax())
-        return R[best], t[best]
+        return pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
 
     def tangent(self, R: F64, t: F64) -> tuple[F64, F64]:
         """Derivatives (9, 5) of F by rotation and by the two directions (2, 3) across t."""
@@ -108,6 +105,13 @@ class _Pair:
         turns = [essential_from_pose(essential_from_pose(R, axis), t) for axis in np.eye(3)]
         moves = [essential_from_pose(R, axis) for axis in across]
         return across, np.asarray(self.fundamental(np.array([*turns, *moves])).reshape(5, 9).T)
+
+    def normal_equations(self, R: F64, t: F64, rows: I64) -> DenseSystem:
+        """Those of the Sampson distances of some matches over the five unknowns of :meth:`tangent`."""
+        points, G, h = np.ascontiguousarray(self.points[rows]), np.empty((9, 9)), np.empty(9)
+        f = np.ascontiguousarray(self.fundamental(essential_from_pose(R, t)).ravel())
+        cost, J = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)[1]
+        return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
 
 
 def fit_essential(
@@ -170,14 +174,9 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
 
 def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
     """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
-    points = np.ascontiguousarray(pair.points[rows])
 
     def linearize(state: Pose) -> DenseSystem:
-        G, h = np.empty((9, 9)), np.empty(9)
-        f = np.ascontiguousarray(pair.fundamental(essential_from_pose(*state)).ravel())
-        cost = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
-        J = pair.tangent(*state)[1]
-        return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
+        return pair.normal_equations(*state, rows)
 
     def retract(state: Pose, step: F64) -> Pose:
         R, t = state
@@ -194,19 +193,17 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
     R, t = pair.pose(essential_from_pose(*pose), rows)
-    E = essential_from_pose(R, t)
-    points, G, h = np.ascontiguousarray(pair.points[rows]), np.empty((9, 9)), np.empty(9)
-    f = np.ascontiguousarray(pair.fundamental(E).ravel())
-    cost = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
-    across, J = pair.tangent(R, t)
-    sigma = float(np.sqrt(2.0 * cost / max(len(rows) - _UNKNOWN, 1)))
-    values, vectors = np.linalg.eigh(J.T @ G @ J)
+    system, across = pair.normal_equations(R, t, rows), pair.tangent(R, t)[0]
+    sigma = float(np.sqrt(2.0 * system.cost / max(len(rows) - _UNKNOWN, 1)))
+    values, vectors = np.linalg.eigh(system.hessian)
     half = np.zeros((6, 5))
     # t moves by w x t + d.
     half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), across.T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
-    return EssentialFit(unit_norm(E), R, t, inliers, front, sigma / scale, half @ half.T)
+    return EssentialFit(
+        unit_norm(essential_from_pose(R, t)), R, t, inliers, front, sigma / scale, half @ half.T
+    )
 
 
 def _undetermined(evidence: str) -> StageFailure:

@@ -67,6 +67,14 @@ def depths_of_matches(R: F64, t: F64, x1: F64, x2: F64) -> F64:
         return np.asarray(np.stack([ab * bt - bb * at, aa * bt - ab * at], axis=-1) / determinant[..., None])
 
 
+def pose_in_front(E: F64, x1: F64, x2: F64) -> tuple[F64, F64, F64]:
+    """R, t and depths (N, 2) of E that place most matches in front of both cameras (HZ 9.6.3)."""
+    R, t = poses_from_essential(E)
+    depths = depths_of_matches(R, t, x1, x2)
+    best = int((depths > 0.0).all(axis=2).sum(axis=1).argmax())
+    return R[best], t[best], depths[best]
+
+
 def essential_from_pose(R: F64, t: F64) -> F64:
     """E = [t]x R."""
     return np.asarray(cross_matrix(t) @ R)

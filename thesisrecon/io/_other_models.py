@@ -46,15 +46,7 @@ def _guarded(path: Path, rule: str, read: Callable[[], SparseModel]) -> SparseMo
         raise
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        OverflowError,
-        struct.error,
-    ) as error:
+    except (LookupError, ArithmeticError, TypeError, ValueError, AttributeError, struct.error) as error:
         raise UsageError(f"{path} {rule} ({in_words(str(error))})") from None
     if not model.views:
         raise UsageError(f"{path} holds no camera; {rule}")
@@ -242,10 +234,8 @@ def read_openmvs(path: Path) -> SparseModel:
                 b.take("<I")
             if pose == 2**32 - 1:
                 continue  # an image without a pose
-            (K, size, R_camera, C_camera), (R, C) = (
-                platforms[platform][0][camera],
-                platforms[platform][1][pose],
-            )
+            cameras, poses = platforms[platform]
+            (K, size, R_camera, C_camera), (R, C) = cameras[camera], poses[pose]
             R, centre = _pose(R_camera @ R, R.T @ C_camera + C)
             views.append(SparseView(_name(name), R, -R @ centre, K, size, np.zeros(3), camera))
         X = []
@@ -286,9 +276,8 @@ def read_kalibr(path: Path) -> SparseModel:
             width, height = (int(v) for v in camera["resolution"])
             model = camera.get("distortion_model", "none")
             lens = np.zeros(4) if model == "none" else np.array(camera["distortion_coeffs"], dtype=np.float64)
-            radial = (
-                camera["camera_model"] == "pinhole" and model in ("radtan", "none") and not lens[2:].any()
-            )
+            radial = camera["camera_model"] == "pinhole" and model in ("radtan", "none")
+            radial = radial and not lens[2:].any()
             k = np.append(lens[:2], 0.0) if radial else None
             views.append(SparseView(name, R, t, _calibration(fx, fy, cx, cy), (width, height), k, i))
         return SparseModel(views)
@@ -309,7 +298,6 @@ def _camchain(text: str) -> dict[str, dict[str, Any]]:
         elif cameras and (entry := re.fullmatch(r"\s+(\w+):\s*(.*)", line)):
             key, value = entry[1], entry[2]
             if value:
-                [*cameras.values()][-1][key] = (
-                    json.loads(value) if value.startswith("[") else value.strip("'\"")
-                )
+                value = json.loads(value) if value.startswith("[") else value.strip("'\"")
+                [*cameras.values()][-1][key] = value
     return cameras
