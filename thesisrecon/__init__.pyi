@@ -12,10 +12,14 @@ from thesisrecon.config import PipelineConfig as PipelineConfig
 from thesisrecon.results import RunResult as RunResult
 
 # Two and three images
+from thesisrecon.api.features import detect_corners as detect_corners
 from thesisrecon.api.pairs import match_pair as match_pair
 from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
 from thesisrecon.api.pairs import estimate_homography as estimate_homography
 from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
+from thesisrecon.api.relative_pose import estimate_essential as estimate_essential
+from thesisrecon.api.relative_pose import recover_pose as recover_pose
+from thesisrecon.api.relative_pose import decompose_homography as decompose_homography
 from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
 from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate as FundamentalEstimate
@@ -44,6 +48,9 @@ from thesisrecon.api.calibrate import kruppa as kruppa
 
 # Stereo and surfaces
 from thesisrecon.api.surface import rectify as rectify
+from thesisrecon.api.lenses import rectify_cameras as rectify_cameras
+from thesisrecon.api.lenses import undistort_points as undistort_points
+from thesisrecon.api.lenses import undistort_image as undistort_image
 from thesisrecon.api.surface import match_rectified as match_rectified
 from thesisrecon.records import DisparityMap as DisparityMap
 from thesisrecon.api.surface import depth_maps as depth_maps
@@ -61,6 +68,7 @@ from thesisrecon.api.views import synthesize_view as synthesize_view
 from thesisrecon.api.models import read_cameras as read_cameras
 from thesisrecon.api.export import export as export
 from thesisrecon.api.export import write_mesh as write_mesh
+from thesisrecon.api.export import read_mesh as read_mesh
 from thesisrecon.api.models import align_to_positions as align_to_positions
 from thesisrecon.api.models import scaled as scaled
 from thesisrecon.api.models import compare_models as compare_models

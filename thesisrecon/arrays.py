@@ -242,6 +242,25 @@ def require_rotations(caller: str, R: F64) -> None:
         raise ValueError(f"{caller} needs a rotation R; got a reflection, det R = -1")
 
 
+def sizes_of_images(sizes: Any) -> Any:
+    """(width, height) of an image, or of each of a list or stack of images; other values stay as they are."""
+
+    def one(image: Any) -> Any:
+        if isinstance(image, np.ndarray) and image.ndim > 1:
+            return image.shape[1], image.shape[0]
+        size = getattr(image, "size", None)
+        return size if isinstance(size, tuple) else image
+
+    if isinstance(sizes, list | tuple):
+        return [one(item) for item in sizes]
+    if not isinstance(sizes, np.ndarray):
+        return one(sizes)
+    if sizes.ndim == 2 and sizes.shape[1] == 2:
+        return sizes
+    stacked = sizes.ndim == 4 or (sizes.ndim == 3 and sizes.shape[2] not in (1, 3, 4))
+    return one(sizes[0] if stacked else sizes) if sizes.size else sizes
+
+
 def resizing_transform(scale: float | F64) -> F64:
     """Transform (3, 3) to the pixels of an image resized by s, one or (2,) for x and y: (x + 0.5) s - 0.5."""
     T: F64 = np.diag(np.append(np.broadcast_to(scale, 2), 1.0))

@@ -20,6 +20,7 @@ from thesisrecon.arrays import (
     require_rotations,
     require_shapes,
     resizing_transform,
+    sizes_of_images,
 )
 
 
@@ -35,8 +36,8 @@ class Camera(Record):
         Calibration matrix in pixels; (0, 0) is the centre of the top-left pixel.
     R, t : ndarray (3, 3), ndarray (3,)
         Rotation from world to camera (the thesis writes its transpose) and translation -R centre.
-    size : tuple of int
-        Image (width, height) in pixels.
+    size : tuple of int, or image
+        Image (width, height) in pixels, or the image.
     distortion : ndarray (C,), optional
         Radial coefficients k1, k2, k3: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
         k3 r^6). None: no distortion. More than three numbers are refused unless the others are 0: four and
@@ -90,7 +91,7 @@ class Camera(Record):
         require_calibration("Camera", K)
         require_rotations("Camera", R)
         try:
-            width, height = (operator.index(side) for side in self.size)
+            width, height = (operator.index(side) for side in sizes_of_images(self.size))
         except (TypeError, ValueError):
             raise ValueError(f"Camera needs a size of two whole numbers; got {self.size}") from None
         if min(width, height) < 1:

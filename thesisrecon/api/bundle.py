@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from thesisrecon.api.cameras import require_inside
+from thesisrecon.api.cameras import outside_by, require_inside
 from thesisrecon.api.given import CameraInput, as_cameras, points_of_reconstruction, radial_coefficients
 from thesisrecon.arrays import B8, F64, I64, Record, numbers, require_finite, require_shapes
 from thesisrecon.camera import Camera
-from thesisrecon.errors import unknown_word
-from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM, BundleOptions, refine_metric_bundle
-from thesisrecon.optimize.bundle.projection import POSE_DOF, MetricCameras, Observations, sort_observations
+from thesisrecon.errors import counted, unknown_word
+from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.optimize.bundle.knowledge import (
+    LOSSES,
+    NO_PRIOR,
+    BundleKnowledge,
+    PositionPrior,
+    remaining_gauge,
+)
+from thesisrecon.optimize.bundle.metric import (
+    MAX_SIGMAS_TO_MINIMUM,
+    BundleOptions,
+    MetricBundleResult,
+    refine_metric_bundle,
+)
+from thesisrecon.optimize.bundle.projection import (
+    POSE_DOF,
+    MetricCameras,
+    MetricModel,
+    Observations,
+    image_points,
+    sort_observations,
+)
+from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
 from thesisrecon.results import RunResult
 
+Chosen = I64 | B8 | Sequence[int]
+"""Numbers of cameras or points, or a mask."""
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
     "k3": (7,),
@@ -32,7 +57,8 @@ class BundleAdjustment(Record):
 
     All covariances are those of the inner gauge (free network adjustment): among the solutions that differ by
     a similarity, the one that moves the cameras least (Triggs et al., "Bundle adjustment - a modern
-    synthesis", 2000, section 9). They contain the uncertainty of all other unknowns.
+    synthesis", 2000, section 9); only the similarities that nothing fixes count. They contain the uncertainty
+    of all other unknowns.
     """
 
     cameras: tuple[Camera, ...]  #: with ``std`` of their intrinsics (0: not free)
@@ -65,13 +91,17 @@ class BundleAdjustment(Record):
 def bundle_adjust(
     cameras: CameraInput, X: F64 | None = None, xy: F64 | Tracks | Observations | None = None, *,
     sizes: I64 | None = None, shared: bool | I64 = True, free: Sequence[str] = ("focal", "k1"),
-    prior: Mapping[str, float] | None = None, loss: str = "huber", loss_px: float | None = None,
-    sigma_px: float | None = None, max_iterations: int = 200,
+    prior: Mapping[str, float | F64] | None = None, loss: str = "huber", loss_px: float | None = None,
+    sigma_px: float | None = None, covariances: F64 | None = None, fixed_cameras: Chosen = (),
+    fixed_points: Chosen = (), gauge: Literal["inner", "two-cameras"] = "inner",
+    positions: F64 | None = None, position_std: float | F64 = 1.0, control_points: F64 | None = None,
+    control_std: float | F64 = 1.0, max_iterations: int = 200,
 ) -> BundleAdjustment:  # fmt: skip
     """Refine cameras and points together, with their covariances (6.7, HZ 18.1 and A6.3).
 
-    Minimises sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - q0) / std)^2 over poses, points and the free
-    intrinsics q.
+    Minimises sum rho(r' Q^-1 r / sigma^2) + sum ((q - q0) / std)^2 + sum |(C - C0) / std|^2 over poses,
+    points and the free intrinsics q, with the residuals r = x - project(X), the covariances Q of the
+    observations and known positions C0 of camera centres and points.
 
     Parameters
     ----------
@@ -89,14 +119,29 @@ def bundle_adjust(
         image has its own; or a camera number per image.
     free : sequence of str
         Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
-    prior : mapping of str to float, optional
+    prior : mapping of str to float or (V,), optional
         Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
-        relative for "focal", in pixels for "principal_point" and "skew".
-    loss, loss_px : {"huber", "squared"}, float
-        Loss, and the residual at which Huber's loss becomes linear (None: two standard deviations of the
-        noise).
+        relative for "focal", in pixels for "principal_point" and "skew"; in an array 0 fixes the value of an
+        image, and infinity leaves it free.
+    loss : {"huber", "squared", "cauchy", "geman-mcclure", "tukey"}
+        Loss; the last three redescend: gross errors lose their influence (Zhang, IVC 15, 1997).
+    loss_px : float, optional
+        Width of the loss: Huber's becomes linear there, Tukey's constant. None: 2, 2.4 (cauchy), 4
+        (geman-mcclure) or 5 (tukey) standard deviations of the noise.
     sigma_px : float, optional
-        Standard deviation of one image coordinate. None: estimated from the residuals.
+        Standard deviation of one image coordinate. None: estimated from the residuals. With ``covariances``
+        the factor on their square roots.
+    covariances : ndarray (V, N), (V, N, 2, 2), (K,) or (K, 2, 2), optional
+        Variances or covariances of the observations, of which only the ratios matter if ``sigma_px`` is None.
+    fixed_cameras, fixed_points : array_like of int, or of bool (V,) and (N,)
+        Cameras whose poses, and points that do not move.
+    gauge : {"inner", "two-cameras"}
+        "two-cameras": the first camera does not move, nor the farthest one along the line between them.
+    positions, position_std : ndarray (V, 3), float, (3,) or (V, 3)
+        Known camera centres, NaN where unknown, and the standard deviations of their coordinates.
+    control_points, control_std : ndarray (N, 3), float, (3,) or (N, 3)
+        Known positions of points, NaN where unknown, and their standard deviations. If nothing is fixed, the
+        initial model is first moved to at least three known positions by a similarity.
     max_iterations : int
         Maximum number of linear solves; if they do not suffice, ``converged`` is false.
 
@@ -108,14 +153,22 @@ def bundle_adjust(
     Raises
     ------
     ValueError
-        If the arrays do not fit together, pixels lie far outside their images, most points lie behind the
-        cameras, there are fewer equations than unknowns, or an option is invalid.
+        If the arrays do not fit together, more than 5 % of the pixels lie far outside their images, most
+        points lie behind the cameras, the pixels fit poses of another convention (camera to world, for
+        example), there are fewer equations than unknowns, or an option is invalid.
+
+    Warns
+    -----
+    UserWarning
+        If up to 5 % of the pixels lie outside their images by more than 10 % of the long side (they are named
+        and left out), or focal lengths or residuals at the end are not those of a camera.
 
     Notes
     -----
     The covariances are those of the linearised problem at the minimum, with the noise estimated from the
     residuals (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the
-    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation.
+    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation. Lenses are radial, as those of
+    :class:`thesisrecon.Camera`; tangential distortion (p1, p2) is not estimated.
 
     Examples
     --------
@@ -136,29 +189,31 @@ def bundle_adjust(
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
     free = (free,) if isinstance(free, str) else tuple(free)
     chosen = _free(free)
-    if loss not in ("huber", "squared"):
-        raise ValueError(unknown_word("loss", loss, ("huber", "squared")))
+    if loss not in LOSSES:
+        raise ValueError(unknown_word("loss", loss, LOSSES))
     start = _start(views, shared, chosen)
-    knowledge = _prior(start.intrinsics, prior or {}, chosen, free)
-    _check(start, X, observed, chosen, bool(prior))
-    require_inside(observed.view_index, observed.xy, np.array([view.size for view in views]))
-    noise = weight = 1.0 if sigma_px is None else sigma_px
-    # A first pass estimates noise that is not given: the weight of the prior and the width depend on it.
-    for last in (True,) if sigma_px is not None else (False, True):
-        width = 2.0 * noise if loss_px is None else loss_px
-        width = np.inf if loss == "squared" else width
-        options = BundleOptions(
-            sigma_px=noise, loss_px=width, max_iterations=max_iterations, settled=1e-6,
-            covariance=last, point_covariance=last,
-        )  # fmt: skip
-        fit = refine_metric_bundle(start, X, observed, free=chosen, prior=knowledge, options=options)
-        start, X, weight, noise = fit.cameras, fit.X, noise, max(fit.sigma_px, 1e-6)
+    expected = _prior(start.intrinsics, prior or {}, chosen, free)
+    # Only for its checks of the list.
+    sort_observations(observed, len(views), len(X))
+    root, inside = _whitening(covariances, dense, observed), _inside(views, observed)
+    observed = observed.at(inside)
+    known = BundleKnowledge(
+        loss if loss_px is None or loss_px < np.inf else "squared", None if root is None else root[inside],
+        _mask("fixed_cameras", fixed_cameras, len(views), observed.view_index),
+        _mask("fixed_points", fixed_points, len(X), observed.point_index),
+        _positions("positions", positions, position_std, len(views), observed.view_index),
+        _positions("control_points", control_points, control_std, len(X), observed.point_index),
+    )  # fmt: skip
+    _check(start, X, observed, chosen, bool(prior), known)
+    start, X, known = _placed(start, X, known, gauge)
+    _check_convention(start, X, observed)
+    fit, scale = _adjusted(start, X, observed, (chosen, expected, known), (sigma_px, loss_px), max_iterations)
+    _warn_of_implausible(views, fit)
     assert fit.pose_covariance is not None
     assert fit.point_covariance is not None
-    residual = fit.residual_px
-    if dense is not None:
-        residual = np.full(dense, np.nan)
-        residual[observed.view_index, observed.point_index] = fit.residual_px
+    residual = np.full((len(inside), 2) if dense is None else dense, np.nan)
+    place = (inside,) if dense is None else (observed.view_index, observed.point_index)
+    residual[place] = fit.residual_px
     K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
     rows, unseen = fit.cameras.intrinsics, np.isin(np.arange(len(views)), observed.view_index, invert=True)
     poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
@@ -170,8 +225,41 @@ def bundle_adjust(
     )
     return BundleAdjustment(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
-        fit.point_covariance, fit.sigmas_to_minimum * weight / noise,
+        fit.point_covariance, fit.sigmas_to_minimum * scale,
     )  # fmt: skip
+
+
+def _adjusted(
+    start: MetricCameras, X: F64, observed: Observations,
+    unknown: tuple[B8, IntrinsicsPrior, BundleKnowledge], noise: tuple[float | None, float | None], most: int,
+) -> tuple[MetricBundleResult, float]:  # fmt: skip
+    """The adjustment, and the weight of its last pass over the noise found.
+
+    First passes estimate noise that is not given: the weight of the prior and the width depend on it. For a
+    loss that redescends they begin with the noise of the start, so that the width falls with the residuals.
+    """
+    (free, prior, known), (sigma, width) = unknown, noise
+    redescends = known.loss not in ("huber", "squared")
+    plain = known.is_empty and not redescends
+    passes = 1 if sigma is not None else 4 if redescends else 2
+    found = 1.0 if sigma is None else sigma
+    if sigma is None and redescends:
+        residual = _residuals(start, X, observed)
+        residual = residual if known.root is None else np.einsum("kij,kj->ki", known.root, residual)
+        found = max(MAD_FACTOR * float(np.median(np.abs(residual))), 1e-6)
+    for last in [False] * (passes - 1) + [True]:
+        loss_px = LOSSES[known.loss][1] * found if width is None else width
+        if known.loss == "squared":
+            loss_px = np.inf if plain else found
+        options = BundleOptions(
+            sigma_px=found, loss_px=loss_px, max_iterations=most, settled=1e-6, covariance=last,
+            point_covariance=last,
+        )  # fmt: skip
+        fit = refine_metric_bundle(
+            start, X, observed, free=free, prior=prior, options=options, knowledge=None if plain else known
+        )
+        start, X, weight, found = fit.cameras, fit.X, found, max(fit.sigma_px, 1e-6)
+    return fit, weight / found
 
 
 def _problem(
@@ -181,8 +269,8 @@ def _problem(
     cameras = cameras.reconstruction if isinstance(cameras, RunResult) else cameras
     views = as_cameras("bundle_adjust", cameras, sizes)
     if isinstance(cameras, Reconstruction) and X is None and xy is None:
-        X, *observed = points_of_reconstruction(cameras)
-        return views, X, Observations(*observed), None
+        X, view, point, pixels = points_of_reconstruction(cameras)
+        return views, X, Observations(view, point, pixels), None
     if X is None or xy is None:
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
     (X,), shape = numbers("bundle_adjust", X=X), None
@@ -230,21 +318,176 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
     return MetricCameras(R, t, table, np.arange(n), sharing)
 
 
-def _prior(table: F64, prior: Mapping[str, float], free: B8, names: Sequence[str]) -> IntrinsicsPrior:
+def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequence[str]) -> IntrinsicsPrior:
     """Gaussian prior of the table of intrinsics (V, 8)."""
     std = np.full(table.shape, np.inf)
     for name, value in prior.items():
         if name not in COLUMNS or not free[list(COLUMNS[name])].all():
             raise ValueError(f"prior has {name!r}, which is not among the free intrinsics {tuple(names)}")
-        if not 0.0 < value < np.inf:
+        values = np.asarray(value, dtype=np.float64)
+        if values.shape not in ((), (len(table),)):
+            raise ValueError(
+                f"prior[{name!r}] must be a number or one per camera ({len(table)},); got {value}"
+            )
+        if not ((values >= 0.0).all() if values.ndim else 0.0 < values < np.inf):
             raise ValueError(f"prior[{name!r}] is a standard deviation and must be above 0; got {value}")
-        std[:, list(COLUMNS[name])] = value
+        std[:, list(COLUMNS[name])] = values[..., None]
     return IntrinsicsPrior.unshared(table, std)
 
 
-def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound: bool) -> None:
+def _mask(name: str, chosen: Chosen, n: int, seen: I64) -> B8 | None:
+    """Mask (n,) of the ``seen`` ones of numbers or of a mask; None without any."""
+    index = np.asarray(chosen)
+    if index.dtype == bool and index.shape == (n,):
+        index = np.flatnonzero(index)
+    if not index.size:
+        return None
+    if index.ndim != 1 or index.dtype.kind not in "iu" or index.min() < 0 or index.max() >= n:
+        raise ValueError(f"{name} must be numbers from 0 to {n - 1}, or a mask ({n},); got {chosen}")
+    mask = np.isin(np.arange(n), np.intersect1d(index, seen))
+    return mask if mask.any() else None
+
+
+def _positions(name: str, at: F64 | None, std: float | F64, n: int, seen: I64) -> PositionPrior:
+    """The known positions (n, 3) of what is ``seen``."""
+    if at is None:
+        return NO_PRIOR
+    at, widths = np.asarray(at, dtype=np.float64), np.asarray(std, dtype=np.float64)
+    if at.shape != (n, 3) or widths.shape not in ((), (3,), (n, 3)):
+        form = f"({n}, 3) with a standard deviation each, (3,) or ({n}, 3)"
+        raise ValueError(f"{name} must have the shape {form}; got {at.shape} and {widths.shape}")
+    known = np.isfinite(at).all(axis=1) & np.isin(np.arange(n), seen)
+    widths = np.broadcast_to(widths, (n, 3))[known]
+    if not (widths > 0.0).all():
+        raise ValueError(f"the standard deviations of {name} must be above 0; got {std}")
+    return PositionPrior(np.flatnonzero(known), at[known], np.eye(3) / widths[:, None, :])
+
+
+def _whitening(covariances: F64 | None, dense: tuple[int, ...] | None, observed: Observations) -> F64 | None:
+    """Roots (K, 2, 2) of the information of the observations, None if they are equal."""
+    if covariances is None:
+        return None
+    Q = np.asarray(covariances, dtype=np.float64)
+    shape = (len(observed.xy),) if dense is None else dense[:2]
+    if Q.shape not in (shape, (*shape, 2, 2)):
+        form = f"{shape} or {(*shape, 2, 2)}"
+        raise ValueError(f"covariances must have the shape {form} of the observations; got {Q.shape}")
+    Q = Q if dense is None else Q[observed.view_index, observed.point_index]
+    Q = Q[:, None, None] * np.eye(2) if Q.ndim == 1 else Q
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(Q)))
+    except np.linalg.LinAlgError:
+        raise ValueError("covariances must be positive (definite) for each observation") from None
+
+
+def _inside(views: Sequence[Camera], o: Observations) -> B8:
+    """Observations (K,) in or near their images; a few others are named in a warning, many are refused."""
+    sizes = np.array([view.size for view in views])
+    far = outside_by(o.view_index, o.xy, sizes) > 0.1
+    turned = outside_by(o.view_index, o.xy, sizes[:, ::-1])[far] > 0.1
+    # Many, or several that are all inside if width and height are exchanged: the sizes are wrong.
+    if far.sum() > max(1, 0.05 * len(far)) or (far.sum() > 1 and not turned.any()):
+        require_inside(o.view_index, o.xy, sizes)
+    if not far.any():
+        return ~far
+    rows = [np.asarray(part)[far][:3].tolist() for part in (o.point_index, o.view_index, o.xy)]
+    first = (f"point {j} in view {i} at ({x:.0f}, {y:.0f})" for j, i, (x, y) in zip(*rows, strict=True))
+    said = f"{counted(int(far.sum()), 'observation')} far outside the image left out: {', '.join(first)}"
+    warnings.warn(f"bundle_adjust: {said}{' ...' if far.sum() > 3 else ''}", UserWarning, stacklevel=3)
+    return ~far
+
+
+def _placed(
+    start: MetricCameras, X: F64, known: BundleKnowledge, gauge: str
+) -> tuple[MetricCameras, F64, BundleKnowledge]:
+    """The start near known positions, and the knowledge that the gauge adds."""
+    if gauge not in ("inner", "two-cameras"):
+        raise ValueError(unknown_word("gauge", gauge, ("inner", "two-cameras")))
+    centres = start.centres
+    if remaining_gauge(known, start.R, start.t, X).shape[1] < 7:
+        if gauge == "two-cameras":
+            raise ValueError('gauge="two-cameras" needs a problem without fixed or known poses and points')
+        if known.fixed_poses is not None or known.fixed_points is not None:
+            return start, X, known
+        source = np.concatenate([centres[known.centres.index], X[known.points.index]])
+        try:
+            move = estimate_similarity(
+                source, np.concatenate([known.centres.position, known.points.position])
+            )
+        except ValueError:
+            return start, X, known
+        R = start.R @ move.R.T
+        t = -np.einsum("vij,vj->vi", R, move.apply(centres))
+        return replace(start, R=R, t=t), move.apply(X), known
+    if gauge == "two-cameras":
+        line = centres - centres[0]
+        far = int(np.linalg.norm(line, axis=1).argmax())
+        # A millionth of the distance: far below any noise.
+        root = np.zeros((1, 3, 3))
+        root[0, 0] = 1e6 * line[far] / max(float(line[far] @ line[far]), 1e-300)
+        prior = PositionPrior(np.array([far]), centres[[far]], root)
+        known = replace(known, fixed_poses=np.arange(len(centres)) == 0, centres=prior)
+    return start, X, known
+
+
+def _residuals(start: MetricCameras, X: F64, o: Observations) -> F64:
+    """Projection minus observation (K, 2) at the start."""
+    model = MetricModel(start.R, start.t, start.intrinsics, np.asarray(start.group), X)
+    return np.asarray(image_points(model, o.view_index, o.point_index)[0] - o.xy)
+
+
+def _check_convention(start: MetricCameras, X: F64, o: Observations) -> None:
+    """Raise ``ValueError`` if poses of another convention fit at least ten times better."""
+    seen = o.at(slice(None, None, max(len(o.xy) // 20000, 1)))
+    back, turned = np.swapaxes(start.R, 1, 2), np.diag([1.0, -1.0, -1.0])
+    by_inverse, by_centre = (-np.einsum("vij,vj->vi", R, start.t) for R in (back, start.R))
+    poses = {
+        "R and t are camera to world": (back, by_inverse), "t is the camera centre": (start.R, by_centre),
+        "R is camera to world": (back, start.t),
+    }  # fmt: skip
+    poses |= {
+        f"{name} and the axes are those of OpenGL": (turned @ R, t @ turned)
+        for name, (R, t) in {**poses, "R and t are right": (start.R, start.t)}.items()
+    }
+    given, best, said = _misfit(_residuals(start, X, seen)), np.inf, ""
+    for name, (R, t) in poses.items():
+        other = replace(start, R=np.ascontiguousarray(R), t=np.ascontiguousarray(t))
+        in_front = np.einsum("ka,ka->k", other.R[seen.view_index, 2], X[seen.point_index])
+        found = np.where(in_front + other.t[seen.view_index, 2] > 0.0, 1.0, np.inf)[:, None]
+        misfit = _misfit(_residuals(other, X, seen) * found)
+        if misfit < best:
+            best, said = misfit, name
+    if best < 0.1 * given:
+        now = f"median residual of {best:.2g} px instead of {given:.2g}"
+        rule = "bundle_adjust needs R world to camera and t = -R centre"
+        raise ValueError(f"the pixels fit the poses if {said} ({now}); {rule}: convert them")
+
+
+def _misfit(residual: F64) -> float:
+    return float(np.median(np.linalg.norm(residual, axis=1)))
+
+
+def _warn_of_implausible(views: Sequence[Camera], fit: MetricBundleResult) -> None:
+    """Warn of focal lengths beyond those of cameras, if they began within, and of very large residuals."""
+    longest = np.array([max(view.size) for view in views])
+    before, after = np.array([view.K[0, 0] for view in views]) / longest, fit.cameras.K[:, 0, 0] / longest
+    odd = np.flatnonzero(((after < 0.2) | (after > 20.0)) & (before > 0.2) & (before < 20.0))
+    said = []
+    if len(odd):
+        i = odd[0]
+        said.append(f"the focal length of camera {i} moved to {after[i] * longest[i]:.0f} px")
+    size = float(np.median(np.linalg.norm(fit.residual_px, axis=1)))
+    if size > 0.02 * longest.max():
+        said.append(f"the median residual is {size:.0f} px")
+    if said:
+        advice = "check the convention of the poses (R world to camera, t = -R centre), X and xy"
+        warnings.warn(f"bundle_adjust: {' and '.join(said)}; {advice}", UserWarning, stacklevel=3)
+
+
+def _check(
+    start: MetricCameras, X: F64, observed: Observations, free: B8, bound: bool, known: BundleKnowledge
+) -> None:
     """Raise ``ValueError`` if most points are behind the cameras, or for fewer equations than unknowns."""
-    sort_observations(observed, len(start.R), len(X))
     view, point = observed.view_index, observed.point_index
     require_finite("bundle_adjust, for points with observations,", X[point])
     depth = np.einsum("kb,kb->k", start.R[view, 2], X[point]) + start.t[view, 2]
@@ -253,11 +496,18 @@ def _check(start: MetricCameras, X: F64, observed: Observations, free: B8, bound
     if behind > 0.5:
         rule = "R is world to camera and t = -R centre"
         raise ValueError(f"{behind:.0%} of the observed points lie behind their cameras; {rule}")
-    seen = np.unique(view)
+    seen, points = np.unique(view), np.unique(point)
     assert start.shared is not None
     own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
-    unknowns = POSE_DOF * len(seen) + 3 * len(np.unique(point)) + own - 7  # those of a similarity
-    if 2 * len(view) < unknowns or len(seen) < 2:
+    fixed = [
+        0 if mask is None else int(mask[index].sum())
+        for mask, index in ((known.fixed_poses, seen), (known.fixed_points, points))
+    ]
+    priors = 3 * (len(known.centres.index) + len(known.points.index))
+    # Those of a similarity have no effect if nothing is known.
+    unknowns = POSE_DOF * (len(seen) - fixed[0]) + 3 * (len(points) - fixed[1]) + own
+    unknowns -= 0 if any(fixed) or priors else 7
+    if 2 * len(view) + priors < unknowns or len(seen) < (1 if fixed[1] or priors else 2):
         given = f"{len(view)} observations in {len(seen)} views give {2 * len(view)} equations"
         rule = "bundle_adjust needs two views and as many equations as unknowns"
         raise ValueError(f"{rule}; {given} for {unknowns} unknowns")

@@ -174,8 +174,8 @@ def reconstruction_from_cameras(
     ----------
     *cameras : ndarray
         P (V, 3, 4), or K (V, 3, 3) or (3, 3), R (V, 3, 3) and t (V, 3) of a metric frame.
-    sizes : array_like (V, 2) or (2,)
-        Image width and height.
+    sizes : array_like (V, 2) or (2,), or images
+        Image width and height, or the images.
     X, xy : ndarray (N, 3) or (N, 4), ndarray (V, N, 2), optional
         Points, and their pixels, NaN where not observed; X None: triangulated from xy.
     stratum, sigma_px : {"metric", "affine", "projective"}, float
@@ -228,10 +228,15 @@ def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tup
     return P, K, checked_sizes(caller, sizes, len(P))
 
 
+def outside_by(view: I64, xy: F64, sizes: I64) -> F64:
+    """How far (K,) pixels (K, 2) lie outside the images of their views, over the long side; else negative."""
+    size = sizes[view]
+    return np.asarray((np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1))
+
+
 def require_inside(view: I64, xy: F64, sizes: I64) -> None:
     """Raise ``ValueError`` if pixels (K, 2) lie far outside the images of their views; ``sizes`` (V, 2)."""
-    size = sizes[view]
-    reach = (np.maximum(-xy, xy - size) / size.max(axis=1, keepdims=True)).max(axis=1)
+    size, reach = sizes[view], outside_by(view, xy, sizes)
     # Pixels this far outside show that the size is wrong, for example height x width.
     if len(reach) and reach.max() > 0.1:
         k = int(reach.argmax())

@@ -32,6 +32,7 @@ from thesisrecon.io._images import (
     rotation_words,
 )
 from thesisrecon.io._meshes import glb_bytes
+from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
@@ -372,3 +373,35 @@ def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
     if path.suffix.lower() != ".glb":
         raise UsageError(f"write_mesh writes GLB; give {path.name} the ending .glb")
     write_atomically(path, glb_bytes(mesh))
+
+
+def read_mesh(path: str | Path) -> TexturedMesh:
+    """Read a mesh with its texture or vertex colours.
+
+    Parameters
+    ----------
+    path : str or Path
+        A GLB of :func:`write_mesh` or of a run, whose axes are turned back, or a PLY or OBJ (with its MTL and
+        texture), whose axes stay. Polygons become triangles.
+
+    Returns
+    -------
+    TexturedMesh
+        For :func:`thesisrecon.render`, :func:`thesisrecon.texture` and :func:`write_mesh`.
+
+    Raises
+    ------
+    UsageError
+        If there is no such file, it is damaged or of another kind, or holds no surface.
+
+    Examples
+    --------
+    >>> import numpy as np, tempfile
+    >>> from thesisrecon import TexturedMesh, read_mesh, write_mesh
+    >>> mesh = TexturedMesh(np.array([[-1.0, -1, 2], [1, -1, 2], [0, 1, 2]]), np.array([[0, 1, 2]]))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_mesh(folder + "/triangle.glb", mesh)
+    ...     read_mesh(folder + "/triangle.glb").vertices.tolist()
+    [[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 1.0, 2.0]]
+    """
+    return mesh_of_file(Path(path))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64, numbers, require_shapes
+from thesisrecon.arrays import F64, I64, numbers, require_shapes, sizes_of_images
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import require_image_name
@@ -190,7 +190,7 @@ def calibrated_arrays(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F6
 
 def checked_sizes(caller: str, sizes: I64 | F64, n: int) -> I64:
     """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
-    (given,) = numbers(caller, sizes=sizes)
+    (given,) = numbers(caller, sizes=sizes_of_images(sizes))
     if given.shape not in ((2,), (n, 2)):
         raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height; got {given.shape}, V = {n}")
     if not (np.isfinite(given).all() and (given >= 1).all() and (given == np.round(given)).all()):

@@ -279,13 +279,15 @@ def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel
 
 
 def read_cameras(path: str | Path) -> dict[str, Camera]:
-    """Read the cameras of a run, a ``cameras.json`` or a COLMAP model by image name.
+    """Read the cameras of a run, a ``cameras.json`` or a model of another program by image name.
 
     Parameters
     ----------
     path : str or Path
         Folder of a run or of a COLMAP model, or a ``cameras.json``: {"cameras": [...]} with name, K, R, t or
-        C, width, height and perhaps three radial coefficients "distortion" each, or a table by name.
+        C, width, height and perhaps three radial coefficients "distortion" each, or a table by name. Also a
+        ``transforms.json`` (NeRF, nerfstudio), a ``bundle.out`` with its images, a ``scene.mvs`` (OpenMVS) or
+        a ``camchain.yaml`` (Kalibr; named cam0, cam1, ... in the frame of cam0).
 
     Returns
     -------

@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import CameraInput, as_cameras, named_cameras, radial_coefficients
-from thesisrecon.arrays import F32, F64, I64, number, numbers, resizing_transform
+from thesisrecon.arrays import F32, F64, I64, U8, number, numbers, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
@@ -91,8 +91,9 @@ def rectify(
 
 
 def match_rectified(
-    left: ImageInput, right: ImageInput, *, max_disparity_px: float, config: Config | None = None
-) -> DisparityMap:
+    left: ImageInput, right: ImageInput, *, max_disparity_px: float, min_disparity_px: float = 0.0,
+    config: Config | None = None,
+) -> DisparityMap:  # fmt: skip
     """Compute the disparity map of a rectified pair (2.5; semi-global matching: Hirschmüller, PAMI 2008).
 
     Parameters
@@ -101,8 +102,8 @@ def match_rectified(
         Two images of the same size: files (read at full size; ``UsageError`` or ``StageFailure`` if one
         cannot be read), or levels 0 to 255, 0 to 1 (floats) or of 16 bits, the same for both. Pixels that are
         NaN, masked or transparent are missing.
-    max_disparity_px : float
-        Largest disparity; x_right = x_left - d with d from 0 to this.
+    max_disparity_px, min_disparity_px : float
+        Largest and smallest disparity d, also negative ones; x_right = x_left - d.
     config : PipelineConfig, str or path, optional
         The matcher is ``config.dense.pairs``; None: the preset ``default``.
 
@@ -123,10 +124,33 @@ def match_rectified(
     """
     images = read_levels(left, right, grey=True)
     most = number("match_rectified", "max_disparity_px", max_disparity_px)
-    if not 0.0 <= most < np.inf:
-        raise ValueError(f"match_rectified needs max_disparity_px of at least 0, finite; got {most:g}")
-    dense = as_config(config).dense
-    return dense.match_rectified(images[0], images[1], max_disparity_px=max_disparity_px)
+    least = number("match_rectified", "min_disparity_px", min_disparity_px)
+    match = as_config(config).dense.match_rectified
+    if least == 0.0:
+        if not 0.0 <= most < np.inf:
+            raise ValueError(f"match_rectified needs max_disparity_px of at least 0, finite; got {most:g}")
+        return match(images[0], images[1], max_disparity_px=most)
+    if not -np.inf < least <= most < np.inf:
+        rule = "finite min_disparity_px <= max_disparity_px"
+        raise ValueError(f"match_rectified needs {rule}; got {least:g} and {most:g}")
+    first = int(np.floor(least))
+    # One image moves to the right by whole columns, so that disparities begin at 0.
+    places = max(-first, 0), max(first, 0)
+    moved = [_shifted(image, place, places[0]) for image, place in zip(images, places, strict=True)]
+    found = match(moved[0], moved[1], max_disparity_px=most - first)
+    own = slice(places[0], None)
+    return replace(
+        found, disparity=found.disparity[:, own] + np.float32(first), confidence=found.confidence[:, own]
+    )
+
+
+def _shifted(image: U8 | F32, columns: int, more: int) -> F32:
+    """An image moved to the right, NaN before it, in a frame with ``more`` columns."""
+    height, width, *channels = image.shape
+    out = np.full((height, width + more, *channels), np.nan, dtype=np.float32)
+    kept = max(width + more - columns, 0)
+    out[:, columns : columns + width] = image[:, :kept]
+    return out
 
 
 def depth_maps(

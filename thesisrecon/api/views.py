@@ -300,7 +300,7 @@ def synthesize_view(
     >>> thesisrecon.synthesize_view("a.jpg", "b.jpg", R, t)
     Traceback (most recent call last):
         ...
-    ValueError: a rotation has R'R = I and det R = 1; this one is off by 3, det 8
+    ValueError: view synthesis needs a rotation R; R'R deviates from the identity by 3
     """
     # Checked before the matching, which takes minutes.
     rotation, translation = numbers("synthesize_view", rotation=rotation, translation=translation)

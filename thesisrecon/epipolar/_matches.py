@@ -85,29 +85,31 @@ class PairFrame:
     @property
     def to_pixels(self) -> F64:
         """Matrix (9, 9) that converts vec(F) from the frame to pixels, up to scale."""
-        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        T1, T2 = self.transforms
         return np.asarray(np.kron(T2.T, T1.T), dtype=np.float64)
 
     @property
     def homography_to_pixels(self) -> F64:
         """Matrix (9, 9) that converts vec(H) of a homography from the frame to pixels."""
-        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        T1, T2 = self.transforms
         return np.asarray(np.kron(np.linalg.inv(T2), T1.T))
 
     def matrix_in_pixels(self, f: F64) -> F64:
         """F (3, 3) in pixels, unit norm, of F (9,) in the frame."""
-        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        T1, T2 = self.transforms
         return unit_norm(T2.T @ f.reshape(3, 3) @ T1)
 
     def matrix_in_frame(self, F: F64) -> F64:
         """F (9,) in the frame, unit norm, of F (3, 3) in pixels."""
-        T1, T2 = self._transform(self.centroid1), self._transform(self.centroid2)
+        T1, T2 = self.transforms
         return np.ascontiguousarray(unit_norm(np.linalg.inv(T2).T @ F @ np.linalg.inv(T1)).ravel())
 
-    def _transform(self, centroid: F64) -> F64:
-        """Similarity (3, 3) from pixels to the frame."""
-        s = self.scale
-        return np.array([[s, 0.0, -s * centroid[0]], [0.0, s, -s * centroid[1]], [0.0, 0.0, 1.0]])
+    @property
+    def transforms(self) -> tuple[F64, F64]:
+        """Similarities (3, 3) of both images from pixels to the frame."""
+        s, (x1, y1), (x2, y2) = self.scale, self.centroid1, self.centroid2
+        first = np.array([[s, 0.0, -s * x1], [0.0, s, -s * y1], [0.0, 0.0, 1.0]])
+        return first, np.array([[s, 0.0, -s * x2], [0.0, s, -s * y2], [0.0, 0.0, 1.0]])
 
 
 def check_start(F: F64, frame: PairFrame) -> F64:

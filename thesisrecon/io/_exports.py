@@ -23,9 +23,8 @@ from thesisrecon.camera import Camera, undistort
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
+from thesisrecon.io._other_models import LOOKS_BACK
 from thesisrecon.results import SparseModel, SparseView
-
-_LOOKS_BACK = np.diag([1.0, -1.0, -1.0])  # From axes x right, y down, z forward to x right, y up, z back
 
 
 def mask_name(to: str, image: str) -> str:
@@ -45,7 +44,7 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
     frames = []
     for view, camera in zip(model.views, cameras, strict=True):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = view.R.T @ _LOOKS_BACK, view.centre
+        pose[:3, :3], pose[:3, 3] = view.R.T @ LOOKS_BACK, view.centre
         own: dict[str, Any] = {} if shared else camera
         if masked:
             own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
@@ -100,7 +99,7 @@ def write_bundler(folder: Path, model: SparseModel) -> Path:
     for i, view in enumerate(model.views):
         K, *_ = view.intrinsics
         centre[i] = K[:2, 2]
-        rows = [[K[0, 0], 0.0, 0.0], *(_LOOKS_BACK @ view.R), _LOOKS_BACK @ view.t]
+        rows = [[K[0, 0], 0.0, 0.0], *(LOOKS_BACK @ view.R), LOOKS_BACK @ view.t]
         lines += [_numbers(row) for row in rows]
     xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
     # Number of each observation among those of its view.

@@ -371,7 +371,7 @@ def _exif(file: PIL.Image.Image) -> tuple[int, float]:
 
 def read_pixels(*sources: Any) -> list[U8]:
     """Files at full size, Pillow images, records or arrays of levels of one scale, as RGB."""
-    return [_full_image(source).rgb for source in eight_bit_images(*sources)]
+    return [full_image(source).rgb for source in eight_bit_images(*sources)]
 
 
 def read_levels(*sources: Any, grey: bool = False) -> list[U8 | F32]:
@@ -429,7 +429,7 @@ def _eight_bit_array(levels: U8 | F32) -> U8:
 def _levels_of(source: Any, *, keep_grey: bool) -> U8 | F32:
     if isinstance(source, np.ndarray) and source.shape[2:] != (4,):
         return source if keep_grey or source.ndim == 3 else np.repeat(source[:, :, None], 3, axis=2)
-    image = _full_image(_eight_bit_array(source) if isinstance(source, np.ndarray) else source)
+    image = full_image(_eight_bit_array(source) if isinstance(source, np.ndarray) else source)
     return image.rgb if image.mask is None else image.levels
 
 
@@ -437,7 +437,8 @@ def _stored(source: U8 | PIL.Image.Image) -> StoredImage:
     return StoredImage(source if isinstance(source, PIL.Image.Image) else PIL.Image.fromarray(source))
 
 
-def _full_image(source: Any) -> Image:
+def full_image(source: Any) -> Image:
+    """A file, a record or a checked array of 8 bits, at full size."""
     if isinstance(source, str | Path | Image):
         return read_image(source, max_size_px=_ANY_SIZE).images[0]
     try:

@@ -1,4 +1,4 @@
-"""Surface models as GLB files; their structure is checked before they are parsed.
+"""Surface models as GLB files, whose structure is checked before they are parsed, and from PLY and OBJ.
 
 trimesh is imported on demand: it takes longer to import than the rest of the package.
 """
@@ -142,15 +142,25 @@ def box_in_file(mesh: TexturedMesh) -> list[list[float]]:
 
 
 def read_mesh(path: Path) -> TexturedMesh:
-    """Read a GLB of :func:`write_mesh`; vertices that were split at texture seams are merged again."""
+    """Read a GLB of :func:`write_mesh`, a PLY or an OBJ, whose axes stay.
+
+    Vertices that were split at texture seams are merged again.
+    """
     if not path.is_file():
         raise UsageError(f"there is no mesh {path}")
+    kind = path.suffix.lower()[1:]
+    if kind not in ("glb", "ply", "obj"):
+        raise UsageError(f"a mesh is read from GLB, PLY or OBJ; got {path.name}")
     import trimesh
 
     try:
+        if kind != "glb":
+            return _mesh_of(trimesh.load(path, process=False, force="mesh"), np.ones(3))
         content = read_bytes(path, largest=2**31)
         _require_plain_glb(content)
-        return _mesh_of(trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"))
+        return _mesh_of(
+            trimesh.load(io.BytesIO(content), file_type="glb", process=False, force="mesh"), _HALF_TURN
+        )
     except OSError as error:
         raise UsageError(f"the mesh {path} cannot be read: {error.strerror or error}") from None
     except Exception as error:
@@ -158,16 +168,17 @@ def read_mesh(path: Path) -> TexturedMesh:
         raise UsageError(f"the mesh {path} cannot be read: {error}") from None
 
 
-def _mesh_of(loaded: Any) -> TexturedMesh:
-    """Convert a mesh of trimesh; ``ValueError`` if it is invalid."""
-    vertices = np.asarray(loaded.vertices, dtype=np.float64) * _HALF_TURN
+def _mesh_of(loaded: Any, axes: F64) -> TexturedMesh:
+    """Convert a mesh of trimesh, its axes by factors; ``ValueError`` if it is invalid."""
+    vertices = np.asarray(loaded.vertices, dtype=np.float64) * axes
     faces = np.asarray(loaded.faces, dtype=np.int64)
     if len(faces) == 0 or not np.isfinite(vertices).all():
         raise ValueError("it holds no surface")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("its faces refer to missing vertices")
     uv = getattr(loaded.visual, "uv", None)
-    image = getattr(getattr(loaded.visual, "material", None), "baseColorTexture", None)
+    material = getattr(loaded.visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if uv is not None and image is not None:
         texture = np.asarray(image.convert("RGB"))
         height, width = texture.shape[:2]

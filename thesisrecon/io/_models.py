@@ -1,4 +1,4 @@
-"""Models of any kind as one record: runs, ``cameras.json``, COLMAP models, TUM and KITTI trajectories.
+"""Models of any kind as one record: runs, ``cameras.json``, models of other programs, trajectories.
 
 Known camera positions are read from CSV files: lengths, or latitude, longitude and height (WGS84).
 """
@@ -22,6 +22,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._colmap import MAX_SIDE_PX, is_colmap_model, read_colmap_model
 from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name, shortened
+from thesisrecon.io._other_models import reader_of
 from thesisrecon.results import SparseModel, SparseView
 
 
@@ -30,14 +31,16 @@ def read_model(path: str | Path) -> SparseModel:
 
     A path is the folder of a run or of a COLMAP model (itself, or the parent of ``0`` or ``sparse/0``), a
     ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
-    named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000). UsageError for anything
-    else.
+    named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000); a transforms.json,
+    bundle.out, scene.mvs or camchain.yaml. UsageError for anything else.
     """
     path = Path(path)
     if not path.exists():
         raise UsageError(f"there is no {path}; give {_KNOWN}")
     if path.is_dir():
         model = _read_folder(path)
+    elif (read := reader_of(path)) is not None:
+        model = read(path)
     else:
         model = SparseModel(_read_views(path) if path.suffix == ".json" else _read_trajectory(path))
         model = replace(model, as_stored=_from_colmap(path.parent))
@@ -48,8 +51,9 @@ def read_model(path: str | Path) -> SparseModel:
 
 
 _KNOWN = (
-    "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, or "
-    "a trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
+    "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, a "
+    "transforms.json, bundle.out, scene.mvs or camchain.yaml, or a trajectory as text with 8 (TUM) or 12 "
+    "(KITTI) numbers per line"
 )
 
 

@@ -61,14 +61,15 @@ def draw_samples(rng: Generator, count: int, n: int, size: int) -> I64:
 
 def search_models(
     solve: Callable[[I64], F64], squared: Callable[[F64, I64], F64], refit: Callable[[F64, I64], F64],
-    rng: Generator, n: int, size: int, budget: Budget,
+    rng: Generator, n: int, size: int, budget: Budget, *, near: float = 1.0,
 ) -> Found | None:  # fmt: skip
     """The model of least truncated cost of random samples of ``size`` of n data, each best one refitted.
 
     ``solve`` makes models (B', ...) of samples (B, size); ``squared`` gives squared distances (B', M) of some
-    data, 1 at the threshold; ``refit`` improves a model by its inliers (rows). Models with too few inliers
-    among the first data are not scored further (Matas and Chum, ICCV 2005). The search ends when a sample
-    without outliers was drawn with the confidence of the ``budget``. None without any model.
+    data, 1 at the threshold; ``refit`` improves a model by its inliers (rows), also one whose cost is below
+    ``near`` times the least. Models with too few inliers among the first data are not scored further (Matas
+    and Chum, ICCV 2005). The search ends when a sample without outliers was drawn with the confidence of the
+    ``budget``. None without any model.
     """
     scored = rng.permutation(n) if n <= SCORED else rng.choice(n, SCORED, replace=False)
     most = max(AT_ONCE // FIRST, 64)
@@ -86,9 +87,11 @@ def search_models(
                 continue
             some = some[inside >= least_inside]
             cost = np.minimum(squared(some, scored), 1.0).mean(axis=1)
-            if cost.min() < least:
-                best, least, inliers = _refitted(some[cost.argmin()], squared, refit, scored)
-                share = len(inliers) / len(scored)
+            if (lowest := cost.min()) < near * least:
+                trial = _refitted(some[cost.argmin()], squared, refit, scored)
+                if min(lowest, trial[1]) < least:
+                    best, least, inliers = trial
+                    share = len(inliers) / len(scored)
         good = (1.0 - LOST) * min(share**size, 1.0 - 1e-9)
         if drawn * np.log1p(-good) < np.log1p(-budget.confidence) or (best is None and drawn >= WITHOUT):
             break

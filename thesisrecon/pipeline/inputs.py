@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64, I64, numbers, rows_of_views
+from thesisrecon.arrays import F64, I64, numbers, rows_of_views, sizes_of_images
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._files import require_image_name
@@ -141,6 +141,7 @@ class Views:
 
 
 def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored: bool = False) -> Views:
+    sizes = sizes_of_images(sizes)
     try:
         table = np.asarray(sizes, dtype=np.float64).reshape(len(sizes), 2)
     except (TypeError, ValueError):

@@ -108,7 +108,12 @@ def common_orientation(pair: EpipolarPair) -> PlanarRectification:
     """
     if pair.cameras is None:
         raise StageFailure("a common orientation needs metric cameras", advice="rectify from F")
-    P = pair.cameras
+    orientation = rotation_along_baseline(pair.cameras)
+    return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(pair.cameras[:, :, :3])))
+
+
+def rotation_along_baseline(P: F64) -> F64:
+    """Rotation (3, 3) with the x axis along the baseline of two cameras (2, 3, 4) and z near both views."""
     baseline = np.diff(dehomogenize(camera_centre(P)), axis=0)[0]
     x = baseline / np.linalg.norm(baseline)
     axis = principal_ray(P).sum(axis=0)
@@ -116,8 +121,7 @@ def common_orientation(pair: EpipolarPair) -> PlanarRectification:
     if not np.linalg.norm(z) > 1e-6:
         raise StageFailure("both cameras look along the baseline", advice="rectify in polar coordinates")
     z = z / np.linalg.norm(z)
-    orientation = np.stack([x, np.cross(z, x), z])
-    return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(P[:, :, :3])))
+    return np.stack([x, np.cross(z, x), z])
 
 
 def hartley(pair: EpipolarPair) -> PlanarRectification:

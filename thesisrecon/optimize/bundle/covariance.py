@@ -30,10 +30,13 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     return trimmed_noise_scale(size, MAD_FACTOR * float(np.median(size)), parameters=0)
 
 
-def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64) -> F64:
+def camera_blocks(
+    reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64, gauge: F64 | None = None
+) -> F64:
     """Return the covariance (n, C + e, C + e) of views ``row`` and the border with ``column`` and the border.
 
-    In the inner gauge, of the solution that moved the cameras R, t (b of them) least.
+    In the inner gauge, of the solution that moved the cameras R, t (b of them) least; free are the
+    similarities of ``gauge`` (7, m), None: all.
     """
     (b, C, e), D = reduced.sums.border.shape, len(reduced.sums.rhs)
     if not b:
@@ -42,14 +45,18 @@ def camera_blocks(reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64)
         [C * np.arange(b)[:, None] + np.arange(C), np.broadcast_to(b * C + np.arange(e), (b, e))], axis=1
     )
     # For more unknowns, a sparse factor is less work if the views have an order with a narrow band.
-    if D <= MAX_DENSE or 5 * order_views(reduced.row, reduced.column, b).reach > b:
+    partly = gauge is not None and 0 < gauge.shape[1] < SIMILARITY_DOF
+    if D <= MAX_DENSE or partly or 5 * order_views(reduced.row, reduced.column, b).reach > b:
         S = reduced.dense()
-        covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, gauge_basis(D, C, R, t))
+        covariance = invert_in_inner_gauge(np.triu(S) + np.triu(S, 1).T, gauge_basis(D, C, R, t, gauge))
         return np.asarray(covariance[index[row][:, :, None], index[column][:, None, :]])
     S = reduced.sparse()
     if not np.isfinite(S.data).all():
         return np.full((len(row), C + e, C + e), np.inf)
-    solve = sparse_inverse(S, C, R, t)
+    if gauge is not None and not gauge.shape[1]:
+        solve = scipy.sparse.linalg.splu(S).solve
+    else:
+        solve = sparse_inverse(S, C, R, t)
     blocks = np.empty((len(row), C + e, C + e))
     blocks[:, :, C:] = solve(unit_columns(D, b * C + np.arange(e)))[index[row]]
     for view in range(b):
@@ -108,7 +115,7 @@ def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64
 
 
 def invert_in_inner_gauge(information: F64, N: F64) -> F64:
-    """Invert an information matrix, singular along orthonormal N (D, 7): (S + w N N')^-1 - N N' / w."""
+    """Invert an information matrix, singular along orthonormal N (D, m): (S + w N N')^-1 - N N' / w."""
     weight = float(np.median(np.diag(information)))
     C = invert_information(information + weight * N @ N.T)
     return np.asarray(C - N @ (N.T @ C @ N) @ N.T)
@@ -144,18 +151,28 @@ def unit_columns(size: int, index: I64) -> F64:
     return columns
 
 
-def gauge_basis(size: int, width: int, R: F64, t: F64) -> F64:
-    """Return the orthonormal motion (D, 7) of all ``size`` columns under similarities of the world."""
-    N = np.zeros((size, SIMILARITY_DOF))
-    N[(width * np.arange(len(t))[:, None] + np.arange(POSE_DOF)).ravel()] = gauge_directions(R, t)
+def gauge_basis(size: int, width: int, R: F64, t: F64, free: F64 | None = None) -> F64:
+    """Return the orthonormal motion (D, 7) of all ``size`` columns under similarities of the world.
+
+    Of those of ``free`` (7, m) only: (D, m).
+    """
+    directions = gauge_directions(R, t, free)
+    N = np.zeros((size, directions.shape[1]))
+    N[(width * np.arange(len(t))[:, None] + np.arange(POSE_DOF)).ravel()] = directions
     return N
 
 
-def gauge_directions(R: F64, t: F64) -> F64:
-    """Return the orthonormal motion (6 V, 7) of poses under similarities of the world."""
+def gauge_directions(R: F64, t: F64, free: F64 | None = None) -> F64:
+    """Return the orthonormal motion (6 V, 7) of poses under similarities, or those of ``free`` (7, m)."""
+    motions = similarity_motions(R, t)
+    return np.asarray(np.linalg.qr(motions if free is None else motions @ free)[0])
+
+
+def similarity_motions(R: F64, t: F64) -> F64:
+    """Return the motion (6 V, 7) of poses under shifts, turns and scaling of the world."""
     directions = np.zeros((len(t), POSE_DOF, SIMILARITY_DOF))
     directions[:, 3:, 0:3] = -R
     directions[:, :3, 3:6] = -R
     directions[:, 3:, 3:6] = -cross_matrix(t) @ R
     directions[:, 3:, 6] = t
-    return np.asarray(np.linalg.qr(directions.reshape(-1, SIMILARITY_DOF))[0])
+    return directions.reshape(-1, SIMILARITY_DOF)

@@ -11,6 +11,7 @@ from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicColumns, IntrinsicUnknowns
+from thesisrecon.optimize.bundle.knowledge import BundleKnowledge, KnowledgeTerms, remaining_gauge
 from thesisrecon.optimize.bundle.projection import (
     POSE_DOF,
     Jacobians,
@@ -100,13 +101,19 @@ class _MetricProblem:
     weighting: Weighting
     jacobians: Jacobians
     information: tuple[I64, I64, F64]
+    known: KnowledgeTerms | None = None
+    #: (7, m) similarities of the world that are free; None: all
+    gauge: F64 | None = None
 
     def linearize(self, state: _State) -> BundleSystem:
-        J, c = self.jacobians, self.columns
+        J, c, known, w = self.jacobians, self.columns, self.known, self.weighting
 
         def work(rows: slice, obs: Observations) -> float:
             part = Jacobians(*(a[rows] for a in J))
-            return float(linearize_metric(state.model, obs, self.weighting, c.own, c.common, part))
+            if known is None:
+                return float(linearize_metric(state.model, obs, w, c.own, c.common, part))
+            linearize_metric(state.model, obs, Weighting(w.sigma, np.inf), c.own, c.common, part)
+            return known.weigh(rows, state.model, obs, part, w)
 
         cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
         if c.pinned.any():
@@ -131,32 +138,48 @@ class _MetricProblem:
         return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
 
     def cost(self, state: _State) -> float:
-        data = self.layout.sum_over_observations(
-            lambda _, obs: float(metric_cost(state.model, obs, self.weighting))
-        )
-        return data + self.values.terms.cost(state.values)
+        def work(rows: slice, obs: Observations) -> float:
+            if self.known is None:
+                return float(metric_cost(state.model, obs, self.weighting))
+            e = project_metric(state.model, obs) / self.weighting.sigma
+            e = self.known.residuals(rows, state.model, obs, e)
+            return self.known.cost(rows, e, self.weighting.delta)
+
+        return self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
 
     def sigma(self, state: _State, residual: F64) -> float:
         """Return the noise of one coordinate, px, from the residuals at the minimum."""
         leverage = np.empty_like(residual)
         self.linearize(state)
-        sum_leverages(self.layout.observations.start, self.jacobians.B, leverage)
-        dof = POSE_DOF * int(self.moves.sum()) + self.values.size - covariance.SIMILARITY_DOF
+        o, known = self.layout.observations, self.known
+        sum_leverages(o.start, self.jacobians.B, leverage)
+        moved = int((~self.columns.pinned[:, 0])[self.moves].sum())
+        free = covariance.SIMILARITY_DOF if self.gauge is None else self.gauge.shape[1]
+        dof = POSE_DOF * moved + self.values.size - free
+        if known is not None:
+            residual = known.residuals(slice(None), state.model, o.seen, residual)
+            if known.fixed_points is not None:
+                leverage[known.fixed_points[o.seen.point_index]] = 0.0
+            residual, leverage = residual[known.observed], leverage[known.observed]
         return covariance.robust_sigma(residual, leverage, dof)
 
 
 def refine_metric_bundle(
     cameras: MetricCameras, X: F64, observations: Observations, *, free: B8,
     prior: IntrinsicsPrior | None = None, options: BundleOptions | None = None, fixed: B8 | None = None,
+    knowledge: BundleKnowledge | None = None,
 ) -> MetricBundleResult:  # fmt: skip
     """Minimise reprojection errors and prior deviations over poses, points and ``free`` intrinsics (6.7).
 
     The cost is sum rho(|x - project(X)|^2 / sigma^2) + sum ((q - mean) / std)^2 with the intrinsics q. Sparse
     Levenberg-Marquardt; the focal length is stepped as log f, the seven gauge freedoms are left to the
     damping, and the scene is centred and scaled inside. The cost never rises; ``fixed`` (V,) views, and views
-    and points without observations, do not change.
+    and points without observations, do not change. ``knowledge`` adds other losses, covariances of the
+    observations, fixed poses and points, and priors of positions.
     """
-    options = options or BundleOptions()
+    options, given = options or BundleOptions(), len(observations.xy)
+    if knowledge is not None:
+        observations = knowledge.observations(observations)
     o = sort_observations(observations, len(cameras.R), len(X))
     seen_points = np.diff(o.start) > 0
     origin, scale = scene_frame(X[seen_points])
@@ -171,9 +194,11 @@ def refine_metric_bundle(
         np.ascontiguousarray(cameras.group, dtype=np.int64),
         np.ascontiguousarray(scale * (X - origin)),
     )
+    if knowledge is not None:
+        problem = _with_knowledge(problem, knowledge, start, (origin, scale), given)
     found = _minimize(problem, _State(start, values), options)
     state, cost = found.state, found.cost
-    end, moved = state.model, problem.moves
+    end, moved = state.model, problem.moves & ~problem.columns.pinned[:, 0]
     refined = replace(
         cameras,
         R=np.where(moved[:, None, None], end.R, cameras.R),
@@ -186,10 +211,28 @@ def refine_metric_bundle(
     if options.covariance:
         noise = max(sigma or options.sigma_px, options.noise_floor_px)
         covariances = _covariances(problem, state, noise, scale, points=options.point_covariance)
+    if knowledge is not None and knowledge.fixed_points is not None:
+        seen_points &= ~knowledge.fixed_points
     return MetricBundleResult(
-        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual), cost,
+        refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual)[:given], cost,
         *covariances[:2], sigma, covariances[2], float(np.sqrt(2.0 * max(found.remaining, 0.0))),
     )  # fmt: skip
+
+
+def _with_knowledge(
+    problem: _MetricProblem, knowledge: BundleKnowledge, start: MetricModel, frame: tuple[F64, float],
+    given: int,
+) -> _MetricProblem:  # fmt: skip
+    """Return the problem with what is known of poses and points; ``given`` observations are of pixels."""
+    columns, pinned = problem.columns, problem.columns.pinned
+    centres, points = (prior.in_frame(*frame) for prior in (knowledge.centres, knowledge.points))
+    knowledge = replace(knowledge, centres=centres, points=points)
+    if knowledge.fixed_poses is not None:
+        pose = np.arange(pinned.shape[1]) < POSE_DOF
+        pinned = pinned | ((knowledge.fixed_poses & problem.moves)[:, None] & pose)
+    terms = KnowledgeTerms.of(knowledge, problem.layout.observations, given)
+    gauge = remaining_gauge(knowledge, start.R, start.t, start.X)
+    return replace(problem, columns=replace(columns, pinned=pinned), known=terms, gauge=gauge)
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
@@ -241,12 +284,15 @@ def _covariances(
     number = problem.columns.columns_of(problem.values.number)
     own = np.arange(int(seen.sum()))
     row, column = (layout.row, layout.column) if points else (own, own)
-    blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column)
+    blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column, problem.gauge)
     poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
     intrinsics, poses[seen] = covariance.bundle_covariances(
         blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
     )
+    poses[problem.columns.pinned[:, 0]] = 0.0
     if not points:
         return intrinsics, poses, None
     of_points = covariance.point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
+    if problem.known is not None and problem.known.fixed_points is not None:
+        of_points[problem.known.fixed_points] = 0.0
     return intrinsics, poses, of_points / scale**2

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import F64, I64, require_finite, require_shapes
+from thesisrecon.arrays import B8, F64, I64, require_finite, require_shapes
 
 
 @dataclass(frozen=True)
@@ -115,6 +115,12 @@ class Observations(NamedTuple):
     view_index: I64
     point_index: I64
     xy: F64
+
+    def at(self, rows: I64 | B8 | slice) -> Observations:
+        """The observations of some rows, as arrays of their own."""
+        view, point = (np.asarray(part)[rows] for part in (self.view_index, self.point_index))
+        xy = np.ascontiguousarray(np.asarray(self.xy)[rows])
+        return Observations(np.ascontiguousarray(view), np.ascontiguousarray(point), xy)
 
 
 def cached_pair_order(first: ArrayLike, second: ArrayLike) -> I64:

@@ -1,0 +1,137 @@
+"""Models of other programs: what is written is read again; what other writers add; damaged files; meshes."""
+
+import json
+
+import numpy as np
+import PIL.Image
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.conftest import refuses
+from thesisrecon import Camera, UsageError, compare_models, detect_corners, read_cameras, read_mesh
+from thesisrecon.io import _exports
+from thesisrecon.io._models import read_model
+from thesisrecon.results import SparseModel, SparseView
+
+SIZE = (640, 480)
+
+
+def _model(*, centred=False, lens=(0.0, 0.0, 0.0)):
+    rng = np.random.default_rng(0)
+    K = np.array([[500.0, 0, 319.5 if centred else 310], [0, 500, 239.5 if centred else 250], [0, 0, 1]])
+    R = Rotation.from_rotvec(0.4 * rng.normal(size=(4, 3))).as_matrix()
+    views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, np.array(lens)) for i, r in enumerate(R)]
+    X, view, point = rng.normal(size=(9, 3)), np.repeat(np.arange(4), 9), np.tile(np.arange(9), 4)
+    colors = rng.integers(0, 256, (9, 3)).astype(np.uint8)
+    return SparseModel(views, X, colors, view, point, rng.uniform(0, 400, (36, 2)))
+
+
+def _same(found, model):
+    assert found.names == model.names
+    for a, b in zip(found.views, model.views, strict=True):
+        np.testing.assert_allclose(a.R, b.R, atol=1e-9)
+        np.testing.assert_allclose(a.t, b.t, atol=1e-9)
+        np.testing.assert_allclose(a.K, b.K, atol=1e-9)
+        np.testing.assert_allclose(a.distortion, b.distortion, atol=1e-9)
+        assert a.size == b.size
+
+
+def test_written_models_are_read_again(tmp_path):
+    model = _model()
+    _same(read_model(_exports.write_nerfstudio(tmp_path, model, masked=False)), model)
+    found = read_model(_exports.write_openmvs(tmp_path, model))
+    _same(found, model)
+    np.testing.assert_allclose(found.X, model.X, atol=1e-6)
+    model, images = _model(centred=True), tmp_path / "images"
+    images.mkdir()
+    for name in model.names:
+        PIL.Image.new("L", SIZE).save(images / name)
+    found = read_model(_exports.write_bundler(tmp_path, model))
+    _same(found, model)
+    np.testing.assert_allclose(found.X, model.X)
+    np.testing.assert_array_equal(found.colors, model.colors)
+    order, theirs = (np.lexsort((m.view_index, m.point_index)) for m in (found, model))
+    np.testing.assert_allclose(found.xy[order], model.xy[theirs])
+    compared = compare_models(tmp_path / "bundle.out", tmp_path / "transforms.json")
+    assert compared.centre_error.max() < 1e-9
+    cameras = read_cameras(_exports.write_kalibr(tmp_path, _model(lens=(0.1, -0.02, 0.0)))[0])
+    assert list(cameras) == ["cam0"]
+    np.testing.assert_allclose(cameras["cam0"].distortion, [0.1, -0.02, 0.0])
+
+
+def test_nerf_gives_an_angle_and_kalibr_a_chain(tmp_path):
+    (tmp_path / "train").mkdir()
+    PIL.Image.new("L", (800, 600)).save(tmp_path / "train" / "r_0.png")
+    pose = [[1.0, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
+    frames = [{"file_path": "./train/r_0", "transform_matrix": pose}]
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+    camera = read_cameras(path)["train/r_0"]
+    assert camera.K[0, 0] == pytest.approx(400 / np.tan(0.4))
+    assert camera.K[:2, 2].tolist() == [399.5, 299.5]
+    np.testing.assert_allclose(camera.centre, [1, 2, 3])
+    # Cameras of NeRF look along -z: here along +y of the world.
+    np.testing.assert_allclose(camera.R[2], [0, 1, 0], atol=1e-12)
+    chain = tmp_path / "camchain.yaml"
+    rows = "".join(f"  - [{', '.join(map(str, row))}]\n" for row in np.c_[np.eye(3), [-0.1, 0, 0]].tolist())
+    entry = "  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.2, {p}, 0.0]\n  distortion_model: radtan\n"
+    entry += "  intrinsics: [400.0, 401.0, 320.0, 240.0]\n  resolution: [640, 480]\n"
+    own = entry.format(p=0.0)
+    chain.write_text(f"cam0:\n{own}cam1:\n  T_cn_cnm1:\n{rows}  - [0, 0, 0, 1]\n{own}")
+    np.testing.assert_allclose(read_cameras(chain)["cam1"].centre, [0.1, 0, 0])
+    chain.write_text(f"cam0:\n{entry.format(p=0.01)}")
+    refuses(UsageError, "not radial", read_cameras, chain)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("transforms.json", '{"frames": [{"file_path": "a"}]}', "must hold frames"),
+        ("transforms.json", '{"frames": []}', "no camera"),
+        ("bundle.out", "# Bundle file v0.3\n3 1\n1 0 0\n", "Bundler file v0.3"),
+        ("scene.mvs", "MVSI", "must be an OpenMVS scene"),
+        ("camchain.yaml", "cam0:\n  resolution: [1]\n", "camchain.yaml of pinhole"),
+    ],
+)
+def test_damaged_models_get_one_sentence(tmp_path, name, content, says):
+    (tmp_path / name).write_text(content)
+    refuses(UsageError, says, read_model, tmp_path / name)
+
+
+def test_meshes_of_ply_and_obj_keep_axes_colours_and_texture(tmp_path):
+    corners = "v 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"
+    (tmp_path / "a.obj").write_text(
+        f"mtllib a.mtl\n{corners}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3 4/4\n"
+    )
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+    PIL.Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(tmp_path / "a.png")
+    mesh = read_mesh(tmp_path / "a.obj")
+    assert (mesh.vertices.shape, mesh.faces.shape, mesh.texture.shape) == ((4, 3), (2, 3), (4, 4, 3))
+    at = mesh.vertices[mesh.faces[0]], mesh.uv[0]
+    np.testing.assert_allclose(
+        at[1], np.column_stack([4 * at[0][:, 0], 4 - 4 * at[0][:, 1]]) - 0.5, atol=1e-6
+    )
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "a.ply").write_text(head + "0 0 1 9 8 7\n1 0 1 9 8 7\n0 1 1 9 8 7\n3 0 1 2\n")
+    mesh = read_mesh(tmp_path / "a.ply")
+    assert mesh.vertices[1].tolist() == [1, 0, 1]
+    assert mesh.colors.tolist() == [[9, 8, 7]] * 3
+    refuses(UsageError, "GLB, PLY or OBJ", read_mesh, tmp_path / "a.mtl")
+    refuses(UsageError, "there is no mesh", read_mesh, tmp_path / "b.ply")
+
+
+def test_images_stand_for_their_sizes_and_corners_are_found():
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[20:40, 30:60] = 200
+    assert Camera(np.eye(3), np.eye(3), np.zeros(3), image).size == (80, 60)
+    for formula in ("noble", "harris"):
+        found = detect_corners(image, formula=formula, max_corners=4)
+        # The edges lie between pixels; the smoothing moves the maximum to the inside.
+        corners = np.array([[29.5, 19.5], [29.5, 39.5], [59.5, 19.5], [59.5, 39.5]])
+        at = found.xy[np.lexsort(found.xy.round().T[::-1])]
+        inward = np.sign([44.5, 29.5] - corners) * (at - corners)
+        assert inward.shape == (4, 2)
+        assert 0.0 < inward.min() <= inward.max() < 1.5
+        np.testing.assert_allclose(inward, inward[0, 0], atol=1e-6)

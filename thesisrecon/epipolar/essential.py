@@ -1,0 +1,222 @@
+"""The essential matrix of matches with outliers: five points, RANSAC, least Sampson distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
+from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
+from thesisrecon.geometry.relative_pose import (
+    depths_of_matches,
+    essential_five_points,
+    essential_from_pose,
+    pose_in_front,
+)
+from thesisrecon.optimize.least_squares import (
+    INLIER_SIGMAS,
+    DenseSystem,
+    run_levenberg_marquardt,
+    trimmed_noise_scale,
+)
+from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
+
+_SAMPLE, _UNKNOWN = 5, 5
+_ROUNDS = 6
+# Minimal samples amplify the noise: inliers of a refit are first those of wider gates, in thresholds.
+_GATES = (3.0, 2.0, 1.0)
+# A refit of a model up to this much worse than the best one may be better.
+_NEAR = 1.1
+_REFITTED = 1000  # matches of a refit
+# Residuals in units of the frame below which they are rounding errors.
+_EXACT = 1e-9
+
+Pose = tuple[F64, F64]
+
+
+@dataclass(frozen=True)
+class EssentialFit:
+    """An essential matrix with the relative pose, its inliers and noise.
+
+    Parameters
+    ----------
+    E, R, t : ndarray (3, 3), (3, 3) and (3,)
+        E = [t]x R of unit norm; a point X in the frame of the first camera is R X + t in that of the second,
+        with \\|t\\| = 1.
+    inliers, in_front, sigma_px : ndarray (N,) of bool, ndarray (N,) of bool, float
+        Matches within the noise; those that meet in front of both cameras; standard deviation of one image
+        coordinate.
+    covariance : ndarray (6, 6)
+        Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as
+        if all inliers were right; it has no part along t.
+    """
+
+    E: F64
+    R: F64
+    t: F64
+    inliers: B8
+    in_front: B8
+    sigma_px: float
+    covariance: F64
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Matches (N, 4) in a common frame, their calibration there, and rays (N, 3)."""
+
+    points: F64
+    inverse1: F64
+    inverse2: F64
+    x1: F64
+    x2: F64
+
+    @classmethod
+    def of(cls, frame: PairFrame, xy1: F64, xy2: F64, K1: F64, K2: F64) -> _Pair:
+        inverse1, inverse2 = np.linalg.inv(np.stack(frame.transforms) @ np.stack([K1, K2]))
+        points = frame.points(xy1, xy2)
+        x1, x2 = homogenize(points[:, :2]) @ inverse1.T, homogenize(points[:, 2:]) @ inverse2.T
+        return cls(points, inverse1, inverse2, x1, x2)
+
+    def fundamental(self, E: F64) -> F64:
+        """F of E (..., 3, 3) in the frame."""
+        return np.asarray(self.inverse2.T @ E @ self.inverse1)
+
+    def squared(self, E: F64, rows: I64) -> F64:
+        """Squared Sampson distances (B, M) of some matches."""
+        F = self.fundamental(E)
+        a, b = homogenize(self.points[rows, :2]), homogenize(self.points[rows, 2:])
+        l2, l1 = a @ np.swapaxes(F, 1, 2), b @ F
+        e = np.sum(l2 * b, axis=2)
+        return np.asarray(e**2 / (np.sum(l2[..., :2] ** 2 + l1[..., :2] ** 2, axis=2) + 1e-300))
+
+    def pose(self, E: F64, rows: I64) -> Pose:
+        """R and t of E that place most matches in front of both cameras."""
+        return pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
+
+    def tangent(self, R: F64, t: F64) -> tuple[F64, F64]:
+        """Derivatives (9, 5) of F by rotation and by the two directions (2, 3) across t."""
+        across = np.linalg.svd(t[None])[2][1:]
+        turns = [essential_from_pose(essential_from_pose(R, axis), t) for axis in np.eye(3)]
+        moves = [essential_from_pose(R, axis) for axis in across]
+        return across, np.asarray(self.fundamental(np.array([*turns, *moves])).reshape(5, 9).T)
+
+    def normal_equations(self, R: F64, t: F64, rows: I64) -> DenseSystem:
+        """Those of the Sampson distances of some matches over the five unknowns of :meth:`tangent`."""
+        points, G, h = np.ascontiguousarray(self.points[rows]), np.empty((9, 9)), np.empty(9)
+        f = np.ascontiguousarray(self.fundamental(essential_from_pose(R, t)).ravel())
+        cost, J = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)[1]
+        return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
+
+
+def fit_essential(
+    xy1: F64, xy2: F64, K1: F64, K2: F64, threshold_px: float | None, budget: Budget, rng: Generator
+) -> EssentialFit:
+    """Fit an essential matrix; arguments as for :func:`thesisrecon.estimate_essential`."""
+    n = len(xy1)
+    if n < _SAMPLE + 1 or min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) == 0.0:
+        raise _undetermined(f"{counted(n, 'match')}, at least 6 different ones are needed")
+    frame = PairFrame.of(xy1, xy2)
+    pair, every = _Pair.of(frame, xy1, xy2, K1, K2), np.arange(n)
+    # Without a search the noise of all matches is the threshold.
+    gate = frame.scale * threshold_px if threshold_px is not None else 1e3
+    E, samples, rows = _search(pair, gate, budget, rng)
+    pose = pair.pose(E, rows)
+    inliers = np.ones(n, dtype=bool) if threshold_px is None else pair.squared(E[None], every)[0] < gate**2
+    if threshold_px is not None:
+        _require_more_than_chance(xy1, xy2, inliers, threshold_px, samples)
+    for _ in range(_ROUNDS):
+        if inliers.sum() <= _SAMPLE:
+            raise _undetermined(f"{inliers.sum()} of {n} matches agree with the best of {samples} samples")
+        pose = _refined(pair, pose, np.flatnonzero(inliers))
+        distance = np.sqrt(pair.squared(essential_from_pose(*pose)[None], every)[0])
+        if threshold_px is None:
+            break
+        near = distance[distance < max(2.0 * gate, float(np.median(distance[inliers])))]
+        noise = trimmed_noise_scale(near, float(np.median(near)) / 0.6745, parameters=_UNKNOWN)
+        before, inliers = inliers, distance <= max(INLIER_SIGMAS * noise, _EXACT)
+        if np.array_equal(inliers, before):
+            break
+    return _finished(pair, pose, inliers, frame.scale)
+
+
+def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int, I64]:
+    """The E of least truncated squared distances, the number of samples and its inliers among scored data."""
+
+    some = rng.permutation(len(pair.points))[:_REFITTED]
+
+    def refit(E: F64, rows: I64) -> F64:
+        if len(rows) <= _SAMPLE:
+            return E
+        pose = pair.pose(E, rows)
+        for wide in _GATES:
+            distance = pair.squared(essential_from_pose(*pose)[None], some)[0]
+            inside = some[distance < (wide * gate) ** 2]
+            if len(inside) <= _SAMPLE:
+                return E
+            pose = _refined(pair, pose, inside, iterations=5)
+        return unit_norm(essential_from_pose(*pose))
+
+    found = search_models(
+        lambda samples: essential_five_points(pair.x1[samples], pair.x2[samples]),
+        lambda E, rows: pair.squared(E, rows) / gate**2,
+        refit, rng, len(pair.points), _SAMPLE, budget, near=_NEAR,
+    )  # fmt: skip
+    if found is None or not len(found.inliers):
+        raise _undetermined("no sample of five matches has an essential matrix")
+    return found
+
+
+def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
+    """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
+
+    def linearize(state: Pose) -> DenseSystem:
+        return pair.normal_equations(*state, rows)
+
+    def retract(state: Pose, step: F64) -> Pose:
+        R, t = state
+        moved = t + step[3:] @ np.linalg.svd(t[None])[2][1:]
+        return Rotation.from_rotvec(step[:3]).as_matrix() @ R, moved / np.linalg.norm(moved)
+
+    def cost(state: Pose) -> float:
+        return 0.5 * float(pair.squared(essential_from_pose(*state)[None], rows).sum())
+
+    return run_levenberg_marquardt(linearize, retract, cost, pose, max_iterations=iterations).state
+
+
+def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFit:
+    """The fit with noise, covariance and the matches in front of both cameras."""
+    rows = np.flatnonzero(inliers)
+    R, t = pair.pose(essential_from_pose(*pose), rows)
+    system, across = pair.normal_equations(R, t, rows), pair.tangent(R, t)[0]
+    sigma = float(np.sqrt(2.0 * system.cost / max(len(rows) - _UNKNOWN, 1)))
+    values, vectors = np.linalg.eigh(system.hessian)
+    half = np.zeros((6, 5))
+    # t moves by w x t + d.
+    half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), across.T
+    half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
+    front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
+    return EssentialFit(
+        unit_norm(essential_from_pose(R, t)), R, t, inliers, front, sigma / scale, half @ half.T
+    )
+
+
+def _undetermined(evidence: str) -> StageFailure:
+    advice = "use more matches of one static scene, and the calibration of these images"
+    return StageFailure("the matches do not determine an essential matrix", evidence, advice)
+
+
+def _require_more_than_chance(xy1: F64, xy2: F64, inliers: B8, threshold_px: float, samples: int) -> None:
+    """Raise ``StageFailure`` if some pose would have as many inliers among wrong matches."""
+    # Weights count matches within two units, here thresholds.
+    weights = multiplicity_weights(xy1 / threshold_px, xy2 / threshold_px)
+    share = chance_of_agreement(xy1, xy2, threshold_px)
+    agreeing, tried = float(weights[inliers].sum()), float(weights.sum())
+    if log10_false_alarms(agreeing, tried, chance=share, free=_SAMPLE) > CHANCE:
+        said = f"{inliers.sum()} of {len(xy1)} matches agree with the best of {samples} samples"
+        raise _undetermined(f"{said}, which chance explains")
