@@ -162,7 +162,11 @@ def _level_array(image: Any) -> Any:
     if array.dtype.kind not in "biuf":
         kinds = "a path, a Pillow image or a numpy array of grey levels or colours"
         raise ValueError(f"an image must be {kinds}; got a {type(image).__name__} of {array.dtype}")
-    return np.where(hidden, np.nan, array.astype(np.float32)) if hidden.any() else array
+    if hidden.any():
+        array = np.where(hidden, np.nan, array.astype(np.float32))
+    if array.dtype.kind == "f" and array.size and not np.isfinite(array).any():
+        raise ValueError("an image array has no finite level: all of them are missing")
+    return array
 
 
 def _white_of(arrays: list[Any]) -> float:

@@ -115,11 +115,12 @@ def test_a_rectified_pair_is_matched_from_arrays_and_files(tmp_path):
         PIL.Image.fromarray(image).save(tmp_path / f"{name}.png")
     again = thesisrecon.match_rectified(tmp_path / "left.png", tmp_path / "right.png", max_disparity_px=12)
     np.testing.assert_array_equal(again.disparity, found.disparity)
-    deep = left.astype(np.uint16) * 257
+    deep = [side.astype(np.uint16) * 257 for side in (left, right)]
+    again = thesisrecon.match_rectified(*deep, max_disparity_px=12)
+    np.testing.assert_allclose(again.disparity, found.disparity, atol=1e-3)
     for error, words, *images in (
         (UsageError, "nothing", tmp_path / "nothing.png", right),
         (ValueError, "same shape", left, right[:-2]),
-        (ValueError, r"grey levels 0 to 255; got uint16 up to 65\d\d\d", deep, deep),
     ):
         refuses(error, words, thesisrecon.match_rectified, *images, max_disparity_px=12)
 
@@ -165,7 +166,8 @@ def test_epipolar_lines_pass_through_the_matches(tmp_path):
     for image in (gray, tmp_path / "a.png"):
         drawn = thesisrecon.draw_epipolar_lines(image, image, F, xy1[:1], xy2[:1])
         for side, (canvas, xy) in enumerate(zip(drawn, (xy1, xy2), strict=True)):
-            rows, columns = np.nonzero((canvas == [255, 0, 0]).all(axis=2))
+            # More red than background: a line covers parts of pixels.
+            rows, columns = np.nonzero(canvas[:, :, 0] > canvas[:, :, 1] + 127.0)
             line = (epipolar_lines(F, xy1) if side else epipolar_lines(F.T, xy2))[0]
             off = np.abs(np.column_stack([columns, rows, np.ones(len(rows))]) @ line)
             near = np.hypot(*(np.column_stack([columns, rows]) - xy[0]).T) < 6.0

@@ -60,9 +60,11 @@ def test_at_their_own_places_the_photographs_are_seen_again(found):
 
 
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
-    refuses(ValueError, "det -1", thesisrecon.synthesize_view, "no.jpg", "file.jpg", -np.eye(3), np.zeros(3))
+    refuses(
+        ValueError, "det R = -1", thesisrecon.synthesize_view, "no.jpg", "file.jpg", -np.eye(3), np.zeros(3)
+    )
     given = thesisrecon.synthesize_view, "no.jpg", "file.jpg", np.eye(3)
-    refuses(ValueError, "three finite", *given, [0.0, 1.0])
+    refuses(ValueError, r"t \(3\)", *given, [0.0, 1.0])
     refuses(ValueError, "K must be", *given, np.zeros(3), K=np.eye(4))
     unknown = np.where(np.eye(3) > 0.0, 1.0, np.nan)
     for wrong in (unknown, 2.0 * np.eye(3), [np.eye(3), unknown]):

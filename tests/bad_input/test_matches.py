@@ -114,7 +114,7 @@ def test_hostile_matches_give_numbers_or_a_named_failure(name):
 @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "seven-point"])
 def test_invalid_matches_are_value_errors(name):
     for kind, (xy1, xy2) in VALUE_ERRORS.items():
-        with pytest.raises(ValueError, match="fundamental matrix needs") as failure:
+        with pytest.raises(ValueError, match=r"fundamental.* needs") as failure:
             FUNCTIONS[name](xy1, xy2)
         assert not isinstance(failure.value, np.linalg.LinAlgError), kind
 

@@ -48,7 +48,7 @@ def test_photographs_that_cannot_be_matched_are_named(name):
     for error, words, images in (
         *((StageFailure, "blank", (np.full(SHAPE, level, np.uint8), right)) for level in (0, 128, 255)),
         (StageFailure, "32 x 32 pixels; the minimum is 64 x 64", (left[:32, :32], right[:32, :32])),
-        (ValueError, "uint8", (np.full(SHAPE, np.nan), right)),
+        (ValueError, "no finite level", (np.full(SHAPE, np.nan), right)),
     ):
         refuses(error, words, match_pair, *images, config=preset(name))
 

@@ -18,7 +18,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.optimize.ransac import CHANCE, MORE_AGREE, REACHES, Budget, log10_false_alarms, search_models
+from thesisrecon.optimize.ransac import CHANCE, REACHES, Budget, log10_false_alarms, search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
@@ -267,9 +267,12 @@ def fit_homography(
     return HomographyFit(unit_norm(h.reshape(3, 3)), inliers, sigma / frame.scale, covariance)
 
 
-def _undetermined(evidence: str, advice: str = "") -> StageFailure:
-    usual = "use four or more matches of one plane, or of a rotating camera, no three of them on one line"
-    return StageFailure("the matches do not determine a homography", evidence, advice or usual)
+def _undetermined(evidence: str) -> StageFailure:
+    return StageFailure(
+        "the matches do not determine a homography",
+        evidence,
+        "use four or more matches of one plane, or of a rotating camera, no three of them on one line",
+    )
 
 
 def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -> None:
@@ -293,8 +296,11 @@ def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -
         k = len(np.unique(points[near], axis=0))
         if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=_SAMPLE) <= CHANCE:
             return
-    evidence = f"{k} of {n} different matches agree with the best of {samples} samples, which chance explains"
-    raise _undetermined(evidence, f"use more matches; {MORE_AGREE}")
+    raise StageFailure(
+        "chance explains the inliers of the homography",
+        f"{k} of {n} different matches agree with the best of {samples} samples",
+        "use more matches; a threshold_px of three times the noise, or None if all are right, keeps more",
+    )
 
 
 @kernel

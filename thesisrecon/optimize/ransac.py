@@ -29,7 +29,6 @@ AT_ONCE = 2**17  # residuals of models computed at once
 WITHOUT = 100_000  # samples without any model after which there is none
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
-MORE_AGREE = "a threshold_px of three times the noise, or None if all are right, lets more of them agree"
 REACHES = 1.0, 3.0
 """Inlier limits at which chance is tested: right data with the noise of the limit lie within three."""
 
@@ -224,13 +223,16 @@ def _require_more_than_chance(X: F64, xy: F64, P: F64, limit: float, samples: in
         k = len(np.unique(np.column_stack([X, xy])[near], axis=0))
         if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=size) <= CHANCE:
             return
-    evidence = f"{k} of {n} agree with the best of {samples} samples, which chance explains"
-    raise _no_camera(evidence, f"use more points; {MORE_AGREE}")
+    raise StageFailure(
+        "chance explains the points of the camera",
+        f"{k} of {n} agree with the best of {samples} samples",
+        "use more points; a threshold_px of three times the noise, or None if all are right, keeps more",
+    )
 
 
-def _no_camera(evidence: str, advice: str = "") -> StageFailure:
-    usual = "check that points and pixels correspond, and that the points are in right-handed coordinates"
-    return StageFailure("no camera explains the points", evidence, advice or usual)
+def _no_camera(evidence: str) -> StageFailure:
+    advice = "check that points and pixels correspond, and that the points are in right-handed coordinates"
+    return StageFailure("no camera explains the points", evidence, advice)
 
 
 def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:

@@ -268,6 +268,9 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
     count = len(views.names)
     if not isinstance(tracks, Tracks):
         kinds = "thesisrecon.Tracks or an array of pixels (V, N, 2), NaN or masked where a point is not seen"
+        # A list may hold keypoints of each image, whose rows do not belong together.
+        if isinstance(tracks, list | tuple):
+            raise UsageError(f"tracks must be {kinds}; got a {type(tracks).__name__}")
         try:
             (xy,) = numbers("tracks", missing=("tracks",), tracks=tracks)
         except ValueError as error:
