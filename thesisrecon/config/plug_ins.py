@@ -22,7 +22,7 @@ from thesisrecon.arrays import B8, F32, F64, U8
 from thesisrecon.epipolar._matches import PairFrame, check_matches, noise_scale
 from thesisrecon.epipolar.refinement import fundamental_covariance
 from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
-from thesisrecon.geometry.two_view import sampson_residuals
+from thesisrecon.geometry.two_view import enforce_rank_two, sampson_residuals
 from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice
 
 # ruff: noqa: ARG002 (all methods of a stage have the same arguments)
@@ -226,11 +226,11 @@ class FunctionFundamental(FunctionAdapter):
         if inliers.sum() < MIN_INLIERS:
             raise self._failure(f"it found {inliers.sum()} inliers", len(xy1))
         frame = PairFrame.of(xy1, xy2)
-        U, s, Vt = np.linalg.svd(frame.matrix_in_frame(F).reshape(3, 3))
+        F = frame.matrix_in_frame(F).reshape(3, 3)
+        s = np.linalg.svd(F, compute_uv=False)
         if not s[1] > 1e-12 * s[0]:
             raise self._check.wrong("an F of rank below 2")
-        f = np.ascontiguousarray((U[:, :2] * s[:2]) @ Vt[:2]).ravel()
-        f /= np.linalg.norm(f)
+        f = enforce_rank_two(F).ravel()
         F = frame.matrix_in_pixels(f)
         sigma = noise_scale(sampson_residuals(F, xy1[inliers], xy2[inliers]))
         points = frame.points(xy1[inliers], xy2[inliers])

@@ -268,11 +268,8 @@ def fit_homography(
 
 
 def _undetermined(evidence: str) -> StageFailure:
-    return StageFailure(
-        "the matches do not determine a homography",
-        evidence,
-        "use four or more matches of one plane, or of a rotating camera, no three of them on one line",
-    )
+    advice = "use four or more matches of one plane, or of a rotating camera, no three of them on one line"
+    return StageFailure("the matches do not determine a homography", evidence, advice)
 
 
 def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -> None:
