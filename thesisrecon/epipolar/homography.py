@@ -256,7 +256,7 @@ def fit_homography(
             if k > 0 and np.array_equal(inliers, before):
                 break
             H, inverse = _refine(H, points[inliers])
-        _require_more_than_chance(H, points, limit, samples)
+        _require_more_than_chance(H, points, gate, samples)
     r = homography_sampson_residuals(H, points[inliers, :2], points[inliers, 2:])
     left = (r.size - _PARAMETERS) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(r**2) / left)) if left else float("nan")
@@ -272,7 +272,7 @@ def _undetermined(evidence: str) -> StageFailure:
     return StageFailure("the matches do not determine a homography", evidence, advice)
 
 
-def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -> None:
+def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
     """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers, equal ones once.
 
     A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
@@ -287,11 +287,11 @@ def _require_more_than_chance(H: F64, points: F64, limit: float, samples: int) -
     with np.errstate(divide="ignore"):
         unit = np.pi * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
     for reach in REACHES:
-        near = squared <= max(reach * limit, _EXACT) ** 2
-        largest = max(float(squared[near].max()), _EXACT**2)
+        near = squared <= max(reach * gate, _EXACT) ** 2
+        largest = max(float(squared[near].max(initial=0.0)), _EXACT**2)
         chance = float(np.minimum(largest * unit, 1.0).max(axis=0).mean())
         k = len(np.unique(points[near], axis=0))
-        if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=_SAMPLE) <= CHANCE:
+        if near.all() or log10_false_alarms(k, n, chance=chance, free=_SAMPLE) <= CHANCE:
             return
     raise StageFailure(
         "chance explains the inliers of the homography",

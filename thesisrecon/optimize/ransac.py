@@ -30,7 +30,7 @@ WITHOUT = 100_000  # samples without any model after which there is none
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
 REACHES = 1.0, 3.0
-"""Inlier limits at which chance is tested: right data with the noise of the limit lie within three."""
+"""Thresholds at which chance is tested: right data whose noise is the threshold lie within three."""
 
 
 class Budget(NamedTuple):
@@ -204,24 +204,24 @@ def resect_robust(
         if np.array_equal(inliers, fit.inliers):
             break
     if threshold_px is not None:
-        _require_more_than_chance(X, xy, fit.P, limit, samples, _SAMPLE if K is None else 3)
+        _require_more_than_chance(X, xy, fit.P, threshold_px, samples, _SAMPLE if K is None else 3)
     left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
     sigma = float(np.sqrt(np.sum(distance[fit.inliers] ** 2) / left)) if left > 0 else float("nan")
     return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
 
 
-def _require_more_than_chance(X: F64, xy: F64, P: F64, limit: float, samples: int, size: int) -> None:
+def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples: int, size: int) -> None:
     """Raise ``StageFailure`` if a camera of wrong points would have as many inliers, equal ones once.
 
     Nothing was chosen if all points are inliers.
     """
     distance, n = np.sqrt(_squared_residuals(P[None], homogenize(X), xy)[0]), len(X)
     for reach in REACHES:
-        near = distance <= max(reach * limit, _EXACT_PX)
+        near = distance <= max(reach * threshold, _EXACT_PX)
         largest = max(float(distance[near].max(initial=0.0)), _EXACT_PX)
         chance = np.pi * largest**2 / max(float(np.prod(np.ptp(xy, axis=0))), largest**2)
         k = len(np.unique(np.column_stack([X, xy])[near], axis=0))
-        if (reach == 1.0 and near.all()) or log10_false_alarms(k, n, chance=chance, free=size) <= CHANCE:
+        if near.all() or log10_false_alarms(k, n, chance=chance, free=size) <= CHANCE:
             return
     raise StageFailure(
         "chance explains the points of the camera",
