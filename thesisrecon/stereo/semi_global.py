@@ -267,7 +267,7 @@ class SemiGlobalMatching:
     support: bool = True
     """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
     smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
-    refinements: int = 2  #: passes of the least squares of intensities, which remove pixel locking
+    refinements: int = 0  #: passes of the least squares of intensities, which remove pixel locking
 
     # Limit for costs and path sums of one strip of rows.
     memory_mb = 256.0
