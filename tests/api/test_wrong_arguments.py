@@ -114,6 +114,19 @@ CALLS = {
         tr.estimate_homography,
         {"xy1": XY[0], "xy2": 2.0 * XY[0], "threshold_px": 1.0, "max_samples": 100, "seed": 0},
     ),
+    "estimate_essential": (
+        tr.estimate_essential,
+        {"xy1": XY[0], "xy2": XY[1], "K1": K, "threshold_px": 1.0, "max_samples": 100, "seed": 0},
+    ),
+    "recover_pose": (tr.recover_pose, {"E": K.T @ F @ K, "xy1": XY[0], "xy2": XY[1], "K1": K}),
+    "decompose_homography": (
+        tr.decompose_homography,
+        {"H": K @ (R[0] + np.outer(T[0], [0.0, 0.0, 0.1])) @ np.linalg.inv(K), "K1": K, "xy1": XY[0]},
+    ),
+    "undistort_points": (
+        lambda xy, K: tr.undistort_points(xy, CAMERAS[0], K),
+        {"xy": XY[0], "K": K},
+    ),
     "estimate_trifocal": (
         tr.estimate_trifocal,
         {

@@ -352,7 +352,8 @@ def _positions(name: str, at: F64 | None, std: float | F64, n: int, seen: I64) -
     """The known positions (n, 3) of what is ``seen``."""
     if at is None:
         return NO_PRIOR
-    at, widths = np.asarray(at, dtype=np.float64), np.asarray(std, dtype=np.float64)
+    (at,) = numbers("bundle_adjust", missing=(name,), **{name: at})
+    widths = np.asarray(std, dtype=np.float64)
     if at.shape != (n, 3) or widths.shape not in ((), (3,), (n, 3)):
         form = f"({n}, 3) with a standard deviation each, (3,) or ({n}, 3)"
         raise ValueError(f"{name} must have the shape {form}; got {at.shape} and {widths.shape}")
@@ -367,7 +368,7 @@ def _whitening(covariances: F64 | None, dense: tuple[int, ...] | None, observed:
     """Roots (K, 2, 2) of the information of the observations, None if they are equal."""
     if covariances is None:
         return None
-    Q = np.asarray(covariances, dtype=np.float64)
+    (Q,) = numbers("bundle_adjust", covariances=covariances)
     shape = (len(observed.xy),) if dense is None else dense[:2]
     if Q.shape not in (shape, (*shape, 2, 2)):
         form = f"{shape} or {(*shape, 2, 2)}"

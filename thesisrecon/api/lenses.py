@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.api.given import CameraInput, as_cameras
-from thesisrecon.arrays import B8, F32, F64, I64, U8, require_calibration, require_shapes
+from thesisrecon.arrays import B8, F32, F64, I64, U8, numbers, require_calibration, require_shapes
 from thesisrecon.camera import Camera, distort, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.imaging.resampling import undistort_image as resampled
@@ -60,7 +60,7 @@ def undistort_points(xy: F64, camera: Camera, K: F64 | None = None) -> F64:
     >>> undistort_points(np.array([[576.25, 240.0]]), camera).round(6).tolist()
     [[570.0, 240.0]]
     """
-    xy = np.asarray(xy, dtype=np.float64)
+    (xy,) = numbers("undistort_points", missing=("xy",), xy=xy)
     require_shapes("undistort_points", xy=(xy, ("N", 2)))
     K = _calibration("undistort_points", camera, K)
     given = dehomogenize(homogenize(xy) @ np.linalg.inv(camera.K).T)
@@ -245,8 +245,9 @@ def rectify_cameras(
 def _calibration(caller: str, camera: Camera, K: F64 | None) -> F64:
     if K is None:
         return camera.K
+    (K,) = numbers(caller, K=K)
     require_calibration(caller, K)
-    return np.asarray(K, dtype=np.float64)
+    return K
 
 
 def _require_size(caller: str, pixels: U8, camera: Camera) -> None:

@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from thesisrecon.api.cameras import require_threshold, search_budget
 from thesisrecon.api.lenses import undistort_points
-from thesisrecon.arrays import F64, require_calibration, require_finite, require_shapes
+from thesisrecon.arrays import F64, generator, numbers, require_calibration, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
@@ -102,7 +102,7 @@ def estimate_essential(
     require_threshold(threshold_px, x1, x2)
     budget = search_budget(confidence, max_samples)
     (K1, x1), (K2, x2) = _pinhole(caller, K1, x1), _pinhole(caller, K1 if K2 is None else K2, x2)
-    return fit_essential(x1, x2, K1, K2, threshold_px, budget, np.random.default_rng(seed))
+    return fit_essential(x1, x2, K1, K2, threshold_px, budget, generator(caller, seed))
 
 
 def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | None = None) -> RelativePose:
@@ -139,7 +139,8 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     >>> np.allclose(pose.R, np.eye(3)), np.allclose(pose.t, [-1, 0, 0]), pose.depths.round(9).tolist()
     (True, True, [[2.0, 2.0]])
     """
-    caller, E = "recover_pose", np.asarray(E, dtype=np.float64)
+    caller = "recover_pose"
+    (E,) = numbers(caller, E=E)
     require_shapes(caller, E=(E, (3, 3)))
     require_finite(caller, E)
     x1, x2 = _matches(caller, xy1, xy2)
@@ -193,7 +194,8 @@ def decompose_homography(
     >>> len(found.R), np.allclose(found.t[k], [0.2, 0, 0]), np.allclose(found.normal[k], [0, 0, 1])
     (2, True, True)
     """
-    caller, H = "decompose_homography", np.asarray(H, dtype=np.float64)
+    caller = "decompose_homography"
+    (H,) = numbers(caller, H=H)
     require_shapes(caller, H=(H, (3, 3)))
     require_finite(caller, H)
     (A, _), (B, _) = (_pinhole(caller, K, np.zeros((0, 2))) for K in (K1, K1 if K2 is None else K2))
@@ -203,7 +205,7 @@ def decompose_homography(
     R, t, normal = poses_from_homography(G)
     if xy1 is None:
         return PlanePoses(R, t, normal, np.ones(len(R)))
-    xy1 = np.asarray(xy1, dtype=np.float64)
+    (xy1,) = numbers(caller, xy1=xy1)
     require_shapes(caller, xy1=(xy1, ("N", 2)))
     x1 = _rays(caller, K1, xy1)
     toward = normal @ x1.T
@@ -218,7 +220,7 @@ def decompose_homography(
 
 
 def _matches(caller: str, xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
+    xy1, xy2 = numbers(caller, xy1=xy1, xy2=xy2)
     require_shapes(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_finite(caller, xy1, xy2)
     return xy1, xy2
@@ -228,7 +230,7 @@ def _pinhole(caller: str, calibration: Calibration, xy: F64) -> tuple[F64, F64]:
     """K (3, 3), and the pixels (N, 2) without distortion."""
     if isinstance(calibration, Camera):
         return calibration.K, undistort_points(xy, calibration)
-    K = np.asarray(calibration, dtype=np.float64)
+    (K,) = numbers(caller, K=calibration)
     require_calibration(caller, K)
     return K, xy
 

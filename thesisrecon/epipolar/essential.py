@@ -147,7 +147,6 @@ def fit_essential(
 
 def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int, I64]:
     """The E of least truncated squared distances, the number of samples and its inliers among scored data."""
-
     some = rng.permutation(len(pair.points))[:_REFITTED]
 
     def refit(E: F64, rows: I64) -> F64:
