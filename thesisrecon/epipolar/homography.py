@@ -18,7 +18,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
-from thesisrecon.optimize.ransac import CHANCE, REACHES, Budget, log10_false_alarms, search_models
+from thesisrecon.optimize.ransac import Budget, inliers_by_chance, search_models
 
 # Planes tried and matches that each is scored on: a plane with a third of the matches is found with 98 %.
 TRIPLES, SUBSET = 100, 200
@@ -273,12 +273,10 @@ def _undetermined(evidence: str) -> StageFailure:
 
 
 def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
-    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers, equal ones once.
+    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers.
 
     A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
-    Nothing was chosen if all matches are inliers.
     """
-    squared, n = squared_plane_distances(H, points), len(points)
     x1, x2 = homogenize(points[:, :2]), points[:, 2:]
     w = x1 @ H[2]
     A = H[:2, :2] - x2[:, :, None] * H[2, :2]
@@ -286,18 +284,16 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
     sizes = np.prod(np.ptp(points, axis=0).reshape(2, 2), axis=1)
     with np.errstate(divide="ignore"):
         unit = np.pi * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
-    for reach in REACHES:
-        near = squared <= max(reach * gate, _EXACT) ** 2
-        largest = max(float(squared[near].max(initial=0.0)), _EXACT**2)
-        chance = float(np.minimum(largest * unit, 1.0).max(axis=0).mean())
-        k = len(np.unique(points[near], axis=0))
-        if near.all() or log10_false_alarms(k, n, chance=chance, free=_SAMPLE) <= CHANCE:
-            return
-    raise StageFailure(
-        "chance explains the inliers of the homography",
-        f"{k} of {n} different matches agree with the best of {samples} samples",
-        "use more matches; a threshold_px of three times the noise, or None if all are right, keeps more",
-    )
+    found = inliers_by_chance(
+        squared_plane_distances(H, points), points, (gate, _EXACT),
+        lambda largest: float(np.minimum(largest * unit, 1.0).max(axis=0).mean()), _SAMPLE,
+    )  # fmt: skip
+    if found is not None:
+        raise StageFailure(
+            "chance explains the inliers of the homography",
+            f"{found} of {len(points)} different matches agree with the best of {samples} samples",
+            "use more matches; a threshold_px of three times the noise, or None if all are right, keeps more",
+        )
 
 
 @kernel

@@ -128,6 +128,24 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
     return float((ways + np.log(max(tail, 1e-300))) / np.log(10.0))
 
 
+def inliers_by_chance(
+    squared: F64, data: F64, limits: tuple[float, float], chance: Callable[[float], float], size: int
+) -> int | None:
+    """Inliers (equal ``data`` once) of a model of samples of ``size``, if chance explains them; else None.
+
+    ``limits``: threshold, and rounding. ``chance`` of a squared distance is the probability that a wrong
+    datum is as near. Nothing was chosen if all data are inliers.
+    """
+    threshold, exact = limits
+    for reach in REACHES:
+        near = squared <= max(reach * threshold, exact) ** 2
+        share = chance(max(float(squared[near].max(initial=0.0)), exact**2))
+        k = len(np.unique(data[near], axis=0))
+        if near.all() or log10_false_alarms(k, len(data), chance=share, free=size) <= CHANCE:
+            return None
+    return k
+
+
 _SAMPLE = 6
 _ANY_PX = 1e4  # search threshold if all points are inliers
 _ROUNDS = 6  # rounds to find the inliers
@@ -211,23 +229,18 @@ def resect_robust(
 
 
 def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples: int, size: int) -> None:
-    """Raise ``StageFailure`` if a camera of wrong points would have as many inliers, equal ones once.
-
-    Nothing was chosen if all points are inliers.
-    """
-    distance, n = np.sqrt(_squared_residuals(P[None], homogenize(X), xy)[0]), len(X)
-    for reach in REACHES:
-        near = distance <= max(reach * threshold, _EXACT_PX)
-        largest = max(float(distance[near].max(initial=0.0)), _EXACT_PX)
-        chance = np.pi * largest**2 / max(float(np.prod(np.ptp(xy, axis=0))), largest**2)
-        k = len(np.unique(np.column_stack([X, xy])[near], axis=0))
-        if near.all() or log10_false_alarms(k, n, chance=chance, free=size) <= CHANCE:
-            return
-    raise StageFailure(
-        "chance explains the points of the camera",
-        f"{k} of {n} agree with the best of {samples} samples",
-        "use more points; a threshold_px of three times the noise, or None if all are right, keeps more",
-    )
+    """Raise ``StageFailure`` if a camera of wrong points would have as many inliers."""
+    area = float(np.prod(np.ptp(xy, axis=0)))
+    found = inliers_by_chance(
+        _squared_residuals(P[None], homogenize(X), xy)[0], np.column_stack([X, xy]), (threshold, _EXACT_PX),
+        lambda largest: np.pi * largest / max(area, largest), size,
+    )  # fmt: skip
+    if found is not None:
+        raise StageFailure(
+            "chance explains the points of the camera",
+            f"{found} of {len(X)} agree with the best of {samples} samples",
+            "use more points; a threshold_px of three times the noise, or None if all are right, keeps more",
+        )
 
 
 def _no_camera(evidence: str) -> StageFailure:
