@@ -170,6 +170,49 @@ def test_trajectories_are_paired_by_time_and_have_errors_by_distance(truth):
     refuses(ValueError, "finite distance above 0", found.relative_errors, 0.0)
 
 
+def test_relative_errors_and_pairs_by_time_are_those_of_evo(truth):
+    """By the definition of Grupp's evo (matching_time_indices; pairs by path; E of Kuemmerle et al.)."""
+    rng, fields = np.random.default_rng(3), {"K": None, "size": None}
+    times = 1e9 + np.arange(14) * 0.1
+    reference = renamed(truth, [f"{time:.6f}" for time in times], **fields)
+    late = [f"{time + 0.5:.6f}" for time in times + rng.uniform(-0.02, 0.02, 14)]
+    given = renamed(changed(truth, noisy), late, **fields)
+    found = compare_models(given, reference, time_offset=0.5, max_time_difference=0.015)
+    expected = []
+    for name in late:
+        differences = [abs(time + 0.5 - float(name)) for time in times]
+        j = int(np.argmin(differences))
+        if differences[j] <= 0.015:
+            expected.append((name, reference.names[j]))
+    assert list(zip(found.names, found.names_b, strict=True)) == expected
+    assert 4 < len(expected) < 14
+
+    def camera_to_world(model, names):
+        views = {view.name: view for view in model.views}
+        return [
+            np.linalg.inv(np.vstack([np.column_stack([v.R, v.t]), [0, 0, 0, 1]]))
+            for v in map(views.get, names)
+        ]
+
+    P, Q = camera_to_world(found.a, found.names), camera_to_world(reference, found.names_b)
+    for distance in (0.5, 1.5, 3.0):
+        ends, path = [], 0.0
+        for k in range(1, len(Q)):
+            path += np.linalg.norm(Q[k][:3, 3] - Q[k - 1][:3, 3])
+            if path >= distance:
+                ends.append(k)
+                path = 0.0
+        # The program begins with the end of the first motion, which counts here too.
+        pairs = list(zip([0, *ends], ends, strict=False))
+        errors = found.relative_errors(distance)
+        assert errors.pairs.tolist() == [list(pair) for pair in pairs]
+        E = [np.linalg.inv(np.linalg.inv(Q[i]) @ Q[j]) @ np.linalg.inv(P[i]) @ P[j] for i, j in pairs]
+        np.testing.assert_allclose(errors.translation, [np.linalg.norm(e[:3, 3]) for e in E], rtol=1e-9)
+        angles = [np.degrees(np.linalg.norm(Rotation.from_matrix(e[:3, :3]).as_rotvec())) for e in E]
+        np.testing.assert_allclose(errors.rotation_deg, angles, rtol=1e-6)
+        assert max(angles) > 0.1
+
+
 def test_too_few_cameras_and_cameras_on_a_line_are_compared_as_far_as_possible(truth):
     two = compare_models(truth, SparseModel(truth.views[:2]))
     assert two.notes[0].startswith("2 common cameras cannot be aligned, at least 3 are needed")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import thesisrecon as tr
 from tests.conftest import refuses
 from tests.io.test_colmap import NAMES, export, scene
 from thesisrecon.errors import UsageError
@@ -224,3 +225,44 @@ def test_impossible_cameras_of_a_colmap_model_are_refused(tmp_path, camera, sent
     for name, text in (("cameras", camera), ("images", ""), ("points3D", "")):
         (tmp_path / f"{name}.txt").write_text(text + "\n")
     refuses(UsageError, sentence, read_model, tmp_path)
+
+
+@pytest.mark.references
+def test_a_reconstruction_of_pycolmap_is_a_model_wherever_its_folder_is(tmp_path):
+    import pycolmap
+
+    # Enough points for a run of its own.
+    X, K = np.random.default_rng(0).uniform(-1, 1, (200, 3)), np.diag([900.0, 900, 1])
+    K[:2, 2] = 319.5, 239.5
+    angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5]])
+    turns, t = Rotation.from_euler("xyz", angles).as_matrix(), np.tile([0, 0, 6.0], (5, 1))
+    xy = np.stack([tr.Camera(K, r, t[0], (640, 480)).project(X) for r in turns])
+    xy += np.random.default_rng(1).normal(0, 0.3, xy.shape)
+    known = tr.reconstruction_from_cameras(K, turns, t, sizes=(640, 480), X=X, xy=xy)
+    tr.export(known, tmp_path / "ours", to="colmap")
+    folder = tmp_path / "ours" / "sparse" / "0"
+    model, names = pycolmap.Reconstruction(folder), list(tr.read_cameras(folder))
+    positions = {image.name: 2.0 * image.projection_center() for image in model.images.values()}
+
+    def exported(given, to):
+        folder = tr.export(given, tmp_path / to / type(given).__name__, to=to).file.parent
+        files = (one for one in sorted(folder.rglob("*")) if one.is_file() and "json" not in one.name)
+        return [one.read_bytes() for one in files]
+
+    calls = {
+        "align": lambda given: tr.align_to_positions(given, positions)[0],
+        "scaled": lambda given: tr.scaled(given, names[0], names[1], 2.0),
+        "compare": lambda given: tr.compare_models(given, folder),
+        "colmap": lambda given: exported(given, "colmap"),
+        "kalibr": lambda given: exported(given, "kalibr"),
+        "bundle": tr.bundle_adjust,
+        "bundle of arrays": lambda given: tr.bundle_adjust(given, X, xy, free=()),
+        "again": lambda given: tr.reconstruct_from_colmap(given).metric.reconstruction,
+    }  # fmt: skip
+    for name, call in calls.items():
+        assert call(model) == call(folder), name
+    assert abs(tr.bundle_adjust(model).cameras[0].K[0, 0] - 900.0) < 9.0
+    empty = pycolmap.Reconstruction()
+    for call in calls.values():
+        with pytest.raises(ValueError, match=r"camera|no observations|image of the model|unknown image"):
+            call(empty)

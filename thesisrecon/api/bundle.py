@@ -10,7 +10,13 @@ from typing import Literal
 import numpy as np
 
 from thesisrecon.api.cameras import outside_by, require_inside
-from thesisrecon.api.given import CameraInput, as_cameras, points_of_reconstruction, radial_coefficients
+from thesisrecon.api.given import (
+    CameraInput,
+    as_cameras,
+    as_sparse_model,
+    cameras_of_model,
+    radial_coefficients,
+)
 from thesisrecon.arrays import B8, F64, I64, Record, numbers, require_finite, require_shapes
 from thesisrecon.camera import Camera
 from thesisrecon.errors import counted, unknown_word
@@ -37,7 +43,7 @@ from thesisrecon.optimize.bundle.projection import (
     sort_observations,
 )
 from thesisrecon.optimize.least_squares import MAD_FACTOR
-from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks
+from thesisrecon.records import IntrinsicsPrior, Tracks
 from thesisrecon.results import RunResult
 
 Chosen = I64 | B8 | Sequence[int]
@@ -105,9 +111,10 @@ def bundle_adjust(
 
     Parameters
     ----------
-    cameras : sequence of Camera, tuple (K, R, t) or Reconstruction
-        Initial cameras; or K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a metric
-        reconstruction: its registered views and, if X and xy are not given, its valid points and inliers.
+    cameras : sequence of Camera, mapping of str to Camera, tuple (K, R, t) or model
+        Initial cameras; or K (3, 3) or (V, 3, 3), R (V, 3, 3) and t (V, 3) with ``sizes``; or a model as for
+        :func:`thesisrecon.compare_models` (path, RunResult, metric Reconstruction, pycolmap): its registered
+        views and, if X and xy are not given, its valid points and inliers.
     X : ndarray (N, 3)
         Initial points.
     xy : ndarray (V, N, 2), Tracks or Observations
@@ -267,10 +274,11 @@ def _problem(
 ) -> tuple[list[Camera], F64, Observations, tuple[int, ...] | None]:  # fmt: skip
     """Cameras, points and observations, and the shape of xy if it was dense."""
     cameras = cameras.reconstruction if isinstance(cameras, RunResult) else cameras
+    if X is None and xy is None and not isinstance(cameras, Mapping | list | tuple | None):
+        model = as_sparse_model(cameras, "the model of bundle_adjust")
+        views = as_cameras("bundle_adjust", cameras_of_model(model, "the model of bundle_adjust"))
+        return views, model.X, Observations(model.view_index, model.point_index, model.xy), None
     views = as_cameras("bundle_adjust", cameras, sizes)
-    if isinstance(cameras, Reconstruction) and X is None and xy is None:
-        X, view, point, pixels = points_of_reconstruction(cameras)
-        return views, X, Observations(view, point, pixels), None
     if X is None or xy is None:
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
     (X,), shape = numbers("bundle_adjust", X=X), None

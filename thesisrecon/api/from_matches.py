@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
 
 import numpy as np
 
+from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import F64, I64
 from thesisrecon.config.text import Config, Settings, build_config
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import read_database
 from thesisrecon.io._images import USELESS_MASKS, add_masks, check_masks_folder, images_folder
-from thesisrecon.io._models import read_model
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
 from thesisrecon.pipeline.inputs import (
@@ -154,7 +155,7 @@ def reconstruct_from_tracks(
 
 
 def reconstruct_from_colmap(
-    path: str | Path, out: str | Path | None = None, *, images: str | Path | Sequence[Any] | None = None,
+    path: Model, out: str | Path | None = None, *, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
 ) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras and points from a COLMAP database or sparse model.
@@ -163,9 +164,10 @@ def reconstruct_from_colmap(
 
     Parameters
     ----------
-    path : path
+    path : path, or model in memory
         A database with keypoints and matches (the verified matches, or the raw ones if there are none), or a
-        folder with a sparse model of any kind of camera, binary or text, whose tracks are used.
+        folder with a sparse model of any kind of camera, binary or text, whose tracks are used; or a
+        ``pycolmap.Reconstruction`` or another model with observations.
     out, images, **options
         As for :func:`reconstruct_from_matches`; ``images`` is the folder of COLMAP's images,
         which are used as stored, without EXIF rotation.
@@ -194,22 +196,22 @@ def reconstruct_from_colmap(
     >>> abs(round(float(again.cameras[0].K[0, 0] / result.cameras[0].K[0, 0] - 1), 2))
     0.0
     """
-    path = Path(path)
-    if path.is_dir():
-        model = read_model(path)
+    name = str(path) if isinstance(path, str | PathLike) else f"the given {type(path).__name__}"
+    if isinstance(path, str | PathLike) and not Path(path).is_dir():
+        database = read_database(Path(path))
+        views = views_of(database.sizes, database.names, images, as_stored=True)
+        given = given_matches(database.keypoints, database.matches, views)
+    else:
+        model = as_sparse_model(path, "the model of reconstruct_from_colmap")
         if any(view.size is None for view in model.views) or not len(model.xy):
-            raise UsageError(f"{path} holds no observations of points; give a COLMAP model or a database")
+            raise UsageError(f"{name} holds no observations of points; give a COLMAP model or a database")
         order = np.lexsort((model.view_index, model.point_index))
         view, point = model.view_index[order], model.point_index[order]
         tracks = Tracks(view, point, model.xy[order], len(model.views), len(model.X))
         sizes = [view.size for view in model.views if view.size is not None]
         views = views_of(sizes, model.names, images, as_stored=model.as_stored)
         given = given_tracks(tracks, views)
-    else:
-        database = read_database(path)
-        views = views_of(database.sizes, database.names, images, as_stored=True)
-        given = given_matches(database.keypoints, database.matches, views)
-    return _reconstruct(str(path), given, views, out, options)
+    return _reconstruct(name, given, views, out, options)
 
 
 def _reconstruct(

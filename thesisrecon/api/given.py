@@ -20,7 +20,7 @@ from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult, SparseModel, SparseView
 
 Model = str | Path | SparseModel | RunResult | Reconstruction | Mapping[str, Camera] | Sequence[Camera]
-"""A model in memory or a folder; what has the methods of ``pycolmap.Reconstruction`` is one, too."""
+"""A model in memory or a folder; what has the interface of ``pycolmap.Reconstruction`` is one, too."""
 CameraInput = Model | tuple[F64, F64, F64]
 """Cameras in the order of the images or by image name, (K, R, t), a metric reconstruction, or a model."""
 
@@ -41,9 +41,12 @@ def as_sparse_model(model: Model, what: str = "a model") -> SparseModel:
         X, view, point, xy = points_of_reconstruction(model)
         views = _model_of_cameras(as_cameras("a model", model)).views
         return SparseModel(views, X, view_index=view, point_index=point, xy=xy)
-    if all(callable(getattr(model, name, None)) for name in ("write", "reg_image_ids")):
+    if _is_of_pycolmap(model):
         with TemporaryDirectory() as folder:
-            model.write(folder)  # type: ignore[union-attr]
+            try:
+                model.write(folder)  # type: ignore[union-attr]
+            except Exception as error:
+                raise UsageError(f"{what}, a {type(model).__name__}, cannot be read ({error})") from None
             return read_model(folder)
     if not isinstance(model, RunResult):
         kinds = "a path, a RunResult, a SparseModel, a metric Reconstruction or Cameras, by name or in a list"
@@ -58,6 +61,11 @@ def as_sparse_model(model: Model, what: str = "a model") -> SparseModel:
     with TemporaryDirectory() as folder:
         save_result(replace(model, mesh=None), Path(folder), overwrite=False)
         return read_model(folder)
+
+
+def _is_of_pycolmap(model: object) -> bool:
+    """Whether an object has the interface of ``pycolmap.Reconstruction``, which is not imported for it."""
+    return all(hasattr(model, name) for name in ("cameras", "images", "points3D", "write"))
 
 
 def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> SparseModel:
@@ -89,7 +97,7 @@ def cameras_by_name(caller: str, model: Model) -> Mapping[str, Camera]:
         if model.metric is None:
             raise UsageError("the result has no cameras; it ended before the metric stage")
         return model.cameras
-    if not isinstance(model, str | PathLike | SparseModel) and not hasattr(model, "reg_image_ids"):
+    if not isinstance(model, str | PathLike | SparseModel) and not _is_of_pycolmap(model):
         kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
         raise ValueError(f"{caller} needs {kinds}; got a {type(model).__name__}")
     source = model if isinstance(model, str | PathLike) else "the model"
@@ -118,6 +126,8 @@ def as_cameras(
         return _registered_cameras(caller, cameras)
     cameras = named_cameras(caller, cameras)
     if isinstance(cameras, Mapping):
+        if not cameras:
+            raise ValueError(f"{caller} needs cameras; the model has none")
         missing = [name for name in names if name not in cameras]
         if missing:
             first = next(iter(cameras), None)
