@@ -13,6 +13,7 @@ import ast
 import itertools
 import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -190,7 +191,7 @@ class Bench:
 
     def set_up(self) -> None:
         clear_folder(self.tree)
-        for name in ("thesisrecon", "validation", "tests", "fixtures"):
+        for name in ("thesisrecon", "validation", "tests", "fixtures", "examples", "docs"):
             shutil.copytree(ROOT / name, self.tree / name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy2(ROOT / "pyproject.toml", self.tree)
 
@@ -207,14 +208,22 @@ class Bench:
             os.utime(path, (before, before))
 
     def judges(self, file: str) -> list[list[str]]:
-        """Return two lists of test files: those of the module's package, then those of its importers."""
+        """Return two lists of test files: those of the module's package, then those of its importers.
+
+        Public functions of importers, and of importers of these, are called as attributes of ``thesisrecon``.
+        """
         near, package = {_module(file)}, self.tree / "tests" / Path(file).parts[1]
-        modules = (self.tree / "thesisrecon").rglob("*.py")
-        users = {_module(str(m.relative_to(self.tree))) for m in modules if imports_of(m) & near}
+        modules = {
+            _module(str(m.relative_to(self.tree))): m for m in (self.tree / "thesisrecon").rglob("*.py")
+        }
+        users = {name for name, m in modules.items() if imports_of(m) & near}
+        doors = [m for m in modules.values() if m.parent.name == "api" and imports_of(m) & (near | users)]
+        calls = {name for m in doors for name in re.findall(r"^def ([a-z]\w+)", m.read_text(), re.MULTILINE)}
+        called = re.compile(rf"\b({'|'.join(calls)})\(" if calls else "(?!)")
         tests = sorted((self.tree / "tests").rglob("test_*.py"), key=lambda t: (not imports_of(t) & near, t))
         own = [t for t in tests if package in t.parents]
         others = [t for t in tests if t not in own and "validation" not in t.parts]
-        others = [t for t in others if imports_of(t) & (near | users)]
+        others = [t for t in others if imports_of(t) & (near | users) or called.search(t.read_text())]
         return [[str(t.relative_to(self.tree)) for t in chosen] for chosen in (own, others) if chosen]
 
     def run_tests(

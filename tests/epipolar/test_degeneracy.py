@@ -9,6 +9,7 @@ contradict. With little relief it has more matches than the right one.
 
 import pickle
 from collections import namedtuple
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -182,6 +183,14 @@ def test_a_wide_covariance_and_few_matches_are_reasons():
     assert not degeneracy.determined
     assert degeneracy.expected_error_px > 1.0
     assert "covariance" in degeneracy.reasons[0]
+    # The noise of 20 matches is known by 13 degrees of freedom: Student's quantile decides.
+    few = replace(fit, inliers=fit.inliers & (np.arange(300) < 20))
+    stated = assess_degeneracy(few, xy1, xy2, rng=np.random.default_rng(0)).expected_error_px
+    limit = scipy.stats.norm.ppf(0.975) / scipy.stats.t.ppf(0.975, few.inliers.sum() - 7)
+    for error in (0.999, 1.001):
+        vague = replace(few, covariance=few.covariance * (error * limit / stated) ** 2)
+        reasons = assess_degeneracy(vague, xy1, xy2, rng=np.random.default_rng(0)).reasons
+        assert any("errors of 1 px" in reason for reason in reasons) == (error > 1.0)
     pair = make_pair(8, np.random.default_rng(1))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(1), sigma=0.5, outliers=0.0)
     for fit, words in (

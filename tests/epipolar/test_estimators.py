@@ -32,6 +32,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.two_view import enforce_rank_two, epipolar_distance_std, epipoles, plane_homography
+from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.records import FundamentalFit
 from validation.metrics.fundamental_precision import _ellipse_95, _student_95, epipoles_of, fundamental_bound
 from validation.scenes.two_views import make_two_views
@@ -378,11 +379,26 @@ def test_a_homography_of_noisy_matches_has_their_noise_and_its_covariance():
         error = fit.H * np.sign(np.sum(fit.H * H)) - H
         ratios.append(squared_in_covariance(error, fit.covariance, 8))
         sigmas.append(fit.sigma_px)
-        # H has unit norm: no part of its error is along H.
-        along = fit.covariance @ fit.H.ravel()
-        assert np.linalg.norm(along) < 1e-9 * np.linalg.norm(fit.covariance)
     assert 0.45 < np.mean(sigmas) < 0.55
     assert 0.7 < np.mean(ratios) < 1.5
+
+
+def test_the_covariance_of_a_homography_is_the_inverse_of_its_information():
+    rng, H = np.random.default_rng(0), np.array([[0.9, 0.12, 0.4], [-0.1, 0.95, 0.6], [0.1, -0.05, 1.0]])
+    xy1 = rng.uniform(1.0, 3.0, (30, 2))
+    xy2 = dehomogenize(homogenize(xy1) @ H.T) + 1e-3 * rng.normal(size=(30, 2))
+    fit = thesisrecon.estimate_homography(xy1, xy2, threshold_px=None)
+
+    def residuals(h):
+        return np.array([two_view.homography_sampson_residuals(x.reshape(3, 3), xy1, xy2).ravel() for x in h])
+
+    h = fit.H.reshape(1, 9)
+    assert fit.sigma_px == pytest.approx(np.sqrt(np.sum(residuals(h) ** 2) / (2 * 30 - 8)), rel=1e-6)
+    J = central_differences(residuals, h)[0]
+    expected = fit.sigma_px**2 * np.linalg.pinv(J.T @ J, rcond=1e-10, hermitian=True)
+    np.testing.assert_allclose(fit.covariance, expected, atol=1e-3 * np.abs(expected).max())
+    # H has unit norm: no part of its error is along H.
+    assert np.abs(fit.covariance @ fit.H.ravel()).max() < 1e-9 * np.abs(expected).max()
 
 
 def test_matches_that_determine_no_homography_are_named():

@@ -1,5 +1,6 @@
 """Compiled loops of chapter 5, consensus, and the noise among wrong residuals."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -21,6 +22,7 @@ from thesisrecon.epipolar._matches import (
     noise_width,
 )
 from thesisrecon.epipolar._sampling import draw_sample, required_samples
+from thesisrecon.epipolar.locally_optimised import _Candidate
 from thesisrecon.epipolar.ransac import _search, distinct_real_roots, seven_point, singular_members
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.small_matrices import solve_damped
@@ -391,3 +393,19 @@ def test_the_mixture_scales_with_its_residuals(power, seed):
     assert other.sigma == pytest.approx(s * one.sigma, rel=1e-6)
     assert other.limit == pytest.approx(s * one.limit, rel=1e-4)
     assert other.log_likelihood == pytest.approx(one.log_likelihood - np.log(s), abs=1e-6)
+
+
+def test_a_wider_gate_must_be_more_likely_and_leave_few_matches():
+    def of(likelihood, near):
+        """A result with noise of 1 px that explains ``near`` of 100 matches."""
+        noise = NoiseMixture(1.0, 100.0, 0.8, 0.1, 0.1, likelihood)
+        residuals = np.where(np.arange(100) < near, 0.5 * noise.limit, 2.0 * noise.limit)
+        return _Candidate(np.ones(9), 1, residuals, noise, (1.0, 1.0), [])
+
+    nothing = replace(of(0.0, 0), noise=None)
+    for wide, narrow, better in (
+        (of(-1.0, 80), of(-2.0, 80), True), (of(-1.0, 79), of(-2.0, 79), False),
+        (of(-2.0, 80), of(-1.0, 80), False), (of(-1.0, 60), of(-2.0, 20), True),
+        (of(-1.0, 60), of(-2.0, 21), False), (of(-1.0, 9), nothing, True), (nothing, of(-1.0, 9), False),
+    ):  # fmt: skip
+        assert wide.explains_more_than(narrow) == better

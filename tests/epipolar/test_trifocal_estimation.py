@@ -107,6 +107,8 @@ def test_each_step_approaches_the_truth_and_reports_the_noise(n, m):
         )
         fit = estimate_trifocal(*points, segments=segments, loss_px=5.0)
         sigmas.append(fit.sigma_px)
+        squares = np.sum(fit.point_residuals_px**2) + np.sum(fit.line_residuals_px**2)
+        assert fit.sigma_px == pytest.approx(np.sqrt(squares / (3 * n + 2 * m - 18)), rel=1e-9)
         steps = (*map(equations.in_pixels, (equations.solve(), algebraic)), fit.T)
         errors.append([np.median(point_transfer_px(T, exact)) for T in steps])
     linear, constrained, refined = np.median(errors, axis=0)

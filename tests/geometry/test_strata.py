@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.geometry import properties
@@ -110,6 +111,25 @@ def test_3_4_2_projective_invariants_are_kept_by_all(rng, group):
     ):
         Q = np.diag(np.array(signature, dtype=float))
         assert curvature_sign(strata.transform(G, Q, "conics")) == sign
+
+
+@holds_for_every()
+def test_the_similarity_is_the_least_squares_one_and_lines_determine_none(rng):
+    X, R = rng.normal(3.0, 1.0, (6, 3)), Rotation.random(random_state=rng).as_matrix()
+    Y = 2.5 * X @ R.T + [40.0, -7.0, 3.0]
+    np.testing.assert_allclose(strata.estimate_similarity(X, Y).apply(X), Y, atol=1e-12)
+    # A mirrored target has no exact one: no similarity nearby is better than the one that is found.
+    noisy = Y * rng.choice([-1.0, 1.0], 3) + 0.3 * rng.normal(size=Y.shape)
+    best = strata.estimate_similarity(X, noisy)
+    assert np.linalg.det(best.R) == pytest.approx(1.0)
+    cost = np.sum((best.apply(X) - noisy) ** 2)
+    for step in 1e-2 * rng.normal(size=(20, 7)):
+        turned = Rotation.from_rotvec(step[:3]).as_matrix() @ best.R
+        other = strata.Similarity(best.scale * np.exp(step[6]), turned, best.t + step[3:6])
+        assert np.sum((other.apply(X) - noisy) ** 2) > cost
+    line = rng.normal(size=3) + rng.normal(size=(6, 1)) * rng.normal(size=3)
+    for source, target in ((line, Y), (X, line), (line, line), (X, np.ones((6, 3)))):
+        refuses(ValueError, "do not all lie on one line", strata.estimate_similarity, source, target)
 
 
 def test_3_4_special_transforms_and_cross_ratios():

@@ -199,6 +199,21 @@ def test_6_3_2_midpoint_degrades_in_a_projective_frame_and_the_optimal_methods_d
         assert rms["projective", method] == pytest.approx(rms["metric", method], rel=1e-5)
 
 
+@pytest.mark.parametrize("far", [(2.0, 3.0), (300.0, 1000.0), (1000.0, 300.0)])
+def test_6_3_3_of_perpendicular_points_the_nearer_one_goes_to_its_epipole(far):
+    """Lines through the epipoles correspond by their angle: all but one are farther off."""
+    e1, e2, angle = np.array([400.0, 300.0]), np.array([-50.0, 20.0]), 0.3
+    along, across = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    F = np.zeros((3, 3))
+    F[0, 1], F[1, 0] = 1.0, -1.0
+    to1, to2 = (np.array([[1.0, 0.0, -e[0]], [0.0, 1.0, -e[1]], [0.0, 0.0, 1.0]]) for e in (e1, e2))
+    xy1, xy2 = (e1 + far[0] * along)[None], (e2 + far[1] * across)[None]
+    found1, found2 = correct_matches(to2.T @ F @ to1, xy1, xy2)
+    first = far[0] < far[1]
+    np.testing.assert_allclose(found1, e1[None] if first else xy1, atol=1e-6)
+    np.testing.assert_allclose(found2, xy2 if first else e2[None], atol=1e-6)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_nan_means_not_seen_for_every_method(method):
     P, X = two_views("general", np.random.default_rng(0))

@@ -13,10 +13,8 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction, wi
 from thesisrecon.camera import project_camera
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.metric import refinement
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.optimize.ransac import Budget, resect_calibrated
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 
@@ -106,17 +104,6 @@ def test_a_fixed_principal_point_is_reported_as_assumed_and_a_known_calibration_
     np.testing.assert_array_equal(result.reconstruction.K[:, 0, 0], 1500.0)
     assert result.intrinsics[0]["focal_px"].std == 0.0
     assert centre_error(result, scene) < 2e-3
-
-
-def test_calibrated_resection_survives_half_wrong_points():
-    scene, rng = make_scene(), np.random.default_rng(0)
-    xy = dehomogenize(scene.X @ scene.R[0].T + scene.t[0])
-    wrong = np.arange(len(xy)) % 2 == 0
-    xy[wrong] += rng.uniform(0.1, 0.4, (int(wrong.sum()), 2))
-    pose, inliers, _ = resect_calibrated(scene.X, xy, threshold=1e-3, budget=Budget(), rng=rng)
-    np.testing.assert_allclose(pose[:, :3], scene.R[0], atol=1e-6)
-    np.testing.assert_allclose(pose[:, 3], scene.t[0], atol=1e-5)
-    np.testing.assert_array_equal(inliers, ~wrong)
 
 
 def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():

@@ -7,6 +7,7 @@ import pytest
 import scipy
 from scipy.spatial.transform import Rotation
 
+from tests.conftest import refuses
 from tests.optimize.bundle_scenes import make_block, perturbed, project_block
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.geometry.small_matrices import floored_diagonal
@@ -185,6 +186,54 @@ def test_elimination_gives_the_step_of_the_full_dense_system(solver, twice):
     # The gain of the cameras is without that of the points alone.
     of_points = g[D:] @ np.linalg.solve(damped[D:, D:], g[D:])
     assert of_cameras == pytest.approx(0.5 * (-g @ expected - of_points), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["sorted", "falling", "any", "twice"])
+def test_observations_of_any_order_are_sorted_by_point_and_view(kind):
+    rng = np.random.default_rng(0)
+    some = np.sort(rng.permutation(35)[:20])
+    orders = {
+        "sorted": some,
+        "falling": some[::-1],
+        "any": rng.permutation(some),
+        "twice": rng.integers(35, size=60),
+    }
+    point, view = np.divmod(orders[kind], 5)
+    given = Observations(view, point, rng.normal(size=(len(view), 2)))
+    o = sort_observations(given, 5, 8)
+    assert o.order.tolist() == sorted(range(len(view)), key=lambda k: (point[k], view[k], k))
+    assert o.start.tolist() == [np.sum(point < j) for j in range(9)]
+    for name in ("view_index", "point_index", "xy"):
+        np.testing.assert_array_equal(o.unsort(getattr(o.seen, name)), getattr(given, name))
+    for one in ((5, 0), (-1, 0), (0, 8), (0, -1)):
+        beyond = Observations(*np.array(one)[:, None], np.zeros((1, 2)))
+        refuses(ValueError, "beyond the 5 views or 8 points", sort_observations, beyond, 5, 8)
+
+
+def test_dense_sparse_and_banded_systems_are_one_matrix():
+    rng, b, C, e = np.random.default_rng(0), 5, 3, 2
+    edge, (row, column) = b * C, np.triu_indices(b)
+    A = rng.normal(size=(edge + e, 60))
+    S, rhs = A @ A.T, rng.normal(size=edge + e)
+    # Views 0 and 3 have no common points.
+    S[:3, 9:12] = S[9:12, :3] = 0.0
+    views, seen = S[:edge, :edge].reshape(b, C, b, C).swapaxes(1, 2), (row != 0) | (column != 3)
+    row, column, pair = row[seen], column[seen], np.full((b, b), -1)
+    pair[row, column] = np.arange(len(row))
+    parts = views[row, column], S[:edge, edge:].reshape(b, C, e), S[edge:, edge:].copy(), rhs
+    system = schur.ReducedSystem(
+        row, column, ReducedSums(*(p.copy() for p in parts), *np.zeros((2, edge + e)))
+    )
+    for _ in range(2):
+        np.testing.assert_array_equal(np.triu(system.dense()), np.triu(S))
+        np.testing.assert_array_equal(system.sparse().toarray(), S)
+        for order in (np.arange(b), rng.permutation(b), rng.permutation(b)):
+            banded = schur.BandedCholesky(order, b - 1)
+            np.testing.assert_allclose(banded.solve(system), np.linalg.solve(S, rhs), rtol=1e-9)
+        np.testing.assert_allclose(schur.solve_dense(system), np.linalg.solve(S, rhs), rtol=1e-9)
+        more = rng.uniform(1.0, 9.0, edge + e)
+        schur.add_diagonal(system.sums, pair, more)
+        S += np.diag(more)
 
 
 def test_chunks_give_the_sums_of_the_whole(monkeypatch):

@@ -94,6 +94,24 @@ def test_a_small_gain_of_a_damped_step_is_no_minimum(seed, weak):
     assert np.abs((found.x - best) / std).max() < 0.1
 
 
+@pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])
+def test_the_path_does_not_depend_on_the_unit_of_the_residuals(unit):
+    def path(unit):
+        states = []
+
+        def residual(x):
+            states.append(x.copy())
+            return unit * np.array([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0], 0.5])
+
+        assert (
+            np.abs(minimize_residuals(residual, np.array([-1.2, 1.0]), max_iterations=200).x - 1.0).max()
+            < 1e-4
+        )
+        return states
+
+    np.testing.assert_allclose(path(unit), path(1.0), rtol=1e-9, atol=1e-9)
+
+
 def test_covariances_are_those_of_the_textbook_and_useless_parameters_harmless():
     rng = np.random.default_rng(1)
     u = np.linspace(0.0, 1.0, 400)

@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
+from tests.synthetic import make_scene
 from thesisrecon import StageFailure, estimate_fundamental, estimate_homography, resect
 from thesisrecon.epipolar.homography import _add_equations, squared_plane_distances
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import _real_quartic_roots
-from thesisrecon.optimize.ransac import draw_samples
+from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
 
 K = np.array([[900.0, 0.0, 639.5], [0.0, 900.0, 479.5], [0.0, 0.0, 1.0]])
 H = np.array([[0.9, 0.12, 40.0], [-0.1, 0.95, 60.0], [1e-4, -5e-5, 1.0]])
@@ -199,3 +200,14 @@ def test_the_gradient_of_the_sampson_distance_is_that_of_differences():
     np.testing.assert_allclose(
         2.0 * g, (np.array(cost) - less) / (2.0 * step), rtol=1e-5, atol=1e-5 * np.abs(g).max()
     )
+
+
+def test_calibrated_resection_survives_half_wrong_points():
+    scene, rng = make_scene(), np.random.default_rng(0)
+    xy = dehomogenize(scene.X @ scene.R[0].T + scene.t[0])
+    wrong = np.arange(len(xy)) % 2 == 0
+    xy[wrong] += rng.uniform(0.002, 0.1, (int(wrong.sum()), 2))
+    pose, inliers, _ = resect_calibrated(scene.X, xy, threshold=1e-3, budget=Budget(), rng=rng)
+    np.testing.assert_allclose(pose[:, :3], scene.R[0], atol=1e-6)
+    np.testing.assert_allclose(pose[:, 3], scene.t[0], atol=1e-5)
+    np.testing.assert_array_equal(inliers, ~wrong)

@@ -19,6 +19,7 @@ from thesisrecon.optimize.bundle.identifiability import (
     _infinite_homography_shift,
     _planarity_ratio,
     excess_equations,
+    identifiability_sentences,
     measure_motion,
     nearest_critical_motion,
     projective_infinity_shifts,
@@ -29,6 +30,7 @@ from thesisrecon.selfcalibration._refinement import RotationCriterion
 from thesisrecon.selfcalibration._upgrade import (
     _biased_focal,
     _no_candidate_failure,
+    _with_virtual_points,
     check_identifiability,
     gherardi_fusiello_planes,
     identifiability_without_calibration,
@@ -230,6 +232,56 @@ def test_advice_never_asks_for_a_given_focal_length(given, advice):
     estimate = projective_estimate(scene, np.random.default_rng(0))
     sentences = identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences
     assert next(s for s in sentences if "rotate the camera" in s).endswith(advice)
+
+
+def test_each_reason_begins_at_its_limit():
+    scene = make_sequence(Motion.GENERAL, np.random.default_rng(6))
+    evidence = measure_motion(true_cameras(scene)) | {
+        "excess_equations": 0.0, "critical_motion_distance": 1.0, "focal_std_rel": 0.2,
+        "focal_std_rel_median": 0.1, "focal_std_rel_free": 0.21, "noise_ratio_to_projective": 2.99,
+        "rotation_significance": MIN_ROTATION_SIGNIFICANCE, "infinity_shift_beyond_roll": MIN_INFINITY_SHIFT,
+    }  # fmt: skip
+
+    def codes(motion="", *, identifiable=False, **changed):
+        said = {"identifiable": identifiable, "focal_std": np.inf}
+        found = identifiability_sentences(motion, evidence | changed, **said)
+        return [getattr(sentence, "code", "advice") for sentence in found]
+
+    turned, shifted = 0.999 * MIN_ROTATION_SIGNIFICANCE, 0.999 * MIN_INFINITY_SHIFT
+    assert codes() == ["advice"]
+    assert codes(identifiable=True) == []
+    assert codes(excess_equations=-1.0) == ["too-few-equations", "advice"]
+    assert codes(noise_ratio_to_projective=3.0) == ["excess-noise"]
+    assert codes(rotation_significance=turned, infinity_shift_beyond_roll=0.0) == ["rotations-within-noise"]
+    assert codes(infinity_shift_beyond_roll=shifted) == ["small-rotations"]
+    for small in ({}, {"rotation_significance": 0.0}, {"infinity_shift_beyond_roll": 0.0}):
+        assert codes(focal_std_rel_median=MAX_FOCAL_STD, **small) == ["uncertain-focal"]
+    assert codes("turntable") == ["advice"]
+    near = {"identifiable": True, "critical_motion_distance": 0.999}
+    assert codes("turntable", **near) == ["turntable", "resolved-by-square-pixels"]
+    assert codes("turntable", **near, focal_std_rel_free=0.2) == ["turntable", "resolved-by-departure"]
+    assert codes("planar scene", **near) == ["planar-scene", "resolved-by-prior"]
+    assert codes("pure translation", **near) == ["pure-translation", "resolved-by-departure"]
+
+
+def test_virtual_points_lie_where_optical_axes_meet_and_are_seen_exactly():
+    scene = make_scene(seed=2)
+    given = projective_reconstruction(scene)
+    H = metric_frame(given, scene)
+    found = _with_virtual_points(given, Upgrade(H, scene.K, 0.0, "truth"))
+    X, t, axes, C = dehomogenize(found.X @ H.T), found.tracks, scene.R[:, 2], scene.centres
+    # The point of least squared distances from the axes, and a cube about it.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    middle = np.linalg.lstsq(across.reshape(-1, 3), (across @ C[:, :, None]).ravel(), rcond=None)[0]
+    half = 0.3 * np.median(np.linalg.norm(C - middle, axis=1))
+    np.testing.assert_allclose((X.min(axis=0) + X.max(axis=0)) / 2.0, middle, atol=0.05 * half)
+    np.testing.assert_allclose(np.ptp(X, axis=0), 2.0 * half, rtol=0.05)
+    z = np.einsum("vij,nj->nvi", scene.P, homogenize(X))
+    xy = dehomogenize(z)
+    inside = (z[..., 2] > 0.0) & (xy >= 0.0).all(axis=2) & (xy <= scene.sizes).all(axis=2)
+    assert len(X) > inside[:, 0].sum() > 0.5 * len(X)
+    np.testing.assert_array_equal(np.argwhere(inside), np.column_stack([t.point_index, t.view_index]))
+    np.testing.assert_allclose(t.xy, xy[inside], atol=1e-4)
 
 
 def calibrate(scene, *, shared=True, seed=0):

@@ -1,5 +1,6 @@
 """The image conic from exact infinite homographies, and the plane at infinity from vanishing points."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from tests.selfcalibration import stratified_scenes as scenes
 from tests.synthetic import TrueScene, make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import calibration_from_image
 from thesisrecon.io._images import read_images
 from thesisrecon.records import Tracks
@@ -23,6 +25,7 @@ from thesisrecon.selfcalibration.absolute_conic import (
     FixedPlaneQuadric,
     LinearAbsoluteConic,
     _largest_rotation,
+    _undetermined_failure,
     dual_conic_of_constant_camera,
     solve_conic,
     solve_conic_batch,
@@ -129,6 +132,14 @@ def test_motions_and_planes_without_a_calibration_are_named():
     assert angle == pytest.approx(40.0)
     seen = K @ R[0] @ [0.0, 1.0, 0.0]
     assert np.linalg.norm(np.cross(axis, seen / np.linalg.norm(seen))) < 1e-9
+    tilted = Rotation.from_euler("x", 70.0, degrees=True).as_matrix() @ turned.R
+    found, _ = scenes.setup(with_poses(turned, tilted, turned.centres), scenes.NOTHING_BUT_CONSTANT)
+    unit = np.linalg.inv(found.frame.pixel_from_unit[found.frame.views]) @ K
+    H = unit @ tilted @ tilted[found.frame.reference].T @ np.linalg.inv(unit[found.frame.reference])
+    evidence = _undetermined_failure(found.frame, H, None).evidence
+    (place,) = re.findall(r"axis at \((-?\d+), (-?\d+)\) px", evidence)
+    seen = dehomogenize(K @ tilted[found.frame.reference] @ [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(np.array(place, dtype=float), seen, atol=1.0)
     linear, fixed = (way.calibrations for way in WAYS)
     found, plane = scenes.setup(turned, scenes.NOTHING_BUT_CONSTANT)
     refuses(StageFailure, r"same axis.*one-parameter|one-parameter.*same axis", linear, found, plane)

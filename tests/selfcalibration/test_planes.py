@@ -216,6 +216,13 @@ def test_a_plane_may_be_given_and_wrong_calls_and_hopeless_data_are_refused():
     plane = np.array([0.1, 0.0, -0.1, 1.0])
     affine = upgrade_to_affine(given, plane)
     np.testing.assert_array_equal(thesisrecon.upgrade_affine(given, plane).X, affine.X)
+    # Points of the plane are at infinity, whatever the scales of the homogeneous coordinates are.
+    X = given.X.copy()
+    X[::50, 3] = -X[::50, :3] @ plane[:3]
+    scales = np.ones(300), np.logspace(-6.0, 6.0, 300)
+    one, other = (upgrade_to_affine(replace(given, X=X * scale[:, None]), plane) for scale in scales)
+    np.testing.assert_array_equal(other.valid, np.arange(300) % 50 > 0)
+    np.testing.assert_allclose(other.X, one.X, rtol=1e-6, atol=1e-9)
     refuses(ValueError, "affine", upgrade_to_affine, affine, np.ones(4))
     refuses(ValueError, "plane", upgrade_to_affine, given, np.zeros(4))
     few = replace(given, registered=np.arange(8) < 2)

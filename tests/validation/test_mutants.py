@@ -54,6 +54,11 @@ def test_tests_of_the_module_come_first_and_then_those_of_its_users(monkeypatch)
     assert all(file.startswith("tests/geometry/") for file in own)
     assert others
     assert not any(file.startswith(("tests/geometry/", "tests/validation/")) for file in others)
+    # Through a public function.
+    assert (
+        "tests/api/test_relative_pose.py"
+        in Bench(Path("nowhere")).judges("thesisrecon/epipolar/essential.py")[1]
+    )
 
 
 def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp_path, capsys):
