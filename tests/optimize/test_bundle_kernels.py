@@ -367,12 +367,14 @@ def test_the_variances_are_those_of_bundle_adjustment_and_grow_with_the_intrinsi
 
 def test_independent_noise_of_any_distribution_has_ratio_one_and_shared_noise_is_seen():
     block = make_block(points=400)
-    rng, found = np.random.default_rng(1), []
+    rng, found, poses = np.random.default_rng(1), [], []
     for _ in range(12):
         noise = SIGMA * rng.normal(size=block.xy.shape)
         heavy = np.where(rng.random(len(noise)) < 0.2, 4.0, 1.0)[:, None] * noise
         scatters = _scatter(block, block.xy + noise)[2], _scatter(block, block.xy + heavy, loss=1.5)[2]
         found.append([(s.median_ratio, s.overdispersion) for s in scatters])
+        poses.append(scatters[0].pose_ratios)
+    np.testing.assert_allclose(np.mean(poses, axis=(0, 2)), 1.0, atol=0.2)
     (normal_ratio, normal_dispersion), (heavy_ratio, heavy_dispersion) = np.mean(found, axis=0)
     assert normal_ratio == pytest.approx(1.0, abs=0.15)
     assert normal_dispersion == pytest.approx(1.0, abs=0.12)
@@ -384,6 +386,9 @@ def test_independent_noise_of_any_distribution_has_ratio_one_and_shared_noise_is
     field = np.sin(np.einsum("kab,kb->ka", wave[block.view], block.xy / 150.0))
     noise = 0.3 * SIGMA * rng.normal(size=field.shape) + SIGMA * field
     assert _scatter(block, block.xy + noise)[2].overdispersion > 2.0
+    noise[block.view != 2] -= SIGMA * field[block.view != 2]
+    of_one = _scatter(block, block.xy + noise)[2].pose_ratios.max(axis=(0, 2))
+    assert of_one[2] > 1.5 * np.median(of_one)
 
 
 @pytest.mark.parametrize("own", [False, True])

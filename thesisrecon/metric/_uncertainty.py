@@ -248,7 +248,8 @@ def pose_std(
 ) -> F64:
     """Standard deviations (V, 6) of rotations and centres as in ``MetricResult.pose_std``.
 
-    They contain the errors of the stated ``intervals`` and of a fixed aspect, skew and decentring.
+    They contain the errors of the stated ``intervals`` and of a fixed aspect, skew and decentring. The noise
+    of a pose is the larger one of its own scatter between blocks and that of the intrinsics.
     """
     number = poses.number
     std = np.sqrt(np.diag(poses.covariance))
@@ -260,10 +261,15 @@ def pose_std(
                 std[unknown] = own.std / (own.value if column == FOCAL else 1.0)
     known = [ratio[np.isfinite(ratio)] for ratio in (scatter.ratio, scatter.large_ratio)]
     ratio, large = (float(np.median(values)) if len(values) else np.nan for values in known)
-    noise = _inflation(scatter, ratio, large, lack_of_fit(scatter, model.tail))
-    fault = MODEL_FLOOR_REL * np.sqrt(lack_of_fit(scatter, model.tail))
+    share = lack_of_fit(scatter, model.tail)
+    common, fault = _inflation(scatter, ratio, large, share), MODEL_FLOOR_REL * np.sqrt(share)
+    # Errors of a few blocks move some views more than they move the intrinsics.
+    noise = np.full((len(poses.views), 2), common)
+    for view, part in zip(*np.nonzero(np.isfinite(scatter.pose_ratios[0])), strict=True):
+        own = _inflation(scatter, *scatter.pose_ratios[:, view, part].tolist(), share)
+        noise[view, part] = max(common, own)
     answer = np.full((len(model.registered), 6), np.nan)
-    answer[poses.views] = np.sqrt(poses.variances(noise, std, fault))
+    answer[poses.views] = np.sqrt(poses.variances(np.repeat(noise, 3, axis=1), std, fault))
     return answer
 
 

@@ -38,6 +38,7 @@ _LARGE_BLOCKS = 4
 # Number of unknowns above which matrices are sparse, if fewer than this fraction of the pairs of views share
 # points.
 _MANY, _SPARSE = 1200, 0.2
+_ALL_POSES = 300  # Pose unknowns up to which the scatter of each is measured
 
 _Solve = Callable[[F64], F64]
 """B -> C B for the covariance C, which is dense even if the information is sparse."""
@@ -48,7 +49,8 @@ class BlockScatter:
     """Variances of the intrinsics (the focal relative) and their scatter between blocks of points.
 
     ``shared_variance`` (C,) would hold if all views shared one camera. ``ratio`` (G, C) is the scatter over
-    its expectation, NaN for fixed intrinsics, ``large_ratio`` that of the ``large_blocks``;
+    its expectation, NaN for fixed intrinsics, ``large_ratio`` that of the ``large_blocks``; ``pose_ratios``
+    (2, V, 2) are both of the rotation and the position of each observed view, NaN where not measured.
     ``overdispersion`` is the scatter between blocks over that between single points, 1 for independent noise.
     ``pull`` (G, C) is the step by which the prior moves the values.
     """
@@ -57,6 +59,7 @@ class BlockScatter:
     shared_variance: F64
     ratio: F64
     large_ratio: F64
+    pose_ratios: F64
     pull: F64
     overdispersion: float
     blocks: int
@@ -104,8 +107,8 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     `_loss_correction` corrects.
     """
     S, solve, values, first = fit.information, fit.solve, fit.values, fit.first
-    # All intrinsics are tested, and about 30 of the pose unknowns.
-    poses = np.arange(0, first, max(first // 30, 1))
+    # All intrinsics are tested, and all pose unknowns of few views, else about 30.
+    poses = np.arange(0, first, max(first // 30, 1) if first > _ALL_POSES else 1)
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
     rows = solve(unit_columns(S.shape[0], tested)).T
     block = point_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
@@ -117,11 +120,14 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     covariance = rows[len(poses) :, first:]
     variance, pull = np.diag(covariance), covariance @ values.terms.gradient(fit.start)
     place_of = np.where(estimated, len(poses) + number, 0)
+    pose_ratios = np.full((2, first), np.nan)
+    pose_ratios[:, poses] = ratio[: len(poses)], large[: len(poses)]
     return BlockScatter(
         np.append(variance, 0.0)[np.where(estimated, number, -1)],
         _shared_variances(S, variance, values, fit.frame, fit.views),
         np.where(estimated, ratio[place_of], np.nan),
         np.where(estimated, large[place_of], np.nan),
+        pose_ratios.reshape(2, -1, 2, 3).mean(axis=3),
         np.append(pull, 0.0)[np.where(estimated, number, -1)],
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
@@ -146,8 +152,8 @@ class PoseUncertainty:
     number: I64
     fault: F64
 
-    def variances(self, noise: float, std: F64, fault: float) -> F64:
-        """Total variances (V, 6) for a factor ``noise`` on standard deviations, and those of other causes.
+    def variances(self, noise: F64, std: F64, fault: float) -> F64:
+        """Total variances (V, 6) for factors ``noise`` (V, 6) on standard deviations, and of other causes.
 
         ``std`` (n,) are those of the intrinsics, ``fault`` that of each fault of the camera model.
         """
