@@ -1,6 +1,5 @@
 """Estimators of the fundamental matrix, their parts, maps and precision, and homographies."""
 
-import itertools
 from typing import get_args
 
 import numpy as np
@@ -15,7 +14,6 @@ from tests.constants import with_constants
 from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
-from thesisrecon.epipolar import refinement
 from thesisrecon.epipolar.degeneracy import Method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import (
@@ -173,7 +171,6 @@ def test_parts_and_settings_that_cannot_be_are_refused():
     for F in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4)):
         refuses(ValueError, "rank 2", refine_fundamental, F, xy1, xy2)
     refuses(ValueError, "unknown criterion .*mean sampson", refine_fundamental, plane.F, xy1, xy2, "samson")
-    refuses(ValueError, "mean row", refine_fundamental, plane.F, xy1, xy2, parameters="rows")
 
 
 def test_algorithm_2_minimises_the_chosen_criterion():
@@ -413,38 +410,6 @@ def test_matches_that_determine_no_homography_are_named():
     refuses(ValueError, "threshold_px must be positive", call, xy, xy, threshold_px=0.0)
     moved = dehomogenize(homogenize(xy) @ unit_norm(np.diag([2.0, 2.0, 1.0])).T)
     assert thesisrecon.estimate_homography(xy, moved).inliers.all()
-
-
-@holds_for_every(examples=50)
-def test_parameters_and_back(rng):
-    F = enforce_rank_two(rng.normal(size=(3, 3)))
-    chosen = refinement._row_map(F)
-    parameters = refinement._row_parameters(F, *chosen)
-    assert parameters.shape == (7,)
-    assert np.abs(parameters).max() <= 1.0 + 1e-9
-    back = refinement._fundamental_from_rows(parameters, *chosen)
-    assert angle_between(back, F) < 1e-12
-    np.testing.assert_allclose(
-        np.cross(np.insert(parameters[5:], chosen[0], -1.0), epipoles(back)[1]), 0.0, atol=1e-12
-    )
-
-
-@pytest.mark.parametrize("epipole", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 0.0)])
-def test_epipoles_at_infinity_and_on_axes_are_reached(epipole):
-    """A fixed third row could not reach them."""
-    e = np.array(epipole) / np.linalg.norm(epipole)
-    F = unit_norm((np.eye(3) - np.outer(e, e)) @ np.random.default_rng(0).normal(size=(3, 3)))
-    chosen = refinement._row_map(F)
-    back = refinement._fundamental_from_rows(refinement._row_parameters(F, *chosen), *chosen)
-    assert angle_between(back, F) < 1e-12
-
-
-@pytest.mark.parametrize(("row", "fixed"), [*itertools.product(range(3), range(6))])
-def test_every_map_gives_rank_two_and_its_parameters_back(row, fixed):
-    parameters = np.random.default_rng(fixed).normal(size=7)
-    F = refinement._fundamental_from_rows(parameters, row, fixed)
-    assert np.linalg.svd(F, compute_uv=False)[2] < 1e-15
-    np.testing.assert_allclose(refinement._row_parameters(F, row, fixed), parameters, atol=1e-9)
 
 
 def bound_of(seed, n=40, sigma=0.5):

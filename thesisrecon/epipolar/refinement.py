@@ -8,7 +8,7 @@ common frame, F is a row-major vector of 9.
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -16,10 +16,7 @@ from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import PairFrame, check_matches, check_start
 from thesisrecon.errors import unknown_word
-from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.small_matrices import orthogonalize_columns, solve_damped
-from thesisrecon.geometry.two_view import epipoles
-from thesisrecon.optimize.least_squares import DenseSystem, central_differences, run_levenberg_marquardt
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -300,77 +297,21 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
 
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
-Parameters = Literal["orthonormal", "row"]
 _CRITERIA = {"sampson": SAMPSON, "epipolar-distance": EPIPOLAR_DISTANCE, "reprojection": REPROJECTION}
 MAX_ITERATIONS = 50
-MAPS_TRIED = 4
 
 
-def refine_fundamental(
-    F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson", *, parameters: Parameters = "orthonormal"
-) -> F64:
+def refine_fundamental(F: F64, xy1: F64, xy2: F64, criterion: Criterion = "sampson") -> F64:
     """Minimise a criterion of section 5.3 over matrices of rank 2 by Levenberg-Marquardt, from a start F.
 
     The reprojection error gives the maximum likelihood for Gaussian noise (HZ, algorithm 11.3); the Sampson
-    distance is optimal to first order in the noise. With the ``parameters`` "row" a row of F is a combination
-    of the others, as in the thesis, which reaches the same minimum more slowly.
+    distance is optimal to first order in the noise. The thesis writes a row of F as a combination of the
+    others, which reaches the same minimum more slowly.
     """
     if criterion not in _CRITERIA:
         raise ValueError(unknown_word("criterion", criterion, _CRITERIA))
-    if parameters not in get_args(Parameters):
-        raise ValueError(unknown_word("value of parameters", parameters, get_args(Parameters)))
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
     frame = PairFrame.of(xy1, xy2)
     f, points = check_start(F, frame), frame.points(xy1, xy2)
-    if parameters == "orthonormal":
-        refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
-    else:
-        f = _refine_by_rows(f, points, _CRITERIA[criterion])
+    refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
     return frame.matrix_in_pixels(f)
-
-
-def _row_map(F: F64) -> tuple[int, int]:
-    """The dependent row of F, that of the largest coordinate of e2, and the largest entry of the others."""
-    row = int(np.argmax(np.abs(epipoles(F)[1])))
-    return row, int(np.argmax(np.abs(np.delete(F, row, axis=0))))
-
-
-def _row_parameters(F: F64, row: int, fixed: int) -> F64:
-    """Entries of two rows of F over the ``fixed`` one, and the factors of the other ``row`` in them (7,)."""
-    rows, e2 = np.delete(F, row, axis=0).ravel(), epipoles(F)[1]
-    return np.append(np.delete(rows, fixed) / rows[fixed], -np.delete(e2, row) / e2[row])
-
-
-def _fundamental_from_rows(parameters: F64, row: int, fixed: int) -> F64:
-    """F of unit norm of five entries of two rows, with 1 at ``fixed``, and the factors of ``row`` (7,)."""
-    rows = np.insert(parameters[:5], fixed, 1.0).reshape(2, 3)
-    return unit_norm(np.insert(rows, row, parameters[5:] @ rows, axis=0))
-
-
-def _refine_by_rows(f: F64, points: F64, criterion: int) -> F64:
-    """Minimise a criterion in the thesis' parameters: a row of F is alpha and beta times the other two.
-
-    The epipole e2 is (alpha, beta, -1) in that order of coordinates (the thesis has e1 here), so that 18 maps
-    are needed for all matrices of rank 2. The map is chosen again when the estimate leaves it.
-    """
-    current, G, h = f.reshape(3, 3), np.empty((9, 9)), np.empty(9)
-    for _ in range(MAPS_TRIED):
-        chosen = _row_map(current)
-
-        def cost(p: F64, chosen: tuple[int, int] = chosen) -> float:
-            F = _fundamental_from_rows(p, *chosen).ravel()
-            return float(normal_equations(F, points, criterion, np.inf, UNBOUNDED, G, h))
-
-        def linearize(p: F64, chosen: tuple[int, int] = chosen) -> DenseSystem:
-            B = central_differences(lambda q: _fundamental_from_rows(q, *chosen).ravel(), p)
-            value = cost(p, chosen)
-            return DenseSystem(value, B.T @ G @ B, B.T @ h)
-
-        found = run_levenberg_marquardt(
-            linearize, lambda p, step: p + step, cost, _row_parameters(current, *chosen),
-            max_iterations=MAX_ITERATIONS, initial_damping=1e-3,
-        )  # fmt: skip
-        current = _fundamental_from_rows(found.state, *chosen)
-        if _row_map(current) == chosen:
-            break
-    return current.ravel()

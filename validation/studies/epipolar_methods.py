@@ -22,7 +22,7 @@ from thesisrecon.config import FundamentalEstimator
 from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, estimate_eight_point
-from thesisrecon.epipolar.refinement import Criterion, Parameters, fundamental_covariance, refine_fundamental
+from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
@@ -68,10 +68,8 @@ class Method:
         return F if F is not None and F.shape == (3, 3) and np.isfinite(F).all() and F.any() else None
 
 
-def _refined(criterion: Criterion, parameters: Parameters) -> Estimate:
-    return lambda xy1, xy2, _, __: refine_fundamental(
-        estimate_eight_point(xy1, xy2), xy1, xy2, criterion, parameters=parameters
-    )
+def _refined(criterion: Criterion) -> Estimate:
+    return lambda xy1, xy2, _, __: refine_fundamental(estimate_eight_point(xy1, xy2), xy1, xy2, criterion)
 
 
 def _linear(**options: bool) -> Estimate:
@@ -96,12 +94,9 @@ OWN = (
     Method("eight-point, raw pixels, rank 3", _linear(normalized=False, rank_two=False)),
     Method(RAW, _linear(normalized=False)),
     Method(NORMALISED, _linear()),
-    Method("Sampson (5.4), thesis' rows", _refined("sampson", "row")),
-    Method("Sampson (5.4), orthonormal", _refined("sampson", "orthonormal")),
-    Method("epipolar distance (5.6), thesis' rows", _refined("epipolar-distance", "row")),
-    Method("epipolar distance (5.6), orthonormal", _refined("epipolar-distance", "orthonormal")),
-    Method("gold standard, thesis' rows", _refined("reprojection", "row")),
-    Method(GOLD, _refined("reprojection", "orthonormal")),
+    Method("Sampson (5.4), orthonormal", _refined("sampson")),
+    Method("epipolar distance (5.6), orthonormal", _refined("epipolar-distance")),
+    Method(GOLD, _refined("reprojection")),
     *(
         Method(f"Algorithm 2, {label}", _robust(ThesisRansac, **variant), robust=True, thresholded=True)
         for label, variant in (
