@@ -22,7 +22,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._colmap import MAX_SIDE_PX, is_colmap_model, read_colmap_model
 from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name, shortened
-from thesisrecon.io._other_models import reader_of
+from thesisrecon.io._other_models import checked_pose, read_other
 from thesisrecon.results import SparseModel, SparseView
 
 
@@ -37,11 +37,8 @@ def read_model(path: str | Path) -> SparseModel:
     path = Path(path)
     if not path.exists():
         raise UsageError(f"there is no {path}; give {_KNOWN}")
-    if path.is_dir():
-        model = _read_folder(path)
-    elif (read := reader_of(path)) is not None:
-        model = read(path)
-    else:
+    model = _read_folder(path) if path.is_dir() else read_other(path)
+    if model is None:
         model = SparseModel(_read_views(path) if path.suffix == ".json" else _read_trajectory(path))
         model = replace(model, as_stored=_from_colmap(path.parent))
     twice = first_repeated(require_image_name(name, path) for name in model.names)
@@ -140,17 +137,12 @@ def _pose(row: F64) -> tuple[F64, F64]:
     """R (3, 3), world to camera, and centre (3,) of a row of TUM (8,) or KITTI (12,), or ``ValueError``."""
     if not np.isfinite(row).all():
         raise ValueError("a number is not finite")
-    rotation = scipy.spatial.transform.Rotation
     if len(row) == 8:
         if not 1e-9 < math.hypot(*row[4:]) < 1e9:
             raise ValueError("the quaternion has no direction")
-        return rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
-    M = row.reshape(3, 4)
-    # The printed digits of a pose may leave a deviation from a rotation.
-    orthogonal = np.allclose(M[:, :3] @ M[:, :3].T, np.eye(3), atol=1e-3)
-    if not orthogonal or np.linalg.det(M[:, :3]) < 0.0:
-        raise ValueError("it is not a rotation")
-    return rotation.from_matrix(M[:, :3]).as_matrix().T, M[:, 3]
+        return scipy.spatial.transform.Rotation.from_quat(row[4:]).as_matrix().T, row[1:4]
+    R, centre = checked_pose(row.reshape(3, 4)[:, :3], row.reshape(3, 4)[:, 3])
+    return R.T, centre
 
 
 Place = tuple[float, float, float]

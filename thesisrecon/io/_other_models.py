@@ -9,7 +9,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,20 +28,22 @@ LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 _MVS_VERSIONS = range(1, 7)
 
 
-def reader_of(path: Path) -> Callable[[Path], SparseModel] | None:
-    """The reader of a file of another program; None for other files."""
+def read_other(path: Path) -> SparseModel | None:
+    """The model in a file of another program; None for other files."""
     if path.suffix == ".json" and isinstance(content := read_json(path), dict) and "frames" in content:
-        return read_transforms
-    if path.suffix == ".mvs":
-        return read_openmvs
-    if path.suffix == ".out":
-        return read_bundler
-    return read_kalibr if path.suffix in (".yaml", ".yml") else None
-
-
-def _guarded(path: Path, rule: str, read: Callable[[], SparseModel]) -> SparseModel:
+        rule = "must hold frames with file_path and transform_matrix (nerfstudio, NeRF)"
+        read = read_transforms
+    elif path.suffix == ".mvs":
+        read, rule = read_openmvs, "must be an OpenMVS scene"
+    elif path.suffix == ".out":
+        rule = "must be a Bundler file v0.3, a camera in five lines and a point in three"
+        read = read_bundler
+    elif path.suffix in (".yaml", ".yml"):
+        read, rule = read_kalibr, "must be a camchain.yaml of pinhole cameras cam0, cam1, ..."
+    else:
+        return None
     try:
-        model = read()
+        model = read(path)
     except UsageError:
         raise
     except OSError as error:
@@ -53,7 +55,7 @@ def _guarded(path: Path, rule: str, read: Callable[[], SparseModel]) -> SparseMo
     return model
 
 
-def _pose(R: F64, t: F64) -> tuple[F64, F64]:
+def checked_pose(R: F64, t: F64) -> tuple[F64, F64]:
     """A finite pose with the rotation nearest to R, which printed digits may leave inexact."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
@@ -92,21 +94,17 @@ def read_transforms(path: Path) -> SparseModel:
     Intrinsics stand in the head or in each frame (``fl_x, fl_y, cx, cy, w, h, k1 ... p2``), or follow from
     ``camera_angle_x`` of NeRF: f = w / (2 tan(angle / 2)), centre in the middle.
     """
-
-    def read() -> SparseModel:
-        content = read_json(path)
-        views: list[SparseView] = []
-        for frame in content["frames"]:
-            M = np.array(frame["transform_matrix"], dtype=np.float64)
-            if M.shape not in ((3, 4), (4, 4)):
-                raise ValueError(f"transform_matrix must be 4 x 4; got {M.shape}")
-            R, centre = _pose(M[:3, :3] @ LOOKS_BACK, M[:3, 3])
-            given, file = {**content, **frame}, str(frame["file_path"])
-            K, size, lens = _nerf_camera(given, path.parent, file)
-            views.append(SparseView(_name(file), R.T, -R.T @ centre, K, size, lens, len(views)))
-        return SparseModel(views)
-
-    return _guarded(path, "must hold frames with file_path and transform_matrix (nerfstudio, NeRF)", read)
+    content = read_json(path)
+    views: list[SparseView] = []
+    for frame in content["frames"]:
+        M = np.array(frame["transform_matrix"], dtype=np.float64)
+        if M.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"transform_matrix must be 4 x 4; got {M.shape}")
+        R, centre = checked_pose(M[:3, :3] @ LOOKS_BACK, M[:3, 3])
+        given, file = {**content, **frame}, str(frame["file_path"])
+        K, size, lens = _nerf_camera(given, path.parent, file)
+        views.append(SparseView(_name(file), R.T, -R.T @ centre, K, size, lens, len(views)))
+    return SparseModel(views)
 
 
 def _nerf_camera(
@@ -138,28 +136,24 @@ def read_bundler(path: Path) -> SparseModel:
 
     Names are those of ``list.txt`` beside it; sizes, and with them K and pixels, those of the images there.
     """
-
-    def read() -> SparseModel:
-        words = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
-        n, points = (int(word) for word in words[0])
-        names = _bundler_names(path.parent / "list.txt", n)
-        views: list[SparseView] = []
-        centres, kept = np.full((n, 2), np.nan), np.full(n, -1)
-        for i in range(n):
-            (f, k1, k2), *rows = (np.array(row, dtype=np.float64) for row in words[1 + 5 * i : 6 + 5 * i])
-            if not f > 0.0:
-                continue  # a camera that Bundler did not register
-            R, t = _pose(LOOKS_BACK @ np.array(rows[:3]), LOOKS_BACK @ rows[3])
-            size = _size_of(path.parent, names[i])
-            K = None
-            if size is not None:
-                centres[i] = (np.array(size) - 1.0) / 2.0
-                K = _calibration(f, f, *centres[i].tolist())
-            kept[i] = len(views)
-            views.append(SparseView(_name(names[i]), R, t, K, size, np.array([k1, k2, 0.0]), i))
-        return _bundler_points(words[1 + 5 * n :], points, views, (centres, kept))
-
-    return _guarded(path, "must be a Bundler file v0.3, a camera in five lines and a point in three", read)
+    words = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
+    n, points = (int(word) for word in words[0])
+    names = _bundler_names(path.parent / "list.txt", n)
+    views: list[SparseView] = []
+    centres, kept = np.full((n, 2), np.nan), np.full(n, -1)
+    for i in range(n):
+        (f, k1, k2), *rows = (np.array(row, dtype=np.float64) for row in words[1 + 5 * i : 6 + 5 * i])
+        if not f > 0.0:
+            continue  # a camera that Bundler did not register
+        R, t = checked_pose(LOOKS_BACK @ np.array(rows[:3]), LOOKS_BACK @ rows[3])
+        size = _size_of(path.parent, names[i])
+        K = None
+        if size is not None:
+            centres[i] = (np.array(size) - 1.0) / 2.0
+            K = _calibration(f, f, *centres[i].tolist())
+        kept[i] = len(views)
+        views.append(SparseView(_name(names[i]), R, t, K, size, np.array([k1, k2, 0.0]), i))
+    return _bundler_points(words[1 + 5 * n :], points, views, (centres, kept))
 
 
 def _bundler_names(path: Path, n: int) -> list[str]:
@@ -216,35 +210,31 @@ class _Bytes:
 
 def read_openmvs(path: Path) -> SparseModel:
     """Read ``scene.mvs`` ("MVSI", versions 1 to 6): cameras and points; their views have no pixels."""
-
-    def read() -> SparseModel:
-        b = _Bytes(read_bytes(path, largest=2**31))
-        magic, version, _ = b.take("<4sII")
-        if magic != b"MVSI" or version not in _MVS_VERSIONS:
-            known = f"MVSI {_MVS_VERSIONS[0]} to {_MVS_VERSIONS[-1]}"
-            raise ValueError(f"its format is {magic!r} {version}; known are {known}")
-        platforms = [_platform(b, version) for _ in range(b.count())]
-        views = []
-        for _ in range(b.count()):
-            name = b.text()
-            if version > 4:
-                b.text()  # mask
-            platform, camera, pose = b.take("<III")
-            if version > 2:
-                b.take("<I")
-            if pose == 2**32 - 1:
-                continue  # an image without a pose
-            cameras, poses = platforms[platform]
-            (K, size, R_camera, C_camera), (R, C) = cameras[camera], poses[pose]
-            R, centre = _pose(R_camera @ R, R.T @ C_camera + C)
-            views.append(SparseView(_name(name), R, -R @ centre, K, size, np.zeros(3), camera))
-        X = []
-        for _ in range(b.count()):
-            X.append(b.take("<3f"))
-            b.take(f"<{2 * b.count()}I")
-        return SparseModel(views, np.array(X, dtype=np.float64).reshape(-1, 3))
-
-    return _guarded(path, "must be an OpenMVS scene", read)
+    b = _Bytes(read_bytes(path, largest=2**31))
+    magic, version, _ = b.take("<4sII")
+    if magic != b"MVSI" or version not in _MVS_VERSIONS:
+        known = f"MVSI {_MVS_VERSIONS[0]} to {_MVS_VERSIONS[-1]}"
+        raise ValueError(f"its format is {magic!r} {version}; known are {known}")
+    platforms = [_platform(b, version) for _ in range(b.count())]
+    views = []
+    for _ in range(b.count()):
+        name = b.text()
+        if version > 4:
+            b.text()  # mask
+        platform, camera, pose = b.take("<III")
+        if version > 2:
+            b.take("<I")
+        if pose == 2**32 - 1:
+            continue  # an image without a pose
+        cameras, poses = platforms[platform]
+        (K, size, R_camera, C_camera), (R, C) = cameras[camera], poses[pose]
+        R, centre = checked_pose(R_camera @ R, R.T @ C_camera + C)
+        views.append(SparseView(_name(name), R, -R @ centre, K, size, np.zeros(3), camera))
+    X = []
+    for _ in range(b.count()):
+        X.append(b.take("<3f"))
+        b.take(f"<{2 * b.count()}I")
+    return SparseModel(views, np.array(X, dtype=np.float64).reshape(-1, 3))
 
 
 def _platform(b: _Bytes, version: int) -> tuple[list[tuple[F64, tuple[int, int], F64, F64]], list[Any]]:
@@ -264,25 +254,21 @@ def _platform(b: _Bytes, version: int) -> tuple[list[tuple[F64, tuple[int, int],
 
 def read_kalibr(path: Path) -> SparseModel:
     """Read ``camchain.yaml`` of Kalibr: cam0, cam1, ... with ``T_cn_cnm1``, from each camera to the next."""
-
-    def read() -> SparseModel:
-        views, R, t = [], np.eye(3), np.zeros(3)
-        for i, (name, camera) in enumerate(_camchain(read_text(path)).items()):
-            if i and "T_cn_cnm1" in camera:
-                T = np.array(camera["T_cn_cnm1"], dtype=np.float64)
-                R_next, t_next = _pose(T[:3, :3], T[:3, 3])
-                R, t = R_next @ R, R_next @ t + t_next
-            fx, fy, cx, cy = (float(v) for v in camera["intrinsics"])
-            width, height = (int(v) for v in camera["resolution"])
-            model = camera.get("distortion_model", "none")
-            lens = np.zeros(4) if model == "none" else np.array(camera["distortion_coeffs"], dtype=np.float64)
-            radial = camera["camera_model"] == "pinhole" and model in ("radtan", "none")
-            radial = radial and not lens[2:].any()
-            k = np.append(lens[:2], 0.0) if radial else None
-            views.append(SparseView(name, R, t, _calibration(fx, fy, cx, cy), (width, height), k, i))
-        return SparseModel(views)
-
-    return _guarded(path, "must be a camchain.yaml of pinhole cameras cam0, cam1, ...", read)
+    views, R, t = [], np.eye(3), np.zeros(3)
+    for i, (name, camera) in enumerate(_camchain(read_text(path)).items()):
+        if i and "T_cn_cnm1" in camera:
+            T = np.array(camera["T_cn_cnm1"], dtype=np.float64)
+            R_next, t_next = checked_pose(T[:3, :3], T[:3, 3])
+            R, t = R_next @ R, R_next @ t + t_next
+        fx, fy, cx, cy = (float(v) for v in camera["intrinsics"])
+        width, height = (int(v) for v in camera["resolution"])
+        model = camera.get("distortion_model", "none")
+        lens = np.zeros(4) if model == "none" else np.array(camera["distortion_coeffs"], dtype=np.float64)
+        radial = camera["camera_model"] == "pinhole" and model in ("radtan", "none")
+        radial = radial and not lens[2:].any()
+        k = np.append(lens[:2], 0.0) if radial else None
+        views.append(SparseView(name, R, t, _calibration(fx, fy, cx, cy), (width, height), k, i))
+    return SparseModel(views)
 
 
 def _camchain(text: str) -> dict[str, dict[str, Any]]:
