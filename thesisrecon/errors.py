@@ -71,7 +71,7 @@ class Notice(str):
     code: str
 
     def __new__(cls, code: str, *values: object) -> Notice:
-        return cls.of(code, _texts()[code].format(*values))
+        return cls.of(code, _entries()[code][0].format(*values))
 
     @classmethod
     def of(cls, code: str, text: str) -> Notice:
@@ -85,16 +85,16 @@ class Notice(str):
 
 
 @cache
-def _texts() -> dict[str, str]:
-    """Text of each code; "{}" stands for a value."""
+def _entries() -> dict[str, list[str]]:
+    """Texts of each code; "{}" stands for a value."""
     tables = tomllib.loads(Path(__file__).with_name("messages.toml").read_text(encoding="utf-8"))
     entries = {code: entry for table in tables.values() for code, entry in table.items()}
-    return {code: entry if isinstance(entry, str) else entry[0] for code, entry in entries.items()}
+    return {code: [entry] if isinstance(entry, str) else entry for code, entry in entries.items()}
 
 
 def remedies() -> dict[int, str]:
     """Advice for a file that cannot be written by the number of the error."""
-    return {number: _texts()[name] for number, name in errno.errorcode.items() if name in _texts()}
+    return {number: _entries()[name][0] for number, name in errno.errorcode.items() if name in _entries()}
 
 
 class StageFailure(Exception):
@@ -103,8 +103,8 @@ class StageFailure(Exception):
     Parameters
     ----------
     reason, evidence, advice : str
-        What happened, what was measured (with numbers and units), and what to do, as clauses. A reason
-        without advice is a ``Notice``.
+        What happened, what was measured (with numbers and units), and what to do, as clauses. A reason of
+        ``messages.toml`` is a ``Notice``.
 
     Examples
     --------
@@ -118,6 +118,12 @@ class StageFailure(Exception):
         self.advice = advice
         parts = [part.rstrip(".") for part in (reason, evidence, advice) if part]
         super().__init__("; ".join(parts) + ".")
+
+    @classmethod
+    def of(cls, code: str, *values: object) -> StageFailure:
+        """Return the failure of a code of ``messages.toml`` with the values of its texts."""
+        reason, *others = (text.format(*values) for text in _entries()[code])
+        return cls(Notice.of(code, reason), *others)
 
     def __reduce__(self) -> tuple[type[StageFailure], tuple[str, str, str]]:
         return type(self), (self.reason, self.evidence, self.advice)

@@ -276,11 +276,7 @@ def _method(
         and not isinstance(method.plane, ParallelLines)
         and not projective.inlier.any()
     ):
-        raise StageFailure(
-            "this method searches for the plane at infinity within bounds that the points give",
-            "the cameras come without points",
-            "give xy (V, N, 2), the pixels of points, or use nonlinear-quadric",
-        )
+        raise StageFailure.of("plane-without-points")
     return with_images(method, images), settings
 
 

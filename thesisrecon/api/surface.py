@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon import records
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import CameraInput, as_cameras, named_cameras, radial_coefficients
 from thesisrecon.arrays import F32, F64, I64, U8, number, numbers, resizing_transform
@@ -16,24 +17,8 @@ from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
-from thesisrecon.io._images import (
-    eight_bit_images,
-    list_images,
-    list_of_images,
-    read_image,
-    read_levels,
-    rotation_words,
-)
+from thesisrecon.io import _images
 from thesisrecon.pipeline.matching import ImageInput
-from thesisrecon.records import (
-    DepthMap,
-    DisparityMap,
-    Image,
-    Reconstruction,
-    TexturedMesh,
-    Tracks,
-    as_mesh,
-)
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
 from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range
@@ -84,7 +69,7 @@ def rectify(
     True
     """
     F, xy1, xy2 = numbers("rectify", F=F, xy1=xy1, xy2=xy2)
-    images = read_levels(image1, image2)
+    images = _images.read_levels(image1, image2)
     size1, size2 = ((image.shape[1], image.shape[0]) for image in images)
     frame = best_rectification(pair_of_fundamental(F, xy1, xy2, size1, size2), PLANAR if planar else METHODS)
     return RectifiedImages.of(frame, (images[0], images[1]), disparity_range(frame, xy1, xy2))
@@ -93,7 +78,7 @@ def rectify(
 def match_rectified(
     left: ImageInput, right: ImageInput, *, max_disparity_px: float, min_disparity_px: float = 0.0,
     config: Config | None = None,
-) -> DisparityMap:  # fmt: skip
+) -> records.DisparityMap:  # fmt: skip
     """Compute the disparity map of a rectified pair (2.5; semi-global matching: Hirschmüller, PAMI 2008).
 
     Parameters
@@ -122,7 +107,7 @@ def match_rectified(
     >>> round(float(np.nanmedian(found.disparity)), 1)
     6.0
     """
-    images = read_levels(left, right, grey=True)
+    images = _images.read_levels(left, right, grey=True)
     most = number("match_rectified", "max_disparity_px", max_disparity_px)
     least = number("match_rectified", "min_disparity_px", min_disparity_px)
     match = as_config(config).dense.match_rectified
@@ -157,7 +142,7 @@ def depth_maps(
     images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
     depth_range: F64 | tuple[float, float] | None = None, max_size: int | None = None,
     config: Config | None = None, threads: int = 1,
-) -> tuple[DepthMap, ...]:  # fmt: skip
+) -> tuple[records.DepthMap, ...]:  # fmt: skip
     """Estimate the depth maps of images with known cameras; no tracks or points are needed (2.5).
 
     Parameters
@@ -217,22 +202,19 @@ def depth_maps(
     dense = method.dense
     scene = dense.prepare(read, model, depth_range=limits, threads=threads)
     if not any(scene.neighbours[view] for view in scene.views):
-        rule = "no two images contain common points whose rays meet at an angle that gives depth"
-        advice = "give R world to camera and t = -R centre, images with more overlap, or a depth_range"
-        raise StageFailure("no depth was found", rule, advice)
+        raise StageFailure.of("no-depth-of-cameras")
     maps = list(confirmed_depth_maps(dense, scene, threads=threads).values())
     if limits is not None:
         near, far = limits.T
         maps = [keep_depths(m, (m.depth >= near[m.view]) & (m.depth <= far[m.view])) for m in maps]
     if not any(np.isfinite(one.depth).any() for one in maps):
-        evidence = f"none of {counted(len(maps), 'view')} agrees with another on any surface"
-        raise StageFailure("no depth was found", evidence, "check the cameras, or give a wider depth_range")
+        raise StageFailure.of("no-depth-in-range", counted(len(maps), "view"))
     return tuple(maps)
 
 
 def confirmed_depth_maps(
     dense: DepthEstimator, scene: MultiViewScene, *, threads: int = 1
-) -> dict[int, DepthMap]:
+) -> dict[int, records.DepthMap]:
     """Depth maps of all views by number, confirmed by each other; the result does not depend on threads."""
     order = sorted(scene.views)
     with ThreadPool(threads) as pool:
@@ -242,9 +224,9 @@ def confirmed_depth_maps(
 
 
 def fuse_depth_maps(
-    depth_maps: Sequence[DepthMap] | Sequence[F32 | F64], cameras: CameraInput | None = None, *,
+    depth_maps: Sequence[records.DepthMap] | Sequence[F32 | F64], cameras: CameraInput | None = None, *,
     sizes: I64 | None = None, config: Config | None = None, threads: int = 1,
-) -> TexturedMesh:  # fmt: skip
+) -> records.TexturedMesh:  # fmt: skip
     """Fuse depth maps to one surface (2.6; Curless and Levoy, SIGGRAPH 1996).
 
     Parameters
@@ -276,13 +258,13 @@ def fuse_depth_maps(
     >>> mesh.vertices[:, 2].round(2).min(), mesh.vertices[:, 2].round(2).max()
     (np.float64(2.0), np.float64(2.0))
     """
-    depth_maps = list_of_images("fuse_depth_maps", depth_maps, "a sequence of depth maps")
+    depth_maps = _images.list_of_images("fuse_depth_maps", depth_maps, "a sequence of depth maps")
     if not depth_maps:
         raise ValueError("fuse_depth_maps needs at least one depth map; got none")
     model = as_config(config).model
     if not isinstance(model, SurfaceModel):
         raise UsageError(f"fuse_depth_maps needs a SurfaceModel as config.model; got {type(model).__name__}")
-    if all(isinstance(one, DepthMap) for one in depth_maps):
+    if all(isinstance(one, records.DepthMap) for one in depth_maps):
         return model.surface_of(depth_maps, threads=threads)
     if cameras is None:
         raise ValueError("fuse_depth_maps needs the cameras of plain depths")
@@ -295,9 +277,9 @@ def fuse_depth_maps(
 
 
 def texture(
-    mesh: TexturedMesh, images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
+    mesh: records.TexturedMesh, images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
     max_size: int | None = None, config: Config | None = None, threads: int = 1,
-) -> TexturedMesh:  # fmt: skip
+) -> records.TexturedMesh:  # fmt: skip
     """Texture a surface from images with known cameras (2.6).
 
     Parameters
@@ -332,7 +314,7 @@ def texture(
     >>> texture(mesh, [image], [camera]).texture.dtype
     dtype('uint8')
     """
-    mesh = as_mesh("texture", mesh)
+    mesh = records.as_mesh("texture", mesh)
     method = as_config(config)
     read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
     views = [pinhole_view(image, model, i, max_side=max(image.size)) for i, image in enumerate(read)]
@@ -341,35 +323,35 @@ def texture(
 
 def _scene(
     caller: str, images: ImagesInput, cameras: CameraInput, sizes: I64 | None, max_size: int
-) -> tuple[list[Image], Reconstruction]:
+) -> tuple[list[records.Image], records.Reconstruction]:
     """Images at working size, and their cameras for it, with the points of a reconstruction."""
     cameras = named_cameras(caller, cameras)
     if isinstance(images, str | Path):
-        files = list_images(Path(images))
+        files = _images.list_images(Path(images))
         # Images that were not registered have no camera.
         images = [path for path in files if isinstance(cameras, Mapping) and path.name in cameras] or files
-    listed = eight_bit_images(*list_of_images(caller, images))
+    listed = _images.eight_bit_images(*_images.list_of_images(caller, images))
     names = [_name_of(n, image) for n, image in enumerate(listed)]
     views = as_cameras(caller, cameras, sizes, names)
     if len(views) != len(names):
         raise ValueError(f"{caller} needs a camera per image; got {len(views)} and {len(names)}")
     read = [
-        read_image(one, max_size_px=max_size, as_stored=view.as_stored).images[0]
+        _images.read_image(one, max_size_px=max_size, as_stored=view.as_stored).images[0]
         for one, view in zip(listed, views, strict=True)
     ]
     scaled = []
     for name, image, view in zip(names, read, views, strict=True):
         if image.original_size != view.size:
             what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
-            rule = f"cameras in pixels of the images {rotation_words(view.as_stored)}, or Camera.scaled(...)"
-            raise ValueError(f"{what}; give {rule}")
+            rule = f"cameras in pixels of the images {_images.rotation_words(view.as_stored)}"
+            raise ValueError(f"{what}; give {rule}, or Camera.scaled(...)")
         scaled.append(_scaled(view, image.scale, image.size))
     model = _model(scaled)
-    if isinstance(cameras, Reconstruction) and len(cameras.tracks.xy):
+    if isinstance(cameras, records.Reconstruction) and len(cameras.tracks.xy):
         t, kept = cameras.tracks, cameras.registered[cameras.tracks.view_index]
         index = (np.cumsum(cameras.registered) - 1)[t.view_index[kept]]
         xy = (t.xy[kept] + 0.5) * np.array([image.scale for image in read])[index, None] - 0.5
-        tracks = Tracks(index, t.point_index[kept], xy, len(read), t.n_points)
+        tracks = records.Tracks(index, t.point_index[kept], xy, len(read), t.n_points)
         model = replace(model, X=cameras.X, valid=cameras.valid, inlier=cameras.inlier[kept], tracks=tracks)
     return read, model
 
@@ -377,7 +359,7 @@ def _scene(
 def _name_of(number: int, image: ImageInput) -> str:
     if isinstance(image, str | Path):
         return Path(image).name
-    return image.name if isinstance(image, Image) else f"image-{number}"
+    return image.name if isinstance(image, records.Image) else f"image-{number}"
 
 
 def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
@@ -385,14 +367,14 @@ def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
     return replace(camera, K=resizing_transform(scale) @ camera.K, size=size)
 
 
-def _model(views: Sequence[Camera]) -> Reconstruction:
+def _model(views: Sequence[Camera]) -> records.Reconstruction:
     """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
     n, lenses = len(views), radial_coefficients("depth of known cameras", views)
     none = np.zeros(0, dtype=np.int64)
     K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
-    return Reconstruction(
+    return records.Reconstruction(
         "metric", P, np.zeros((0, 4)), np.ones(n, dtype=bool), np.zeros(0, dtype=bool),
-        np.zeros(0, dtype=bool), Tracks(none, none, np.zeros((0, 2)), n, 0),
+        np.zeros(0, dtype=bool), records.Tracks(none, none, np.zeros((0, 2)), n, 0),
         np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, lenses,
     )  # fmt: skip
 
@@ -408,7 +390,7 @@ def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
     return limits
 
 
-def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
+def _plain(number: int, depth: F32 | F64, camera: Camera) -> records.DepthMap:
     """The depth map of an array of the camera's size or smaller."""
     z: F32 = numbers("fuse_depth_maps", missing=("depth",), depth=depth)[0].astype(np.float32)
     # Renderers give infinity where no surface is.
@@ -421,4 +403,4 @@ def _plain(number: int, depth: F32 | F64, camera: Camera) -> DepthMap:
             f"depth map {number} of {width} x {height} px needs a camera of its shape; got {camera.size}"
         )
     own = _scaled(camera, width / camera.size[0], (width, height))
-    return DepthMap(number, own.P, z, z / np.float32(own.K[0, 0]), np.isfinite(z).astype(np.uint8))
+    return records.DepthMap(number, own.P, z, z / np.float32(own.K[0, 0]), np.isfinite(z).astype(np.uint8))

@@ -11,20 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from thesisrecon import arrays
 from thesisrecon.api.pairs import match_pair
-from thesisrecon.arrays import (
-    F32,
-    F64,
-    U8,
-    Record,
-    eight_bit,
-    image_levels,
-    number,
-    numbers,
-    require_calibration,
-    resizing_transform,
-    whole_number,
-)
+from thesisrecon.arrays import F32, F64, U8, Record
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
@@ -49,7 +38,6 @@ from thesisrecon.views.tensor import (
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
-_SIDE_BY_SIDE = "take the images side by side, not one behind the other"
 
 
 def interpolate_view(
@@ -95,7 +83,7 @@ def interpolate_view(
     >>> np.array_equal(view, left)
     True
     """
-    if not 0.0 <= number("interpolate_view", "s", s) <= 1.0:
+    if not 0.0 <= arrays.number("interpolate_view", "s", s) <= 1.0:
         raise ValueError(f"s must be between 0 (left image) and 1 (right image); got {s}")
     return prepare_rectified_pair(left, right, disparity=disparity, config=config).view(s)
 
@@ -134,7 +122,9 @@ def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
     """The disparities as a map; plain ones have confidence 1 where they are known."""
     if isinstance(disparity, DisparityMap):
         return disparity
-    disparity = numbers("interpolate_view", missing=("disparity",), disparity=disparity)[0].astype(np.float32)
+    disparity = arrays.numbers("interpolate_view", missing=("disparity",), disparity=disparity)[0].astype(
+        np.float32
+    )
     if disparity.ndim != 2:
         raise ValueError(f"disparities must be (H, W), or a tuple of two such maps; got {disparity.shape}")
     return DisparityMap(disparity, np.isfinite(disparity).astype(np.float32), 0.0)
@@ -182,12 +172,12 @@ def prepare_pair(
     except StageFailure as failure:
         if "polar" not in failure.advice:
             raise
-        raise StageFailure(failure.reason, failure.evidence, _SIDE_BY_SIDE) from None
+        advice = "take the images side by side, not one behind the other"
+        raise StageFailure(failure.reason, failure.evidence, advice) from None
     assert isinstance(dense.frame, PlanarRectification)
     # Halfway, views then show 0.7 of the field of view.
     if abs(roll := roll_between(dense.frame.H, first.size)) > 90.0:
-        evidence = f"by {abs(roll):.0f} degrees, at most 90 leave views between them"
-        raise StageFailure("the images are rolled against each other", evidence, "turn one of them upright")
+        raise StageFailure.of("rolled-images", abs(roll))
     return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
 
 
@@ -211,9 +201,7 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
         if -0.5 <= x <= size[0] - 0.5 and -0.5 <= y <= size[1] - 0.5:
             # Without parallax F is not unique, and neither are its epipoles.
             require_parallax_of_matches(pair.F, pair.xy1, pair.xy2)
-            reason = "there is no view between the images: the camera moved towards the scene or away from it"
-            evidence = f"the epipole lies at ({x:.0f}, {y:.0f}) px, inside {image.name}"
-            raise StageFailure(reason, evidence, _SIDE_BY_SIDE)
+            raise StageFailure.of("forward-motion", x, y, image.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +291,7 @@ def synthesize_view(
     ValueError: view synthesis needs a rotation R; R'R deviates from the identity by 3
     """
     # Checked before the matching, which takes minutes.
-    rotation, translation = numbers("synthesize_view", rotation=rotation, translation=translation)
+    rotation, translation = arrays.numbers("synthesize_view", rotation=rotation, translation=translation)
     _given_intrinsics(K)
     VirtualCamera(rotation, translation, np.eye(3), (1, 1))
     found = match_images(image1, image2, config=config, seed=seed)
@@ -315,12 +303,12 @@ def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
     """Return K as (2, 3, 3), None if not given; ``ValueError`` if it is not that of a camera."""
     if K is None:
         return None
-    (given,) = numbers("view synthesis", K=K)
+    (given,) = arrays.numbers("view synthesis", K=K)
     if given.shape not in ((3, 3), (2, 3, 3)):
         raise ValueError(f"K must be (3, 3) for both images or (2, 3, 3); got {given.shape}")
     both = np.broadcast_to(given, (2, 3, 3))
     for one in both:
-        require_calibration("view synthesis", one)
+        arrays.require_calibration("view synthesis", one)
     return both
 
 
@@ -329,7 +317,8 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
     scales = np.array([image.scale for image in found.images])
     given = _given_intrinsics(K)
     if given is not None:
-        return resizing_transform(scales[0]) @ given[0], resizing_transform(scales[1]) @ given[1]
+        first, second = map(arrays.resizing_transform, scales)
+        return first @ given[0], second @ given[1]
     sizes = [image.original_size for image in found.images]
     prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
     both = []
@@ -375,17 +364,17 @@ def render(
     >>> view.color.shape, bool(view.valid[5, 10]), float(view.depth[5, 10])
     ((20, 20, 3), True, 2.0)
     """
-    whole_number("render", "samples", samples, 1)
-    whole_number("render", "threads", threads, 1)
+    arrays.whole_number("render", "samples", samples, 1)
+    arrays.whole_number("render", "threads", threads, 1)
     if not isinstance(camera, Camera):
         raise ValueError(f"render needs a thesisrecon.Camera as camera; got a {type(camera).__name__}")
     if not (shading is None or isinstance(shading, Shading)):
         raise ValueError(f"render needs a Shading or None as shading; got a {type(shading).__name__}")
-    (behind,) = numbers("render", background=background)
+    (behind,) = arrays.numbers("render", background=background)
     if behind.shape != (3,) or not np.isfinite(behind).all():
         rule = "background, three levels from 0 to 255 (or floats from 0 to 1)"
         raise ValueError(f"render needs {rule}; got {background!r}")
-    colour = tuple(eight_bit(image_levels(background)[0])[0].tolist())
+    colour = tuple(arrays.eight_bit(arrays.image_levels(background)[0])[0].tolist())
     return render_mesh(
         as_mesh("render", mesh), camera, shading=shading, background=colour, samples=samples, threads=threads
     )

@@ -42,20 +42,12 @@ def check_matches(xy1: F64, xy2: F64, *, needed: int) -> tuple[F64, F64]:
     """As :func:`as_matches`; StageFailure if the matches are too few, equal or collinear."""
     xy1, xy2 = as_matches(xy1, xy2)
     if len(xy1) < needed:
-        raise StageFailure(
-            "too few matches for the epipolar geometry",
-            f"found {len(xy1)}, needed at least {needed}",
-            "use images with more overlap",
-        )
+        raise StageFailure.of("few-matches", len(xy1), needed)
     for name, xy in (("first", xy1), ("second", xy2)):
         spread = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
         length = max(float(spread[0]), 1e-3 * float(np.abs(xy).max()))
         if not spread[1] > max(COLLINEAR * length, MIN_PX):
-            raise StageFailure(
-                f"the matched points are collinear in the {name} image",
-                f"{len(xy)} points with a spread across the line of {spread[1] / np.sqrt(len(xy)):.3g} px",
-                "collinear points do not determine the epipolar geometry; use matches from the whole image",
-            )
+            raise StageFailure.of("collinear-matches", name, len(xy), spread[1] / np.sqrt(len(xy)))
     return xy1, xy2
 
 

@@ -268,8 +268,7 @@ def fit_homography(
 
 
 def _undetermined(evidence: str) -> StageFailure:
-    advice = "use four or more matches of one plane, or of a rotating camera, no three of them on one line"
-    return StageFailure("the matches do not determine a homography", evidence, advice)
+    return StageFailure.of("undetermined-homography", evidence)
 
 
 def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
@@ -289,11 +288,7 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
         lambda largest: float(np.minimum(largest * unit, 1.0).max(axis=0).mean()), _SAMPLE,
     )  # fmt: skip
     if found is not None:
-        raise StageFailure(
-            "chance explains the inliers of the homography",
-            f"{found} of {len(points)} different matches agree with the best of {samples} samples",
-            "use more matches; a threshold_px of three times the noise, or None if all are right, keeps more",
-        )
+        raise StageFailure.of("homography-by-chance", found, len(points), samples)
 
 
 @kernel

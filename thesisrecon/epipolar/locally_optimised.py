@@ -147,11 +147,10 @@ class LocallyOptimisedRansac:
     def _finish(self, frame: PairFrame, found: _Candidate, points: F64) -> FundamentalFit:
         r, noise = found.residuals, found.noise
         if noise is None:
-            raise StageFailure(
-                "no epipolar geometry explains the matches",
+            raise StageFailure.of(
+                "no-epipolar-geometry",
                 f"no F of {found.samples} samples has {MINIMUM} or more of the {len(points)} matches within "
                 f"{self.threshold_px:g} px",
-                "check that the images overlap and that the matches are correct",
             )
         # The tail of the noise ends at twice the threshold.
         widest = max(noise.core_limit, 2.0 * self.threshold_px * frame.scale)

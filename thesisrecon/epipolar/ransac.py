@@ -40,11 +40,7 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     # The triangular factor has the singular values and right vectors of all rows, and nine rows.
     _, s, Vt = np.linalg.svd(np.linalg.qr(A, mode="r"))
     if not s[7] > (1e-12 if normalized else 1e-16) * s[0]:
-        raise StageFailure(
-            "the matches do not determine the fundamental matrix",
-            f"the equations of {len(xy1)} matches have rank below 8",
-            "add matches off the dominant plane",
-        )
+        raise StageFailure.of("undetermined-fundamental", len(xy1))
     F = Vt[8].reshape(3, 3)
     return unit_norm(T2.T @ (enforce_rank_two(F) if rank_two else F) @ T1)
 
@@ -291,10 +287,8 @@ def _search_and_refine(
     )
     needed = MINIMUM if known else 1
     if f is None or inliers.sum() < needed:
-        raise StageFailure(
-            "no epipolar geometry explains the matches",
-            f"none of {samples} samples has {needed} inliers among {len(xy1)} matches",
-            "check that the images overlap and that the matches are correct",
+        raise StageFailure.of(
+            "no-epipolar-geometry", f"none of {samples} samples has {needed} inliers among {len(xy1)} matches"
         )
     F = frame.matrix_in_pixels(f)
     sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=threshold_px, test=test)
@@ -323,10 +317,6 @@ def fit_seven(xy1: F64, xy2: F64) -> FundamentalFit:
     """Estimate F of seven matches; see :func:`thesisrecon.estimate_fundamental`."""
     solutions = estimate_seven_point(xy1, xy2)
     if not len(solutions):
-        raise StageFailure(
-            "the seven matches do not determine the fundamental matrix",
-            "their equations are dependent",
-            "choose seven matches in general position, no four of them in one plane of the scene",
-        )
+        raise StageFailure.of("dependent-seven-matches")
     every = np.ones(len(xy1), dtype=bool)
     return FundamentalFit(solutions[0], every, np.nan, np.full((9, 9), np.nan), 0, solutions[1:])

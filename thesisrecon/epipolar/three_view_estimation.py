@@ -34,8 +34,6 @@ WEAK = 0.4
 SAME_NOISE, FAMILY = 1.25, 6
 _SEARCHED = 12  # minimum number of points for the search for wrong ones
 NO_POINTS, NO_SEGMENTS = np.zeros((0, 2)), np.zeros((3, 0, 2, 2))
-UNDETERMINED = "the matches do not determine the trifocal tensor"
-REMEDY = "use matches off one plane from three different positions, and check for wrong matches"
 _State = tuple[F64, F64]
 
 
@@ -81,18 +79,14 @@ def fit_trifocal(
     n, m = points.shape[1], segments.shape[1]
     if 4 * n + 2 * m < NEEDED_EQUATIONS and n < len(inliers):
         evidence = f"only {n} of {len(inliers)} points agree with the epipolar geometry of all pairs of views"
-        raise StageFailure(UNDETERMINED, evidence, REMEDY)
+        raise StageFailure.of("undetermined-tensor", evidence)
     if 4 * n + 2 * m < NEEDED_EQUATIONS:
-        raise StageFailure(
-            "too few matches for the trifocal tensor",
-            f"found {n} points and {m} lines; 7 points, 13 lines or a mixture are needed",
-            "use images with more overlap",
-        )
+        raise StageFailure.of("few-trifocal-matches", n, m)
     try:
         equations = _tensor_equations(points, segments)
         T = _minimize_algebraic_error(equations, equations.solve())
     except ValueError as error:
-        raise StageFailure(UNDETERMINED, "they are in a degenerate configuration", REMEDY) from error
+        raise StageFailure.of("undetermined-tensor", "they are in a degenerate configuration") from error
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
     fit = _minimize_reprojection_error(problem, equations)
     _require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
@@ -254,7 +248,7 @@ def _require_determined(fit: TrifocalFit, equations: _TensorEquations, xy: F64) 
             f"the noise of {sigma:.2g} px"
         )
     if found:
-        raise StageFailure(UNDETERMINED, "; ".join(found), REMEDY)
+        raise StageFailure.of("undetermined-tensor", "; ".join(found))
 
 
 @dataclass(frozen=True)

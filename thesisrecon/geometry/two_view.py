@@ -241,16 +241,8 @@ def require_parallax_of_matches(
     if fits and parallax > _PARALLAX_PER_NOISE * noise + _MIN_PARALLAX_PX:
         return
     if not fits and parallax > most:
-        raise StageFailure(
-            "the fundamental matrix does not fit the matches",
-            f"their median distance from the epipolar lines is {off:.3g} px",
-            "estimate it from these matches, with the images in this order",
-        )
-    raise StageFailure(
-        "the images show no parallax: the camera only rotated, or the scene is a plane or too far away",
-        f"{what} explains 90 % of {len(xy1)} matches to {parallax:.2g} px; the noise is {noise:.2g} px",
-        f"take images from positions farther apart{advice}",
-    )
+        raise StageFailure.of("fundamental-of-other-matches", off)
+    raise StageFailure.of("no-parallax", advice, what, len(xy1), parallax, noise)
 
 
 def _homography_residuals(xy1: F64, xy2: F64) -> F64:

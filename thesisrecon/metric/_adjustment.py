@@ -139,12 +139,7 @@ def _shares_a_lens(model: MetricEstimate) -> B8:
 def _inlier_observations(model: MetricEstimate) -> Observations:
     t, k = model.tracks, np.flatnonzero(model.inlier)
     if len(k) < MIN_OBSERVATIONS:
-        raise StageFailure(
-            "the metric upgrade leaves too few inliers",
-            f"{counted(len(k), 'inlier observation')} at sufficient triangulation angles; at least "
-            f"{MIN_OBSERVATIONS} are needed",
-            "take images from more different places around the scene",
-        )
+        raise StageFailure.of("few-metric-inliers", counted(len(k), "inlier observation"), MIN_OBSERVATIONS)
     return Observations(t.view_index[k], t.point_index[k], t.xy[k])
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thesisrecon import records
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
@@ -21,14 +22,6 @@ from thesisrecon.metric._resection import MIN_POINTS, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
 from thesisrecon.optimize.bundle.scatter import BlockScatter, LinearisedFit, block_scatter, pose_uncertainty
 from thesisrecon.optimize.least_squares import noise_from_distances
-from thesisrecon.records import (
-    IntrinsicsPrior,
-    MetricResult,
-    Reconstruction,
-    SelfCalibration,
-    Tracks,
-    Upgrade,
-)
 
 MAX_REMAINING = 0.25
 """Largest cost of held-out observations of a richer camera model that is adopted, over the simple one's."""
@@ -54,9 +47,9 @@ class MetricRefinement:
     """Metric refinement of a calibrated projective reconstruction (6.7)."""
 
     def refine(
-        self, reconstruction: Reconstruction, calibration: SelfCalibration, *,
-        prior: IntrinsicsPrior, rng: np.random.Generator, threads: int = 1,
-    ) -> MetricResult:  # fmt: skip
+        self, reconstruction: records.Reconstruction, calibration: records.SelfCalibration, *,
+        prior: records.IntrinsicsPrior, rng: np.random.Generator, threads: int = 1,
+    ) -> records.MetricResult:  # fmt: skip
         """See `thesisrecon.config.MetricRefiner.refine`."""
         adjustment = MetricAdjustment(prior, lens_std=0.02, noise_floor_px=0.02, threads=threads)
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
@@ -73,8 +66,8 @@ class MetricRefinement:
 
 
 def _assess(
-    settled: _Settled, tracks: Tracks, calibration: SelfCalibration, reasons: tuple[str, ...]
-) -> MetricResult:
+    settled: _Settled, tracks: records.Tracks, calibration: records.SelfCalibration, reasons: tuple[str, ...]
+) -> records.MetricResult:
     """State the intervals of a final model with all ``tracks``, and check it."""
     final, sharing, enlarged, difference = settled
     model, adjustment, own, fit, scatter = final
@@ -102,13 +95,13 @@ def _assess(
         failed_checks.append(Notice("focal-by-camera-model", deviations))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
-    return MetricResult(
+    return records.MetricResult(
         _as_reconstruction(model, reasons), tuple(intervals), check, not failed_checks, tuple(failed_checks),
         warnings, (*enlarged, *limitations), report, poses,
     )  # fmt: skip
 
 
-def _contradiction(calibration: SelfCalibration) -> list[str]:
+def _contradiction(calibration: records.SelfCalibration) -> list[str]:
     """A sentence if the images contradicted the prior of the intrinsics in self-calibration."""
     report = calibration.identifiability
     if report is None or not report.prior_contradicted:
@@ -118,7 +111,7 @@ def _contradiction(calibration: SelfCalibration) -> list[str]:
 
 
 def _start(
-    reconstruction: Reconstruction, upgrade: Upgrade, adjustment: MetricAdjustment
+    reconstruction: records.Reconstruction, upgrade: records.Upgrade, adjustment: MetricAdjustment
 ) -> MetricEstimate | None:
     """Upgrade the core cameras and adjust them on projective inliers while the gate narrows."""
     model = _model.upgraded_model(reconstruction, upgrade, adjustment.prior)
@@ -196,7 +189,7 @@ def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> Met
 
 
 def _adjust_to_precise_points(
-    model: MetricEstimate, tracks: Tracks, adjustment: MetricAdjustment
+    model: MetricEstimate, tracks: records.Tracks, adjustment: MetricAdjustment
 ) -> MetricEstimate:
     """In large sets, select the points again by the residuals of the model adjusted to the selection."""
     if model.tracks.n_points == tracks.n_points:
@@ -211,19 +204,16 @@ def _adjust_to_precise_points(
     return model
 
 
-def _no_candidate(prior: IntrinsicsPrior, tried: int) -> StageFailure:
+def _no_candidate(prior: records.IntrinsicsPrior, tried: int) -> StageFailure:
     if not prior.focal_known.any():
-        reason, advice = "no candidate calibration gives a metric model", "take images from more directions"
-        return StageFailure(reason, f"{tried} were tried", advice)
+        return StageFailure.of("no-metric-model", tried)
     wide = float(prior.std[prior.focal_known, 0].max())
-    return StageFailure(
-        "the images contradict the given focal length",
-        f"none of {tried} calibrations near it (+- {wide:.1%}) fits them",
-        "leave it out, or set a larger focal_std_rel" if wide > 0.0 else "leave it out",
+    return StageFailure.of(
+        "focal-against-images", ", or set a larger focal_std_rel" if wide > 0.0 else "", tried, wide
     )
 
 
-def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> Reconstruction:
+def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> records.Reconstruction:
     registered = model.registered
     P = np.where(registered[:, None, None], model.cameras.P, 0.0)
     K = np.where(registered[:, None, None], model.cameras.K, 0.0)
@@ -232,4 +222,6 @@ def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> Recon
     norms = _model.residual_norms(model)
     sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
     seen = (registered, model.valid, model.inlier, model.tracks, model.sizes)
-    return Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion).with_reasons(MIN_POINTS)
+    return records.Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion).with_reasons(
+        MIN_POINTS
+    )

@@ -186,12 +186,10 @@ def resect_robust(
         raise StageFailure(Notice("few-resection-points"), f"{counted(len(X), 'point')}, {needed} are needed")
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if not extent[2 if K is None else 1] > _FLAT * extent[0]:
-        place = "in one plane" if K is None else "on one line"
-        raise StageFailure(
-            f"the points do not determine the camera: they lie {place}",
-            "",
-            "add points off it" + (", or give the calibration matrix K" if K is None else ""),
+        place, more = (
+            ("in one plane", ", or give the calibration matrix K") if K is None else ("on one line", "")
         )
+        raise StageFailure.of("undetermined-camera", place, more)
     if not np.ptp(xy, axis=0).any():
         raise _no_camera(f"all {len(xy)} pixels are equal")
     limit = threshold_px or _ANY_PX
@@ -236,16 +234,11 @@ def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples
         lambda largest: np.pi * largest / max(area, largest), size,
     )  # fmt: skip
     if found is not None:
-        raise StageFailure(
-            "chance explains the points of the camera",
-            f"{found} of {len(X)} agree with the best of {samples} samples",
-            "use more points; a threshold_px of three times the noise, or None if all are right, keeps more",
-        )
+        raise StageFailure.of("camera-by-chance", found, len(X), samples)
 
 
 def _no_camera(evidence: str) -> StageFailure:
-    advice = "check that points and pixels correspond, and that the points are in right-handed coordinates"
-    return StageFailure("no camera explains the points", evidence, advice)
+    return StageFailure.of("no-camera", evidence)
 
 
 def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:

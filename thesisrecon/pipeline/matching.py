@@ -462,9 +462,7 @@ def require_accepted_pair(pairs: Sequence[TwoView]) -> None:
     if not any(pair.accepted for pair in pairs):
         best = max(pairs, key=lambda pair: pair.inliers)
         tried, verified = counted(len(pairs), "pair"), counted(best.inliers, "verified match")
-        evidence = f"the best of {tried} has {verified}: {best.reason}"
-        advice = "add images with more overlap, all of one textured scene"
-        raise StageFailure("no two images could be matched", evidence, advice)
+        raise StageFailure.of("no-match", tried, verified, best.reason)
 
 
 def report_tracks(run: Run, tracks: Tracks) -> Tracks:

@@ -30,21 +30,13 @@ from thesisrecon.errors import (
     counted,
     unknown_word,
 )
+from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.io._files import read_json
 from thesisrecon.io._images import ImageSet
 from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
+from thesisrecon.runtime import _run_folder
 from thesisrecon.runtime._executors import Workers, available_threads
-from thesisrecon.runtime._run_folder import (
-    MANIFEST_FILE,
-    RUN_FILE,
-    ChangedRecord,
-    RunDirectory,
-    StageFolder,
-    is_running,
-    key_of,
-    read_record,
-)
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -89,32 +81,6 @@ class _StageLog:
     computed: int = 0
 
 
-class StoredRecords(Sequence[Any]):
-    """Records of items (item -> key) of a stage: up to ``max_bytes`` in memory, the others in their files."""
-
-    def __init__(self, folder: StageFolder, keys: Mapping[str, str], max_bytes: float) -> None:
-        self._folder, self._keys, self._left = folder, list(keys.items()), max_bytes
-        self._held: dict[int, Any] = {}
-
-    def hold(self, n: int, record: Any) -> None:
-        """Keep a record in memory if there is space."""
-        size = sum(value.nbytes for value in vars(record).values() if isinstance(value, np.ndarray))
-        if size <= self._left:
-            self._held[n], self._left = record, self._left - size
-
-    def __len__(self) -> int:
-        return len(self._keys)
-
-    def __getitem__(self, n: Any) -> Any:
-        if isinstance(n, slice):
-            return [self[k] for k in range(*n.indices(len(self)))]
-        item, key = self._keys[n]
-        record = self._held.get(n % len(self._keys))
-        if record is None and (record := self._folder.load(item, key)) is None:
-            raise UsageError(Notice("record-lost", self._folder.path / f"{item}.npz"))
-        return record
-
-
 @dataclass
 class Run:
     """Settings and state of one run."""
@@ -122,7 +88,7 @@ class Run:
     config: PipelineConfig
     seed: int
     workers: Workers
-    directory: RunDirectory
+    directory: _run_folder.RunDirectory
     progress: Progress
     title: str  #: title of the report
     images_folder: Path | None = None  #: folder of all images; None: several folders, or images in memory
@@ -136,7 +102,7 @@ class Run:
     started: float = field(default_factory=time.perf_counter, init=False)
     _stage: str = field(default="", init=False)  # the one being computed
 
-    def inside(self, directory: RunDirectory) -> Run:
+    def inside(self, directory: _run_folder.RunDirectory) -> Run:
         """A run of a part of the images in a folder of its own, by the same workers."""
         return replace(self, directory=directory, title=f"{self.title}, {directory.path.name}")
 
@@ -174,7 +140,7 @@ class Run:
         for item, key in keys.items():
             try:
                 record = folder.load(item, key)
-            except ChangedRecord:
+            except _run_folder.ChangedRecord:
                 record = None
                 changed.append(f"{FOLDERS[stage]}/{item}.npz")
             if record is not None:
@@ -188,7 +154,7 @@ class Run:
         self, stage: str, keys: Mapping[str, str], function: Callable[..., Sequence[Any]],
         batches: Callable[[Sequence[int]], Iterable[Batch]], *, max_bytes: float = np.inf,
         silent: bool = False, here: bool = False,
-    ) -> StoredRecords:  # fmt: skip
+    ) -> Sequence[Any]:  # fmt: skip
         """The records of all items (item -> key) of a stage, missing ones computed by the workers.
 
         Records beyond ``max_bytes`` are read when used; ``here``: in threads, for tasks with large arguments.
@@ -197,12 +163,18 @@ class Run:
         with self.clock(stage) as log:
             log.keys.update(keys)
             folder, names, missing = self.directory.stage(FOLDERS[stage]), list(keys), list[int]()
-            records = StoredRecords(folder, keys, max_bytes)
+
+            def stored(n: int) -> Any:
+                if (record := folder.load(names[n], keys[names[n]])) is None:
+                    raise UsageError(Notice("record-lost", folder.path / f"{names[n]}.npz"))
+                return record
+
+            records = OnDemand(len(names), stored, max_bytes)
             for n, record in enumerate(self._loaded(stage, keys)):
                 if record is None:
                     missing.append(n)
                 else:
-                    records.hold(n, record)
+                    records.keep(n, record)
             done = len(names) - len(missing)
             progress(stage, done, len(names))
             submitted: list[Sequence[int]] = []
@@ -215,7 +187,7 @@ class Run:
             def finished(k: int, found: Sequence[Any]) -> None:
                 nonlocal done
                 for n, record in zip(submitted[k], found, strict=True):
-                    records.hold(n, record)
+                    records.keep(n, record)
                     folder.save(names[n], keys[names[n]], record)
                 done, log.computed = done + len(found), log.computed + len(found)
                 progress(stage, done, len(names))
@@ -256,7 +228,7 @@ class Run:
 
     def key(self, stage: str, *parts: Any) -> str:
         """Cache key of an item; ``parts`` are everything it depends on: settings, code and inputs."""
-        return key_of(FOLDERS[stage], *parts)
+        return _run_folder.key_of(FOLDERS[stage], *parts)
 
 
 class FrontEnd(Protocol):
@@ -332,9 +304,8 @@ class Job:
             unread = [f"{name} {reason}" for name, reason in self.inputs.refused.items()]
             more = [f"and {len(unread) - 3} more"] if len(unread) > 3 else []
             wanted = f"at least {'two different ones are' if needed == 2 else 'one is'} needed"
-            reason = counted(found, "usable image") if found else "no usable images"
             evidence = "; ".join([wanted, *unread[:3], *more])
-            raise StageFailure(reason, evidence, "add images of the scene from other places")
+            raise StageFailure.of("one-image" if found else "no-images", evidence)
 
 
 def name_images(text: str, names: Sequence[str]) -> str:
@@ -363,7 +334,7 @@ def start_run(
     seed = _checked_seed(seed)
     workers = Workers(options.get("threads") or available_threads(), options.get("executor", "local"))
     shared = options.get("shared")
-    directory = RunDirectory(Path(out), None if shared is None else Path(shared))
+    directory = _run_folder.RunDirectory(Path(out), None if shared is None else Path(shared))
     report = progress or (lambda *_: None)
     run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
     return until, run, bool(options.get("overwrite", False))
@@ -371,20 +342,20 @@ def start_run(
 
 def run_position(folder: Path) -> str:
     """One sentence: running or interrupted, the stage, the items done, the time left; empty without a run."""
-    content = read_json(folder / RUN_FILE)
+    content = read_json(folder / _run_folder.RUN_FILE)
     if not isinstance(content, dict):
         return ""
     stage, items, since = _latest_stage(folder)
     total = len(content.get("images", ())) if stage == "features" else 0
     if stage == "matches":
-        manifest = read_json(folder / FOLDERS["pairs"] / MANIFEST_FILE)
+        manifest = read_json(folder / FOLDERS["pairs"] / _run_folder.MANIFEST_FILE)
         keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
-        choice = read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
+        choice = _run_folder.read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
         total = 0 if choice is None else len(choice.pairs)
     where = f"{stage} begins" if not items else f"{stage}, {counted(len(items), 'item')} done"
     if items and total:
         where = f"{stage}, {len(items)} of {total} done" if len(items) < total else f"{stage} is done"
-    if not is_running(folder):
+    if not _run_folder.is_running(folder):
         return f"interrupted: {where}; repeat the command to resume"
     left = _seconds_left(items, total, max(since, (folder / LOCK_FILE).stat().st_mtime))
     return f"running: {where}" + (f", about {_in_words(left)} left in this stage" if left else "")
@@ -392,7 +363,7 @@ def run_position(folder: Path) -> str:
 
 def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
     """The last stage that was written to, the times of its items, and when the one before it ended."""
-    started = ended = (folder / RUN_FILE).stat().st_mtime
+    started = ended = (folder / _run_folder.RUN_FILE).stat().st_mtime
     found = ("images", list[float](), ended)
     for stage, name in FOLDERS.items():
         every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
@@ -400,7 +371,7 @@ def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
         times = sorted(when for when in every if when >= started)
         if times:
             found = (stage, times, ended)
-            manifest = folder / name / MANIFEST_FILE
+            manifest = folder / name / _run_folder.MANIFEST_FILE
             ended = max(ended, manifest.stat().st_mtime if manifest.exists() else times[-1])
     return found
 

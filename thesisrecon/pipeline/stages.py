@@ -191,9 +191,7 @@ def report_depth_maps(job: Job, maps: Sequence[DepthMap]) -> None:
     metrics = {"median_share_known": float(np.median([count / size for _, count, size in known]))}
     job.run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
     if not depths:
-        evidence = f"none of {len(known)} views agrees with another on any surface"
-        advice = "add images with more overlap of a textured scene"
-        raise StageFailure("no depth was found", evidence, advice)
+        raise StageFailure.of("no-depth", len(known))
 
 
 def build_model(

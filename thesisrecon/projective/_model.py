@@ -85,12 +85,7 @@ def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
     if min(shares) >= NO_PARALLAX or all(kind in _NO_PARALLAX_REASONS for kind in kinds):
         usual = "the camera only rotates, hardly moves, or sees one plane"
         meaning = _NO_PARALLAX_REASONS.get(kinds.most_common(1)[0][0], usual)
-        raise StageFailure(
-            f"the images show no parallax: {meaning}",
-            f"in the least planar of {counted(len(shares), 'pair')} a homography explains "
-            f"{min(shares):.0%} of the matches",
-            "walk around the scene between images, and include objects at different depths",
-        )
+        raise StageFailure.of("no-pair-with-parallax", meaning, counted(len(shares), "pair"), min(shares))
 
 
 def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:

@@ -128,11 +128,7 @@ class Factorization:
         ranked = _model.rank_initial_pairs(tracks, pairs)
         _model.require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
-            found = f"{len(ranked)} of {counted(len(pairs), 'image pair')} accepted"
-            raise StageFailure(
-                "no initial pair is left for the factorization", found,
-                "take images that overlap by more than half and show texture",
-            )  # fmt: skip
+            raise StageFailure.of("no-pair-for-factorization", len(ranked), counted(len(pairs), "image pair"))
         selected, keep = _model.working_tracks(tracks, pairs, points_per_view=self.growth.points_per_view)
         model = self._core(selected, pairs, ranked[attempt], sizes)
         self.growth.complete(model, pairs, rng)

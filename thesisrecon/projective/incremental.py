@@ -106,9 +106,7 @@ class IncrementalProjective:
         inside = [pair for pair in pairs if core[pair.i] and core[pair.j]]
         ranked = _model.rank_initial_pairs(tracks, inside)
         if not ranked:
-            found = f"none of {counted(len(pairs), 'pair')} was verified"
-            advice = "take images that overlap by more than half and show texture"
-            raise StageFailure("no image pair was accepted", found, advice)
+            raise StageFailure.of("no-accepted-pair", counted(len(pairs), "pair"))
         _model.require_pair_with_parallax(pairs)
         if attempt >= len(ranked):
             tried = f"all {len(ranked)} accepted image pairs were tried"

@@ -127,16 +127,14 @@ def require_cameras_of_full_rank(P: F64) -> None:
 
 
 def cannot_be_calibrated(evidence: str) -> StageFailure:
-    advice = "take images from different positions"
-    return StageFailure("the projective cameras cannot be calibrated", evidence, advice)
+    return StageFailure.of("cameras-without-calibration", evidence)
 
 
 def normalized_frame(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ReferenceFrame:
     """Return a frame that absorbs the prior aspect and principal point: K = diag(f, f, 1) if they hold."""
     n = int(reconstruction.registered.sum())
     if n < 3:
-        needed = "self-calibration needs at least 3 registered images"
-        raise StageFailure(needed, f"{n} were registered", "add images with more overlap")
+        raise StageFailure.of("few-views-to-calibrate", n)
     unit = pixel_from_unit(reconstruction.sizes)
     unit[:, 1, 1] *= prior.mean[:, 1]
     unit[:, :2, 2] = prior.mean[:, 3:5]

@@ -345,11 +345,7 @@ def _no_candidate_failure(frame: ReferenceFrame, reconstruction: Reconstruction,
         # All candidates are near the given focal length, so the advice to give one does not help here.
         focal = frame.prior.mean[given, 0]
         values = f"{focal.min():.0f}" if np.ptp(focal) < 0.5 else f"{focal.min():.0f} to {focal.max():.0f}"
-        return StageFailure(
-            "self-calibration found no solution near the given focal length",
-            f"{values} px (+- {frame.prior.std[given, 0].max():.1%}) at working size was given; {evidence}",
-            "the images contradict it: omit it, or set a larger focal_std_rel",
-        )
+        return StageFailure.of("no-calibration-near-focal", values, frame.prior.std[given, 0].max(), evidence)
     sentences = identifiability_without_calibration(reconstruction, frame.prior).sentences
     advice = "; ".join(sentences) or "take images from more directions and rotate the camera between them"
     return StageFailure(Notice("self-calibration"), evidence, advice)

@@ -16,14 +16,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.strata import calibration_from_image
 from thesisrecon.optimize.least_squares import central_differences
-from thesisrecon.selfcalibration._frame import (
-    HOMOGRAPHY_NOISE,
-    ConicConstraints,
-    ProjectiveScene,
-    ReferenceFrame,
-    SolverUnknowns,
-    infinite_homographies,
-)
+from thesisrecon.selfcalibration import _frame
 from thesisrecon.selfcalibration._refinement import (
     ENTRY_WEIGHT,
     UPPER,
@@ -52,7 +45,7 @@ def _transfer_matrix(M: F64) -> F64:
     return quadratic_rows(M[..., UPPER[0]].swapaxes(-1, -2), M[..., UPPER[1]].swapaxes(-1, -2))
 
 
-def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
+def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) -> F64:
     """Return rows (B, M, 6) in the entries 11, 12, 13, 22, 23, 33 of w in the reference view.
 
     H (B, R, 3, 3) of determinant 1 or NaN (no row); ``focals`` (B, R) are unit-free estimates: dividing the
@@ -68,7 +61,7 @@ def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
     carried[bad] = 0.0
     std = np.repeat(constraints.std[None], len(H), axis=0)
     std[..., :3] /= focals[..., None]
-    weight = HOMOGRAPHY_NOISE / np.hypot(std, HOMOGRAPHY_NOISE)
+    weight = _frame.HOMOGRAPHY_NOISE / np.hypot(std, _frame.HOMOGRAPHY_NOISE)
     half_aspect = (carried[..., 0, :] - carried[..., 3, :]) / 2.0
     known = np.stack([carried[..., 1, :], carried[..., 2, :], carried[..., 4, :], half_aspect], axis=2)
     later = np.flatnonzero(constraints.first != np.arange(H.shape[1]))
@@ -80,7 +73,7 @@ def _conic_equations(H: F64, constraints: ConicConstraints, focals: F64) -> F64:
     )  # fmt: skip
 
 
-def solve_conic_batch(H: F64, constraints: ConicConstraints) -> tuple[F64, F64]:
+def solve_conic_batch(H: F64, constraints: _frame.ConicConstraints) -> tuple[F64, F64]:
     """Solve for the conics of B planes from their homographies (B, R, 3, 3), without reweighting.
 
     Return squared focal lengths (B,) of the reference view and the residuals (B, M) over the second smallest
@@ -116,7 +109,7 @@ class ImageConic:
         return bool(s[4] > 1e-7 * max(s[0], 1e-3) and s[4] > 2.0 * s[5])
 
 
-def solve_conic(H: F64, constraints: ConicConstraints, *, orthogonal: F64 | None = None) -> ImageConic:
+def solve_conic(H: F64, constraints: _frame.ConicConstraints, *, orthogonal: F64 | None = None) -> ImageConic:
     """Solve for the conic by SVD, reweighted by the estimated focals; x' w y = 0 for ``orthogonal`` pairs."""
     focals = np.ones((1, len(H)))
     conic = ImageConic(np.eye(3), np.zeros(6))
@@ -162,7 +155,7 @@ class LinearAbsoluteConic:
     With a constant K and no other prior the equations are w* = H w* H', else the linear constraints on w_j.
     """
 
-    def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
+    def calibrations(self, scene: _frame.ProjectiveScene, plane: F64) -> F64:
         """Unit-free calibrations (R, 3, 3) of a plane p (3,); ``StageFailure`` without a unique conic."""
         frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
@@ -177,11 +170,7 @@ class LinearAbsoluteConic:
             raise _undetermined_failure(frame, H, conic)
         if not conic.definite:
             values = np.linalg.eigvalsh(conic.w)
-            raise StageFailure(
-                "the image of the absolute conic is not that of a real camera",
-                f"its eigenvalues are {values[0]:.2e}, {values[1]:.2e} and {values[2]:.2e}, not all positive",
-                "check the plane at infinity and the prior of the intrinsics: one of them is wrong",
-            )
+            raise StageFailure.of("imaginary-camera", values[0], values[1], values[2])
         K = np.array([calibration_from_image(w) for w in transferred_conics(H, conic.w)])
         return _apply_known_values(scene.unknown, K)
 
@@ -194,7 +183,7 @@ class FixedPlaneQuadric:
     focal_range = (0.3, 10.0)
     starts = 9
 
-    def calibrations(self, scene: ProjectiveScene, plane: F64) -> F64:
+    def calibrations(self, scene: _frame.ProjectiveScene, plane: F64) -> F64:
         """See `thesisrecon.selfcalibration.absolute_conic.LinearAbsoluteConic.calibrations`."""
         unknown, frame = scene.unknown, scene.frame
         H = _homographies(frame, plane)
@@ -206,7 +195,7 @@ class FixedPlaneQuadric:
         def residuals(batch: F64) -> F64:
             K = unknown.calibrations(batch)
             data = dual_image_residuals(frame, K, plane[None]).reshape(len(batch), -1)
-            return np.concatenate([data, HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
+            return np.concatenate([data, _frame.HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
 
         nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
         found, cost = minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
@@ -217,15 +206,15 @@ class FixedPlaneQuadric:
         return np.asarray(unknown.calibrations(best[None])[0], dtype=np.float64)
 
 
-def _homographies(frame: ReferenceFrame, plane: F64) -> F64:
-    H = infinite_homographies(frame, plane[None])[0]
+def _homographies(frame: _frame.ReferenceFrame, plane: F64) -> F64:
+    H = _frame.infinite_homographies(frame, plane[None])[0]
     if not np.isfinite(H).all():
         view = frame.views[~np.isfinite(H).all(axis=(1, 2))][0]
         raise StageFailure(Notice("plane-through-camera"), f"image #{view} has no infinite homography")
     return np.asarray(H, dtype=np.float64)
 
 
-def _apply_known_values(unknown: SolverUnknowns, K: F64) -> F64:
+def _apply_known_values(unknown: _frame.SolverUnknowns, K: F64) -> F64:
     """Return calibrations (R, 3, 3) with known values inserted and shared values averaged."""
     f = K[:, 0, 0]
     values = np.column_stack([np.log(f), np.log(K[:, 1, 1] / f), K[:, 0, 1], K[:, 0, 2], K[:, 1, 2]])
@@ -246,21 +235,15 @@ def _largest_rotation(H: F64) -> tuple[float, F64]:
     return float(angle.max()), np.asarray(axis / np.linalg.norm(axis))
 
 
-def _undetermined_failure(frame: ReferenceFrame, H: F64, conic: ImageConic | None) -> StageFailure:
+def _undetermined_failure(frame: _frame.ReferenceFrame, H: F64, conic: ImageConic | None) -> StageFailure:
     angle, axis = _largest_rotation(H)
     found = "the criterion has a flat direction"
     if conic is not None:
         s = conic.singular_values
         found = f"singular values {s[4] / max(s[0], 1e-300):.1e} and {s[5] / max(s[0], 1e-300):.1e} of 1"
     if angle < 1.0:
-        reason = "the cameras do not rotate, so the plane at infinity does not determine the calibration"
-        evidence = f"largest rotation {angle:.1f} deg; {found}"
-        return StageFailure(reason, evidence, "rotate the camera between images")
+        return StageFailure.of("no-rotation", angle, found)
     pixel = frame.pixel_from_unit[frame.views[frame.reference]] @ axis
     with np.errstate(divide="ignore", invalid="ignore"):
         place = pixel[:2] / pixel[2]
-    return StageFailure(
-        "a one-parameter family of calibrations fits the plane at infinity: all rotations have the same axis",
-        f"{found}; largest rotation {angle:.1f} deg with its axis at ({place[0]:.0f}, {place[1]:.0f}) px",
-        "rotate the camera about a second axis, or assume square pixels without skew",
-    )
+    return StageFailure.of("one-rotation-axis", found, angle, place[0], place[1])

@@ -24,13 +24,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.records import Reconstruction
-from thesisrecon.selfcalibration._frame import (
-    ConicConstraints,
-    PlaneCandidates,
-    ProjectiveScene,
-    ReferenceFrame,
-    infinite_homographies,
-)
+from thesisrecon.selfcalibration import _frame
 from thesisrecon.selfcalibration._refinement import minimize_batch
 from thesisrecon.selfcalibration.absolute_conic import solve_conic_batch
 
@@ -80,7 +74,7 @@ class CheiralityRegion:
 
     @classmethod
     def of(
-        cls, frame: ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
+        cls, frame: _frame.ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
     ) -> CheiralityRegion:
         """Compute the region by up to ``MAX_POINTS`` points of three views or more; no polytopes below eight.
 
@@ -191,20 +185,16 @@ class CheiralitySearch:
     max_candidates = 10  # maximum number of local minima
     refine_iterations = 15  # descent steps from each of them
 
-    def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
+    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> _frame.PlaneCandidates:
         """Candidate planes at infinity, best first; ``StageFailure`` if there is none."""
         planes, _ = self.search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):
-            raise StageFailure(
-                "the cheirality search found no plane at infinity",
-                "no plane keeps points and cameras on one side and gives a real image of the absolute conic",
-                "use the default preset, which tolerates wrong points",
-            )
-        return PlaneCandidates(planes)
+            raise StageFailure.of("no-cheiral-plane")
+        return _frame.PlaneCandidates(planes)
 
     def search(
-        self, frame: ReferenceFrame, reconstruction: Reconstruction, constraints: ConicConstraints,
-        rng: np.random.Generator,
+        self, frame: _frame.ReferenceFrame, reconstruction: Reconstruction,
+        constraints: _frame.ConicConstraints, rng: np.random.Generator,
     ) -> tuple[F64, F64]:  # fmt: skip
         """Planes p (B, 3), best first, and unit-free focal lengths (B,) of the reference camera."""
         region = CheiralityRegion.of(frame, reconstruction, rng)
@@ -216,12 +206,12 @@ class CheiralitySearch:
         return planes[kept], np.sqrt(f2[kept])
 
     def _minima(
-        self, frame: ReferenceFrame, constraints: ConicConstraints, polytope: Polytope
+        self, frame: _frame.ReferenceFrame, constraints: _frame.ConicConstraints, polytope: Polytope
     ) -> tuple[F64, F64, F64]:
         """Return planes, squared focal lengths and scores of the refined local minima of the grid."""
 
         def scan(v: F64) -> tuple[F64, F64]:
-            H = infinite_homographies(frame, polytope.reference_planes(v))
+            H = _frame.infinite_homographies(frame, polytope.reference_planes(v))
             f2, residuals = solve_conic_batch(H, constraints)
             return f2, np.where(polytope.contains(v)[:, None], residuals, np.nan)
 
@@ -290,16 +280,12 @@ class ModulusConstraint:
     max_candidates = 21  # maximum number of solutions: three views have up to 21, four or more have one
     max_wrong_side_ratio = 0.02  # largest accepted share of points and cameras on the wrong side of a plane
 
-    def locate(self, scene: ProjectiveScene, rng: np.random.Generator) -> PlaneCandidates:
+    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> _frame.PlaneCandidates:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""
         frame = scene.frame
         pairs = _pairs_of_constant_cameras(scene.constraints.first)
         if len(pairs) < 3:
-            raise StageFailure(
-                "the modulus constraint needs three images of one camera with constant intrinsics",
-                f"{counted(len(pairs), 'pair')} of views share all intrinsics",
-                "set constant intrinsics, or use another method for the plane at infinity",
-            )
+            raise StageFailure.of("few-images-of-one-camera", counted(len(pairs), "pair"))
         region = CheiralityRegion.of(frame, scene.reconstruction, rng)
         starts = region.sample(self.starts, rng)
         coefficients = _modulus_coefficients(frame.A, frame.a, pairs)
@@ -311,12 +297,8 @@ class ModulusConstraint:
         planes, cost = planes[fit], cost[fit]
         kept = distinct_planes(planes, cost)[: self.max_candidates]
         if not len(planes):
-            raise StageFailure(
-                "the modulus constraint has no solution with the scene on one side of the plane at infinity",
-                f"{len(starts)} starts over {len(pairs)} pairs of views",
-                "use another method for the plane at infinity",
-            )
-        return PlaneCandidates(planes[kept])
+            raise StageFailure.of("no-modulus-solution", len(starts), len(pairs))
+        return _frame.PlaneCandidates(planes[kept])
 
 
 def _pairs_of_constant_cameras(first: I64) -> I64:

@@ -153,9 +153,7 @@ class KruppaEquations:
         frame = _frame.normalized_frame(reconstruction, prior)
         pairs = _overlapping_pairs(frame, reconstruction, self.min_common_points)
         if len(pairs.i) < 2:
-            needed = "the Kruppa equations need at least 2 pairs of images"
-            found = f"{counted(len(pairs.i), 'pair')} with at least {self.min_common_points} common points"
-            raise StageFailure(needed, found, "add images with more overlap")
+            raise StageFailure.of("few-kruppa-pairs", counted(len(pairs.i), "pair"), self.min_common_points)
         unknown = _frame.solver_unknowns(frame, prior)
         candidates = []
         for K, K_std, _ in self._solutions(pairs, unknown, len(frame.views)):
@@ -176,12 +174,10 @@ class KruppaEquations:
                 found.append((K, K_std, residual))
         if found:
             return sorted(found, key=lambda solution: solution[2])
-        raise StageFailure(
-            "the Kruppa equations do not determine the focal length",
+        raise StageFailure.of(
+            "undetermined-kruppa-focal",
             f"{counted(len(pairs.i), 'pair')} of views agree with "
             + ("any focal length" if weakest > 1.0 else f"focal lengths within {weakest:.0%}"),
-            "vary the distance to the scene and the point that the cameras look at (cameras on a sphere that "
-            "look at its centre are critical), or use the projective cameras too, as nonlinear-quadric does",
         )
 
     def _scan(self, pairs: _Pairs, n: int) -> list[float]:
@@ -225,9 +221,5 @@ def calibrate_from_fundamentals(F: F64, sizes: I64) -> F64:
     focal = [float(unit[0, 0] * K[0, 0, 0]) for K, _, _ in (best, *others)]
     for f, (_, _, residual) in zip(focal[1:], others, strict=True):
         if abs(np.log(f / focal[0])) > _SAME and residual <= max(_ALIKE * best[2], _ROUNDING):
-            raise StageFailure(
-                "the Kruppa equations have several solutions",
-                f"focal lengths of {focal[0]:.0f} and {f:.0f} px fit {counted(len(F), 'pair')} equally well",
-                "add pairs of images, or calibrate from projective cameras (self_calibrate)",
-            )
+            raise StageFailure.of("several-kruppa-solutions", focal[0], f, counted(len(F), "pair"))
     return np.asarray(unit @ best[0][0])

@@ -371,11 +371,8 @@ class ParallelLines:
                 scores.append(1.0 / float(counts[chosen].min()))
                 points.append(v)
         if not planes:
-            raise StageFailure(
-                "no three directions of parallel lines give a plane with the scene on one side",
-                f"{len(X)} directions, with {', '.join(str(c) for c in counts) or 'no'} segments, in "
-                f"{len(frame.views)} images",
-                "give vanishing points, or use another method for the plane at infinity",
+            raise StageFailure.of(
+                "no-plane-of-directions", len(X), ", ".join(str(c) for c in counts) or "no", len(frame.views)
             )
         order = np.argsort(scores, kind="stable")[: 1 if self.orthogonal_directions else self.max_candidates]
         return PlaneCandidates(np.array(planes)[order], self._orthogonal(points[order[0]]))
@@ -389,11 +386,7 @@ def _points_at_infinity(P: F64, v: F64) -> F64:
     found = [_triangulate_directions(P[None, seen[:, d]], v[None, seen[:, d], d]) for d in used]
     X = [point for points, determined in found for point in points[determined]]
     if len(X) < 3:
-        raise StageFailure(
-            "the plane at infinity needs three directions of parallel lines",
-            f"{len(X)} have vanishing points in two registered images that are not both epipoles",
-            "give the vanishing points of another direction, not parallel to the baseline",
-        )
+        raise StageFailure.of("few-parallel-directions", len(X))
     return np.stack(X)
 
 
@@ -414,12 +407,7 @@ def _null_plane(X: F64, *, finite: bool = False) -> F64:
     _, s, Vt = np.linalg.svd(unit_rows(X))
     ratio = float(s[2] / s[0]) if not finite or abs(Vt[-1, 3]) > 1e-9 else 0.0
     if not ratio > _MIN_SPREAD:
-        raise StageFailure(
-            "the directions of the parallel lines lie in one plane, so their vanishing points do not "
-            "determine the plane at infinity",
-            f"the third singular value is {ratio:.1e} of the first",
-            "give lines of a direction outside that plane",
-        )
+        raise StageFailure.of("directions-in-one-plane", ratio)
     return np.asarray(Vt[-1])
 
 

@@ -185,12 +185,11 @@ def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) ->
         raise ValueError(f"rectification needs a finite F (3, 3) that is not zero; got shape {F.shape}")
     if len(xy1) < MIN_MATCHES:
         evidence = f"{counted(len(xy1), 'match')}, at least {MIN_MATCHES} are needed"
-        advice = "match the images again, or rectify from cameras"
-        raise StageFailure("the pair has too few matches for rectification", evidence, advice)
+        raise StageFailure.of("few-matches-to-rectify", evidence)
     pencil, ratio = _pencil_of_fundamental(F, (size1, size2))
     if not ratio > 1e-9:
         evidence = f"the ratio of its singular values is {ratio:.1g}"
-        raise StageFailure("the fundamental matrix has rank 1", evidence, "estimate it from more matches")
+        raise StageFailure.of("fundamental-of-rank-one", evidence)
     require_parallax_of_matches(F, *matches, advice=", or rectify from cameras if the scene is a plane")
     return _complete(pencil, matches, None)
 
@@ -206,9 +205,7 @@ def pair_of_cameras(
     centres = dehomogenize(camera_centre(P))
     apart = float(np.linalg.norm(centres[1] - centres[0]))
     if not apart > 1e-12 * (1.0 + float(np.abs(centres).max())):
-        evidence = f"the distance of the centres is {apart:.1g}"
-        advice = "take images from different positions, or choose other views"
-        raise StageFailure("both cameras have the same centre", evidence, advice)
+        raise StageFailure.of("one-centre", apart)
     F = fundamental_from_cameras(P[0], P[1])
     if len(matches[0]) >= MIN_MATCHES:
         require_parallax_of_matches(F, *matches, at_infinity=infinite_homography(P[0], P[1]))
@@ -254,9 +251,7 @@ def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
     p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
     share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
     if max(share, 1.0 - share) < min_same_half:
-        evidence = f"only {100.0 * max(share, 1.0 - share):.0f} % of {len(xy1)} lie on corresponding halves"
-        advice = "the fundamental matrix or the matches are wrong; estimate them again"
-        raise StageFailure("matches lie on opposite halves of their epipolar lines", evidence, advice)
+        raise StageFailure.of("opposite-half-lines", 100.0 * max(share, 1.0 - share), len(xy1))
     return pencil if share >= 0.5 else replace(pencil, lines=pencil.lines * [[[1.0]], [[-1.0]]])
 
 
@@ -269,8 +264,7 @@ def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F
     X = (C[0] + steps[:, None, None] * rays).reshape(-1, 3)
     X = X[homogenize(X) @ P[1, 2] > 0.0]
     if len(X) == 0:
-        evidence = "their fields of view do not intersect"
-        raise StageFailure("no point is in front of both cameras", evidence, "choose another pair")
+        raise StageFailure.of("no-point-in-front")
     return (project(P[0], X), project(P[1], X)), pencil.normalization @ P
 
 
@@ -309,9 +303,7 @@ def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
     turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
     low, high = max(a, c + turn), min(b, d + turn)
     if not high > low:
-        evidence = "no half-plane through the baseline is visible in both"
-        advice = "the fundamental matrix is wrong, or the views do not overlap; choose another pair"
-        raise StageFailure("the images share no epipolar line", evidence, advice)
+        raise StageFailure.of("no-common-epipolar-line")
     return low, high
 
 
@@ -373,11 +365,10 @@ def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
     most = MAX_GROWTH * max(w * h for w, h in pair.pencil.sizes)
     if not width * height <= most:
         evidence = f"they need {width * height / 1e6:.3g} million pixels, the limit is {most / 1e6:.3g}"
-        advice = "rectify in polar coordinates, or choose views with less forward motion"
-        raise StageFailure("the rectified images are too distorted", evidence, advice)
+        raise StageFailure.of("distorted-rectification", evidence)
     if not min(width, height) >= 2.0:
         evidence = f"their common frame is {width:.3g} x {height:.3g} px"
-        raise StageFailure("the rectified images do not overlap", evidence, "choose views that overlap more")
+        raise StageFailure.of("no-rectified-overlap", evidence)
     return int(np.ceil(width)), int(np.ceil(height))
 
 

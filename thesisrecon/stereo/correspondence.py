@@ -115,9 +115,7 @@ def _searched_range(frame: Rectification, xy1: F64, xy2: F64) -> tuple[int, int]
     first, last = disparity_range(frame, xy1, xy2, margin=range_margin)
     first, last = max(first, 1 - frame.size[0]), min(last, frame.size[0] - 1)
     if not 0 <= last - first < MAX_DISPARITIES:
-        evidence = f"it is {first} to {last} px"
-        advice = "choose neighbours with a shorter baseline, or a smaller image size"
-        raise StageFailure("the disparity range of the pair cannot be searched", evidence, advice)
+        raise StageFailure.of("large-disparity-range", first, last)
     return first, last
 
 

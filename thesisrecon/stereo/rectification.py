@@ -107,7 +107,7 @@ def common_orientation(pair: EpipolarPair) -> PlanarRectification:
     Fusiello, Trucco and Verri (MVA 2000) use the viewing direction of the first camera; here it is the mean.
     """
     if pair.cameras is None:
-        raise StageFailure("a common orientation needs metric cameras", advice="rectify from F")
+        raise StageFailure.of("orientation-without-cameras")
     orientation = rotation_along_baseline(pair.cameras)
     return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(pair.cameras[:, :, :3])))
 
@@ -119,7 +119,7 @@ def rotation_along_baseline(P: F64) -> F64:
     axis = principal_ray(P).sum(axis=0)
     z = axis - (axis @ x) * x
     if not np.linalg.norm(z) > 1e-6:
-        raise StageFailure("both cameras look along the baseline", advice="rectify in polar coordinates")
+        raise StageFailure.of("views-along-baseline")
     z = z / np.linalg.norm(z)
     return np.stack([x, np.cross(z, x), z])
 
@@ -232,7 +232,7 @@ def _loop_zhang_line(pair: EpipolarPair) -> float:
     with np.errstate(all="ignore"):
         costs = variation(tried)
     if not np.isfinite(costs).any():
-        raise StageFailure("no line can be sent to infinity", advice="rectify in polar coordinates")
+        raise StageFailure.of("no-line-to-infinity")
     k, step = int(np.nanargmin(costs)), (high - low) / search
     bounds = max(low, tried[k] - step), min(high, tried[k] + step)
     found = scipy.optimize.minimize_scalar(variation, bounds=bounds, method="bounded")
@@ -251,8 +251,7 @@ def _admissible_lines(pair: EpipolarPair) -> tuple[float, float]:
     """Interval of phi whose line at infinity misses the common field of view."""
     low, high = pair.arc
     if not high - low < np.pi - 1e-6:
-        evidence = "every epipolar line crosses the common field of view"
-        raise StageFailure("the epipoles lie inside the images", evidence, "rectify in polar coordinates")
+        raise StageFailure.of("epipoles-inside")
     return high - 0.5 * np.pi, low + 0.5 * np.pi
 
 
@@ -261,9 +260,8 @@ def _require_in_front(pair: EpipolarPair, rows: F64) -> None:
     for side, (xy, samples) in enumerate(zip(pair.matches, pair.regions, strict=True)):
         third = homogenize(pair.pencil.normalized(side, np.concatenate([samples, xy]))) @ rows[side, 1]
         if not third.min() > 1e-6 * third.max():
-            reason = "the line sent to infinity crosses the images"
             evidence = "an epipole lies inside an image or at its border"
-            raise StageFailure(reason, evidence, "rectify in polar coordinates")
+            raise StageFailure.of("infinite-line-inside", evidence)
 
 
 def _affine_rows(pair: EpipolarPair, rows: F64) -> F64:
@@ -305,7 +303,7 @@ def _crop_and_scale(pair: EpipolarPair, H: F64) -> PlanarRectification:
         values.append(singular_values(homography_jacobians(H[side], pair.regions[side][inside])))
     found = np.concatenate(values)
     if len(found) == 0:
-        raise StageFailure("the rectified images do not overlap", advice="choose views that overlap more")
+        raise StageFailure.of("no-rectified-overlap", "")
     area = float(np.exp(-0.5 * np.mean(np.log(found[:, 0] * found[:, 1]))))
     scale = max(area, 1.0 / (MAX_SHRINK * float(found[:, 1].min())))
     size = frame_size(scale * (high - low).max(axis=0) + 1.0, pair)
@@ -316,8 +314,7 @@ def _crop_and_scale(pair: EpipolarPair, H: F64) -> PlanarRectification:
 def _mapped(H: F64, xy: F64) -> F64:
     xh = homogenize(xy) @ H.T
     if not (xh[:, 2] > 1e-9 * np.abs(xh[:, 2]).max(initial=0.0)).all() or np.linalg.det(H) <= 0.0:
-        reason = "the line sent to infinity crosses the images"
-        raise StageFailure(reason, advice="rectify in polar coordinates")
+        raise StageFailure.of("infinite-line-inside", "")
     return np.asarray(xh[:, :2] / xh[:, 2:])
 
 
@@ -593,10 +590,6 @@ def disparity_range(
     """First and last disparity to search, from matches; ``StageFailure`` if none is in the frame."""
     left, right = matches_in_frame(rectification, (xy1, xy2))
     if len(left) == 0:
-        raise StageFailure(
-            "the disparity range is unknown",
-            "no match is inside the rectified frame",
-            "check that the matches are pixels (x, y) of these images",
-        )
+        raise StageFailure.of("unknown-disparity-range")
     low, high = disparity_bounds(left[:, 0] - right[:, 0], margin=margin)
     return int(np.floor(low)) - 2, int(np.ceil(high)) + 2

@@ -336,7 +336,7 @@ class VolumetricFusion:
         longest_voxels = 16.0
         surface, std, voxel = self._fused(depth_maps, threads)
         if not len(surface.faces):
-            raise _nothing_to_fuse()
+            raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
         if self.tolerance:
             limit, longest = self.tolerance * np.minimum(std, max_std_voxels * voxel), longest_voxels * voxel
             surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
@@ -358,7 +358,7 @@ class VolumetricFusion:
             for m in chain.from_iterable(_certain_maps(maps, np.inf, pool))
         ]
         if not sum(map(len, footprints)):
-            raise _nothing_to_fuse()
+            raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
         voxel = self.voxel_px * float(np.median(np.concatenate(footprints)))
         while True:
             grid = _empty_grid(maps, voxel, pool)
@@ -396,14 +396,6 @@ def _measured(depth_map: DepthMap) -> FusionMap:
     depth, focal = _without_grazing(depth_map, slope), float(np.sqrt(K[0, 0] * K[1, 1]))
     return FusionMap(
         compose_camera(K, R, t), focal, depth, depth_map.std, _incidence_cosines(depth, K), slope
-    )
-
-
-def _nothing_to_fuse() -> StageFailure:
-    return StageFailure(
-        "no surface could be built",
-        "the depth maps contain no depths that agree",
-        "take images of a textured scene from positions closer to each other",
     )
 
 
@@ -460,7 +452,7 @@ def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> Vo
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
-        raise _nothing_to_fuse()
+        raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
     edge = SIDE * voxel
     origin = low - 2.0 * reach
     shape = np.ceil((high - low + 4.0 * reach) / edge).astype(int) + 1
@@ -572,7 +564,7 @@ class DepthSheets:
             shows.append(self._coverage_test(depth_map))
             sheets.append(_mesh.select_faces(sheet, np.asarray(~shown[sheet.faces].all(axis=1))))
         if not sum(len(sheet.faces) for sheet in sheets):
-            raise _nothing_to_fuse()
+            raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
         starts = np.cumsum([0, *(len(sheet.vertices) for sheet in sheets[:-1])])
         faces = [sheet.faces + start for sheet, start in zip(sheets, starts, strict=True)]
         vertices = np.concatenate([sheet.vertices for sheet in sheets])

@@ -34,12 +34,8 @@ REDUCED_BYTES = 2**28  #: reduced images in memory; more are made again when the
 
 
 def texture_mesh(
-    mesh: TexturedMesh,
-    views: Sequence[PinholeView],
-    *,
-    max_texels: int = MAX_TEXELS,
-    threads: int = 1,
-) -> TexturedMesh:
+    mesh: TexturedMesh, views: Sequence[PinholeView], *, max_texels: int = MAX_TEXELS, threads: int = 1,
+) -> TexturedMesh:  # fmt: skip
     """Texture a mesh at the resolution of the best view of each part, up to ``max_texels`` (2.6)."""
     min_scale = 0.05  # Smallest reduction of the images
     neighbours = face_neighbours(mesh.faces)
@@ -58,8 +54,7 @@ def texture_mesh(
         if size[0] * size[1] <= max_texels:
             break
         if scale <= min_scale:
-            need = f"{len(rectangles)} charts need {size[0] * size[1]} texels, the limit is {max_texels}"
-            raise StageFailure("the texture is too large", need, "increase max_texels")
+            raise StageFailure.of("large-texture", len(rectangles), size[0] * size[1], max_texels)
         scale = max(0.95 * scale * np.sqrt(max_texels / (size[0] * size[1])), min_scale)
     uv = xy + (offsets - rectangles[:, :2])[chart][:, None, :]
     if scale < 1.0:
@@ -133,13 +128,9 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequ
 
 
 def choose_views(
-    mesh: TexturedMesh,
-    views: Sequence[PinholeView],
-    buffers: Sequence[F32],
-    neighbours: I64,
-    *,
+    mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32], neighbours: I64, *,
     threads: int = 1,
-) -> I64:
+) -> I64:  # fmt: skip
     """Choose the view (M,) from which each face is textured, -1 if no view sees it.
 
     Quality relative to the best view is diffused over the faces that a view sees, and small charts join the
@@ -376,13 +367,9 @@ class SurfaceModel:
         return self.fusion.fuse(depth_maps, threads=threads)
 
     def color(
-        self,
-        surface: TexturedMesh,
-        views: Sequence[PinholeView],
-        *,
-        without: int | None = None,
+        self, surface: TexturedMesh, views: Sequence[PinholeView], *, without: int | None = None,
         threads: int = 1,
-    ) -> TexturedMesh:
+    ) -> TexturedMesh:  # fmt: skip
         """See `thesisrecon.config.ModelBuilder.color`."""
         if without is not None:
             used = [n for n, view in enumerate(views) if view.view != without]

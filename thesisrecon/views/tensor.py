@@ -16,20 +16,9 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from thesisrecon import arrays
 from thesisrecon._numba import kernel
-from thesisrecon.arrays import (
-    B8,
-    F32,
-    F64,
-    I16,
-    I32,
-    U8,
-    Record,
-    require_calibration,
-    require_finite,
-    require_rotations,
-    require_shapes,
-)
+from thesisrecon.arrays import B8, F32, F64, I16, I32, U8, Record
 from thesisrecon.camera import rq
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_centre
@@ -42,9 +31,9 @@ AGREE_PX = 1.5  #: tolerance of the forward-backward check: half a pixel of roun
 
 
 def _require_motion(R: F64, t: F64) -> None:
-    require_shapes("view synthesis", R=(R, (3, 3)), t=(t, (3,)))
-    require_finite("view synthesis", R, t)
-    require_rotations("view synthesis", R)
+    arrays.require_shapes("view synthesis", R=(R, (3, 3)), t=(t, (3,)))
+    arrays.require_finite("view synthesis", R, t)
+    arrays.require_rotations("view synthesis", R)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +46,8 @@ class CalibratedPair(Record):
     t: F64
 
     def __post_init__(self) -> None:
-        require_calibration("view synthesis", self.K1)
-        require_calibration("view synthesis", self.K2)
+        arrays.require_calibration("view synthesis", self.K1)
+        arrays.require_calibration("view synthesis", self.K2)
         _require_motion(self.R, self.t)
         if not np.linalg.norm(self.t) > 0.0:
             raise ValueError("CalibratedPair needs a translation other than 0")
@@ -93,9 +82,9 @@ def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> Ca
     contradicts it.
     """
     in_front = 0.75  # Share of matches that must lie in front of both cameras
-    require_finite("pair_from_fundamental", F, xy1, xy2)
-    require_calibration("view synthesis", K1)
-    require_calibration("view synthesis", K2)
+    arrays.require_finite("pair_from_fundamental", F, xy1, xy2)
+    arrays.require_calibration("view synthesis", K1)
+    arrays.require_calibration("view synthesis", K2)
     require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
@@ -103,11 +92,7 @@ def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> Ca
     shares = [_ratio_in_front(R, t, rays1, rays2) for R, t in candidates]
     best = int(np.argmax(shares))
     if not shares[best] >= in_front:
-        evidence = (
-            f"{100.0 * shares[best]:.0f} % of {len(xy1)} matches are, with the best of {len(shares)} cameras"
-        )
-        advice = "check the fundamental matrix and the intrinsics"
-        raise StageFailure("the scene is not in front of both cameras", evidence, advice)
+        raise StageFailure.of("scene-behind-cameras", 100.0 * shares[best], len(xy1), len(shares))
     return _pair_with(F, K1, K2, *candidates[best])
 
 
@@ -125,9 +110,7 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
     m, *mv = np.linalg.lstsq(design, (back @ wanted @ K1).ravel(), rcond=None)[0]
     left = m * (H + np.outer(e2, np.asarray(mv) / m)) @ K1
     if not np.linalg.det(left) > 0.0:
-        evidence = "no second camera that it allows is close to these intrinsics"
-        advice = "set another focal length, or none"
-        raise StageFailure("the fundamental matrix contradicts the intrinsics", evidence, advice)
+        raise StageFailure.of("fundamental-against-intrinsics")
     own, turn = rq(left)
     baseline: F64 = np.asarray(np.linalg.solve(own, e2), dtype=np.float64)
     baseline *= np.sign(baseline @ t) / np.linalg.norm(baseline)
@@ -163,7 +146,7 @@ class VirtualCamera(Record):
 
     def __post_init__(self) -> None:
         _require_motion(self.rotation, self.translation)
-        require_calibration("view synthesis", self.K)
+        arrays.require_calibration("view synthesis", self.K)
         if min(self.size) < 1:
             raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
 
@@ -385,9 +368,7 @@ class TensorSynthesis(Record):
             layers.append((sample(levels, source, threads=threads), front))
         seen: B8 = np.isfinite(layers[0][1]) | np.isfinite(layers[1][1])
         if not seen.mean() >= min_seen:
-            evidence = f"{100.0 * seen.mean():.1f} % of its image, needed {100.0 * min_seen:.0f} %"
-            advice = "move the camera less (in baselines) or rotate it back"
-            raise StageFailure("the virtual camera sees almost nothing of the scene", evidence, advice)
+            raise StageFailure.of("virtual-view-without-scene", 100.0 * seen.mean(), 100.0 * min_seen)
         rgb, inverse_depth = self._mixed(layers, self._share_of_second(moved[0]), step)
         filled = fill_holes(rgb, inverse_depth, step=step)
         return np.clip(np.rint(np.nan_to_num(filled)), 0.0, 255.0).astype(np.uint8)
@@ -432,20 +413,14 @@ def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: fl
 
 
 def prepare_synthesis(
-    pair: CalibratedPair,
-    images: tuple[ArrayLike, ArrayLike],
-    places: tuple[F32, F32],
-    *,
-    gain: ArrayLike = (1.0, 1.0, 1.0),
-    agree_px: float = AGREE_PX,
-) -> TensorSynthesis:
+    pair: CalibratedPair, images: tuple[ArrayLike, ArrayLike], places: tuple[F32, F32], *,
+    gain: ArrayLike = (1.0, 1.0, 1.0), agree_px: float = AGREE_PX,
+) -> TensorSynthesis:  # fmt: skip
     """Complete the correspondences of all pixels and prepare the images for any virtual camera."""
     known = _agreeing(places[0], places[1], agree_px), _agreeing(places[1], places[0], agree_px)
     for side in (0, 1):
         if not known[side].any():
-            evidence = f"no pixel of image {side + 1} has a known correspondence"
-            advice = "choose images that overlap more"
-            raise StageFailure("the images have no dense correspondence", evidence, advice)
+            raise StageFailure.of("no-dense-correspondence", side + 1)
     pairs = pair, pair.swapped
     sure = [np.where(known[side][..., None], places[side], np.nan) for side in (0, 1)]
     own = [seed_of_two(one, first=True) for one in pairs]
