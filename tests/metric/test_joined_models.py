@@ -11,6 +11,7 @@ from thesisrecon import Tracks
 from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.triangulation import triangulate_observations
+from thesisrecon.metric import _joined_models
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.records import Similarity
 
@@ -20,18 +21,20 @@ OWN = 60
 WORLD = Similarity(3.0, Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix(), np.ones(3))
 
 
-def row(common=10, singles=0, noise_px=NOISE_PX, seed=0, parts=2):
+def row(common=10, singles=0, noise_px=NOISE_PX, seed=0, parts=2, own=OWN, alike=False):
     """Models of parts of three cameras each in one row, which share points with the next part, and the truth.
 
     Each model but the first has a world of its own. Of ``singles`` more points the next part sees one image.
+    If the parts are ``alike``, they are rows before equal facades, and the common points are wrong.
     """
     rng, views = np.random.default_rng(seed), 3 * parts
-    centres = np.column_stack([np.arange(views), rng.normal(0, 0.2, (views, 2))])
+    centres = np.column_stack([np.arange(views) % (3 if alike else views), rng.normal(0, 0.2, (views, 2))])
     R = Rotation.from_euler("xyz", rng.normal(0, 4, (views, 3)), degrees=True).as_matrix()
     seen, X, view = [], [], np.arange(views)
     for first in range(0, views, 3):
-        for count, more in ((OWN, 0), (common, 3), (singles, 1)):
-            X.append(rng.uniform([first - 1, -1, 5], [first + 3, 1, 9], (count, 3)))
+        for count, more in ((own, 0), (common, 3), (singles, 1)):
+            left = 0 if alike else first
+            X.append(rng.uniform([left - 1, -1, 5], [left + 3, 1, 9], (count, 3)))
             seen.append(np.tile((view >= first) & (view < first + 3 + more), (count, 1)))
     X, (point, view) = np.concatenate(X), np.nonzero(np.concatenate(seen))
     P = camera_from_centre(np.tile(K, (views, 1, 1)), R, centres)
@@ -109,6 +112,14 @@ def test_wrong_points_alone_are_refused(common):
     for seed in range(10):
         models, _ = row(common, seed=seed)
         assert join(with_wrong_points(models, common, seed), seed) is None
+
+
+def test_rows_before_equal_facades_are_not_joined(monkeypatch):
+    """Many common points agree, but the images of a row see nothing else of the other facade."""
+    models, _ = row(24, own=600, alike=True)
+    assert join(models) is None
+    monkeypatch.setattr(_joined_models, "MIN_SEEN", 0.0)
+    assert join(models).registered.all()
 
 
 def test_points_on_a_line_fewer_than_six_and_two_similarities_are_refused():

@@ -1,7 +1,6 @@
 """Matches and tracks of other programs: the same cameras from each form, and one sentence for wrong input."""
 
 import shutil
-import sqlite3
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from tests.pipeline.fake_stages import FakeDense
-from tests.pipeline.given_scene import SIZE, given_scene
+from tests.pipeline.given_scene import SIZE, given_scene, write_database
 from thesisrecon import UsageError, reconstruct_from_colmap, reconstruct_from_matches, reconstruct_from_tracks
 from thesisrecon.cli.commands import run_command
 from thesisrecon.io._models import read_model
@@ -175,41 +174,20 @@ def test_masks_drop_matches_and_observations(tmp_path, from_rows):
             SCENE.keypoints, SCENE.matches, SCENE.sizes, names="abcde", masks=tmp_path)  # fmt: skip
 
 
-def write_database(path, *, verified):
-    """The tables of COLMAP's database that hold keypoints and matches."""
-    used, other = ("two_view_geometries", "matches") if verified else ("matches", "two_view_geometries")
-    blob = "rows INTEGER, cols INTEGER, data BLOB"
-    base = sqlite3.connect(path)
-    for table in (
-        "cameras (camera_id INTEGER, model INTEGER, width INTEGER, height INTEGER)",
-        "images (image_id INTEGER, name TEXT, camera_id INTEGER)", f"keypoints (image_id INTEGER, {blob})",
-        f"{used} (pair_id INTEGER PRIMARY KEY, {blob})", f"{other} (pair_id INTEGER PRIMARY KEY, {blob})",
-    ):  # fmt: skip
-        base.execute(f"CREATE TABLE {table}")
-    base.execute("INSERT INTO cameras VALUES (7, 2, 640, 480)")
-    for i, xy in enumerate(SCENE.keypoints):
-        # Names in the opposite order of the numbers.
-        base.execute("INSERT INTO images VALUES (?, ?, 7)", (i + 1, f"{9 - i}.jpg"))
-        data = np.column_stack([xy + 0.5, np.ones((len(xy), 2))]).astype("<f4").tobytes()
-        base.execute("INSERT INTO keypoints VALUES (?, ?, 4, ?)", (i + 1, len(xy), data))
-    for (i, j), rows in SCENE.matches.items():
-        row = ((i + 1) * (2**31 - 1) + j + 1, len(rows), 2, rows.astype("<u4").tobytes())
-        base.execute(f"INSERT INTO {used} VALUES (?, ?, ?, ?)", row)
-    base.commit()
-    base.close()
-    return path
+def database_in(folder, *, verified=True):
+    return write_database(folder / "database.db", SCENE.keypoints, SCENE.matches, verified=verified)
 
 
 @pytest.mark.parametrize("verified", [True, False])
 def test_a_database_gives_the_same_cameras(verified, tmp_path, from_rows):
-    result = reconstruct_from_colmap(write_database(tmp_path / "database.db", verified=verified))
+    result = reconstruct_from_colmap(database_in(tmp_path, verified=verified))
     assert list(result.cameras) == [f"{i}.jpg" for i in range(5, 10)]
     # Keypoints are stored in single precision.
     assert result.cameras["9.jpg"].K[0, 0] == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-3)
 
 
 def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, capsys):
-    database = write_database(tmp_path / "database.db", verified=True)
+    database = database_in(tmp_path)
     assert run_command(["reconstruct", "--from", str(database), "-o", str(tmp_path / "first")]) == 0
     assert "5 of 5 images registered" in capsys.readouterr().out
     sparse = str(tmp_path / "first" / "sparse" / "0")
@@ -224,7 +202,10 @@ def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, ca
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
     """COLMAP ignores the EXIF rotation; a run from its matches does so too, and says it to the export."""
-    database, exif = write_database(tmp_path / "database.db", verified=True), PIL.Image.Exif()
+    database, exif = (
+        database_in(tmp_path),
+        PIL.Image.Exif(),
+    )
     exif[0x0112] = orientation
     pixels = np.zeros((480, 640, 3), np.uint8)
     pixels[:240, :, 0], pixels[240:, :, 1] = 200, 200

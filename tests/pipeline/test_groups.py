@@ -5,20 +5,28 @@ The first tests use fake stages, the last ones two places with one weak link bet
 
 import re
 from dataclasses import dataclass, replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from tests.conftest import refuses
 from tests.pipeline import fake_stages as fakes
 from tests.pipeline.fake_stages import CALLS, fake_config, interrupt_at, kept_bytes, photographs, read
-from tests.pipeline.given_scene import SIZE, given_scene
-from thesisrecon import load, reconstruct_from_matches, reconstruct_from_tracks
+from tests.pipeline.given_scene import SIZE, given_scene, write_database
+from thesisrecon import (
+    Camera,
+    load,
+    reconstruct_from_colmap,
+    reconstruct_from_matches,
+    reconstruct_from_tracks,
+)
 from thesisrecon.api import reconstruct as api
 from thesisrecon.cli.commands import summary_text
 from thesisrecon.config import ImageOptions
 from thesisrecon.errors import StageFailure
-from thesisrecon.pipeline import matching
+from thesisrecon.pipeline import matching, stages
 
 GROUPS = [range(3), range(3, 7), range(7, 9)]
 
@@ -174,18 +182,21 @@ def test_images_left_over_become_models_until_too_few_are_left(tmp_path):
 
 
 SCENE = given_scene()
+APART = np.array([3.2, 0.0, 0.0])
+"""The second place, whose cameras do not see the first one."""
 LINK = 80
 """Points that only the last view of the first place and one view of the second see."""
 
 
-def two_places(common=0):
+def two_places(common=0, apart=APART):
     """Pixels (10, N, 2), NaN where a point is not seen; two views of either place see ``common`` more points.
 
     Each view of the second place sees at most half of these.
     """
     rng = np.random.default_rng(1)
     views, points = len(SCENE.keypoints), len(SCENE.X)
-    X = np.concatenate([SCENE.X, SCENE.X, rng.uniform(-1, 1, (2 * LINK + common, 3))])
+    between = rng.uniform(-0.2, 0.2, (2 * LINK + common, 3)) + apart / 2
+    X = np.concatenate([SCENE.X, SCENE.X + apart, between])
     seen = np.zeros((2 * views, len(X)), dtype=bool)
     for place in (0, 1):
         seen[place * views : (place + 1) * views, place * points : (place + 1) * points] = True
@@ -195,7 +206,8 @@ def two_places(common=0):
         seen[np.ix_([views - 1, views + 2], more)] = True
         seen[views - 2 : views, shared] = True
         seen[views : views + 2, shared[::2]] = seen[views + 2 : views + 4, shared[1::2]] = True
-    pixels = np.array([camera.project(X) for camera in SCENE.cameras * 2])
+    moved = [Camera(camera.K, camera.R, camera.t - camera.R @ apart, SIZE) for camera in SCENE.cameras]
+    pixels = np.array([camera.project(X) for camera in SCENE.cameras + moved])
     return np.where(seen[:, :, None], pixels + rng.normal(0, SCENE.noise_px, pixels.shape), np.nan)
 
 
@@ -203,7 +215,8 @@ def from_tracks(xy, out):
     return reconstruct_from_tracks(xy, [SIZE] * len(xy), out)
 
 
-def from_matches(xy, out):
+def given_matches(xy):
+    """Keypoints of each view, and rows of them that show the same points."""
     seen = np.isfinite(xy).all(axis=2)
     rows = np.cumsum(seen, axis=1) - 1
     matches = {}
@@ -212,42 +225,71 @@ def from_matches(xy, out):
             both = seen[i] & seen[j]
             if both.any():
                 matches[i, j] = np.column_stack([rows[i, both], rows[j, both]])
-    return reconstruct_from_matches(
-        [xy[i, there] for i, there in enumerate(seen)], matches, [SIZE] * len(xy), out
+    return [xy[i, there] for i, there in enumerate(seen)], matches
+
+
+def from_matches(xy, out):
+    return reconstruct_from_matches(*given_matches(xy), [SIZE] * len(xy), out)
+
+
+def from_database(xy, out):
+    return reconstruct_from_colmap(
+        write_database(out.parent / "colmap.db", *given_matches(xy), verified=True), out=out
     )
 
 
-@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches])
+@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches, from_database])
 def test_images_beyond_a_weak_link_become_a_model_with_the_same_camera(reconstruct, tmp_path):
-    result = reconstruct(two_places(), tmp_path)
+    result = reconstruct(two_places(), tmp_path / "out")
     (group,) = result.summary["groups"]
-    other = load(tmp_path / "group-2")
+    other = load(tmp_path / "out" / "group-2")
     assert len(result.cameras) == len(other.cameras) == 5
     assert not set(result.cameras) & set(other.cameras)
     assert group["registered"] == 5
     assert group["trusted"]
     assert any("5 images in this model, 5 in group-2" in text for text in result.summary["warnings"])
     assert all("is reconstructed in group-2" in reason for reason in result.refused.values())
+    for found in (result, other):
+        assert found.summary["self_check"]["sigmas_to_minimum"] < 0.1
     focal = SCENE.cameras[0].K[0, 0]
     first, second = (next(iter(found.cameras.values())) for found in (result, other))
     assert abs(second.K[0, 0] - focal) < 3 * second.std["focal_px"]
-    for (model,) in (result.further_models, load(tmp_path).further_models):
+    for (model,) in (result.further_models, load(tmp_path / "out").further_models):
         assert list(model.cameras) == list(other.cameras)
     # Its interval is that of all images.
-    assert second.std["focal_px"] < 0.9 * first.std["focal_px"]
+    assert second.std["focal_px"] < 0.95 * first.std["focal_px"]
 
 
-@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches])
+@pytest.mark.parametrize("reconstruct", [from_tracks, from_matches, from_database])
 def test_a_further_model_that_shares_points_is_joined(reconstruct, tmp_path):
-    result = reconstruct(two_places(common=8), tmp_path)
-    assert len(result.cameras) == len(load(tmp_path).cameras) == 10
+    result = reconstruct(two_places(common=8), tmp_path / "out")
+    assert len(result.cameras) == len(load(tmp_path / "out").cameras) == 10
     assert result.summary["trusted"]
+    assert result.summary["self_check"]["sigmas_to_minimum"] < 0.1
     assert "groups" not in result.summary
     assert result.further_models == ()
-    # Both places have the same cameras in the same world.
-    centres = np.array([camera.centre for camera in result.cameras.values()])
-    size = np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
-    assert np.linalg.norm(centres[:5] - centres[5:], axis=1).max() < 0.02 * size
+    # Both places have the same cameras in the same world, as far apart as they are.
+    truth = np.array([camera.centre for camera in SCENE.cameras])
+    truth = np.concatenate([truth, truth + APART])
+    by_number = sorted(result.cameras.items(), key=lambda item: int(re.findall(r"\d+", item[0])[0]))
+    centres = np.array([camera.centre for _, camera in by_number])
+    # Images of the database are named in the opposite order.
+    ratio = pdist(centres) / pdist(truth[::-1] if reconstruct is from_database else truth)
+    np.testing.assert_allclose(ratio, ratio.mean(), rtol=0.02)
+
+
+def test_a_place_that_looks_alike_is_not_joined_and_reconstructed_once(tmp_path, monkeypatch):
+    """What the places have in common agrees, but the images of one see nothing else of the other."""
+    xy, calibrated = two_places(common=8, apart=0.0 * APART), Mock(wraps=stages.calibrate_with_core)
+    monkeypatch.setattr(stages, "calibrate_with_core", calibrated)
+    result = from_tracks(xy, tmp_path / "out")
+    (other,) = result.further_models
+    assert len(result.cameras) == len(other.cameras) == 5
+    assert calibrated.call_count == 2
+    kept = files_of(tmp_path / "out")
+    from_tracks(xy, tmp_path / "out")
+    assert calibrated.call_count == 2
+    assert files_of(tmp_path / "out") == kept
 
 
 def test_further_models_are_part_of_a_result_without_a_folder():

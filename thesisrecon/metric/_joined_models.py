@@ -29,6 +29,13 @@ MAX_CHANCE = 1e-4  # largest expected number of similarities on which as many wr
 MAX_STD = 0.01
 """Largest standard deviation of the rotation in rad and of the relative scale, given the cameras."""
 
+MIN_SEEN, MIN_EXPECTED = 0.05, 30
+"""Smallest share of the expected points that images observe of the other model, relative to the share between
+images of one model; and number of expected points from which this tells something."""
+MAX_TURN, MAX_ZOOM, MAX_VIEWS, MAX_OBSERVATIONS = np.radians(10.0), 1.5, 50, 20000
+"""A point is expected in an image if another one sees it from within this angle and ratio of distances; most
+images and observations that are counted."""
+
 
 @dataclass(frozen=True)
 class _Points:
@@ -117,7 +124,45 @@ def join_models(
         return None
     if _log_chance(points, found, agree) > np.log(MAX_CHANCE) or _std(points, found, agree) > MAX_STD:
         return None
-    return _merged(first, second, found, numbers[agree])
+    joined = _merged(first, second, found, numbers[agree])
+    return None if _contradicted(joined, first.registered) else joined
+
+
+def _contradicted(joined: Reconstruction, first: B8) -> bool:
+    """Whether images miss what they should see of the other model, as in front of two equal facades.
+
+    An image observes most points that lie in it and that another one sees from nearly the same place. If they
+    are missing, the places are different (Zach, Irschara and Bischof, CVPR 2008).
+    """
+    second = joined.registered & ~first
+    # The images of one model may be far from each other: half of a few points are taken as seen.
+    inside = _seen(joined, first, first) + _seen(joined, second, second) + MIN_EXPECTED * np.array([0.5, 1.0])
+    across = _seen(joined, first, second) + _seen(joined, second, first)
+    few = across[0] * inside[1] < MIN_SEEN * inside[0] * across[1]
+    return bool(across[1] >= MIN_EXPECTED and few)
+
+
+def _seen(model: Reconstruction, views: B8, by: B8) -> I64:
+    """Numbers of points of ``views`` that the images ``by`` observe, and that these should observe."""
+    t, total = model.tracks, np.zeros(2, np.int64)
+    C = np.zeros((len(views), 3))
+    here = np.flatnonzero(model.registered)
+    C[here] = -np.linalg.solve(model.P[here, :, :3], model.P[here, :, 3:])[:, :, 0]
+    k = np.flatnonzero(model.inlier & views[t.view_index])
+    k = k[:: 1 + len(k) // MAX_OBSERVATIONS]
+    view, point, X = t.view_index[k], t.point_index[k], model.X[t.point_index[k], :3]
+    ray = X - C[view]
+    distance = np.linalg.norm(ray, axis=1)
+    for v in np.flatnonzero(by)[:: 1 + by.sum() // MAX_VIEWS]:
+        x, other = X @ model.P[v, :, :3].T + model.P[v, :, 3], X - C[v]
+        ahead = np.maximum(x[:, 2:], 1e-12)
+        inside = (x[:, 2] > 0.0) & (np.abs(x[:, :2] / ahead / model.sizes[v] - 0.5) < 0.45).all(axis=1)
+        length = np.linalg.norm(other, axis=1)
+        near = np.einsum("ni,ni->n", ray, other) > np.cos(MAX_TURN) * distance * length
+        near &= np.abs(np.log(length / distance)) < np.log(MAX_ZOOM)
+        expected = np.unique(point[inside & near & (view != v)])
+        total += np.isin(expected, t.point_index[t.view_index == v]).sum(), len(expected)
+    return total
 
 
 def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> list[Similarity]:

@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from thesisrecon._numba import code_digest
 from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
+from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.pipeline.large_sets import (
     calibrated_part,
     cameras_from_parts,
@@ -29,13 +31,13 @@ from thesisrecon.pipeline.outputs import (
     best_result,
     write_outputs,
 )
-from thesisrecon.pipeline.run import Job, Run, name_images
+from thesisrecon.pipeline.run import Job, Run, name_images, stream
 from thesisrecon.pipeline.stages import (
+    better_model,
     build_model,
     estimate_depth_maps,
-    groups_left_over,
-    join_left_over,
     known_cameras,
+    model_among,
     reconstruct_projective,
     refine_metric,
     register_more,
@@ -44,7 +46,7 @@ from thesisrecon.pipeline.stages import (
     report_projective,
     self_calibrate,
 )
-from thesisrecon.records import IntrinsicsPrior, Reconstruction, TwoView
+from thesisrecon.records import MetricResult, Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run_folder import RunDirectory
@@ -129,11 +131,42 @@ def metric_cameras(
         raise failures[0]
     chosen = next(k for k, other in enumerate(tried) if other is best)
     metric = register_more(job, views, pairs, best.calibration, best.metric, chosen)
-    metric = join_left_over(job, pairs, best.calibration, metric, chosen, ATTEMPTS)
+    job.run.cameras = job.known or known_cameras(job.prior, metric)
+    metric = join_left_over(job, replace(best, metric=metric), chosen)
     report_metric(job, metric)
     if len(tried) > 1:
         job.run.warnings.append(Notice("several-starts", len(tried)))
     yield replace(best, metric=metric)
+
+
+def join_left_over(job: Job, result: RunResult, attempt: int) -> MetricResult:
+    """Reconstruct groups left over, join those that share points and adjust; else the old model."""
+    run, metric, calibration = job.run, result.metric, result.calibration
+    assert metric is not None
+    assert calibration is not None
+    model, item = metric.reconstruction, f"attempt-{attempt}"
+    if not (groups := joinable(model, _unregistered_groups(job, result))):
+        return metric
+
+    def join() -> MetricResult:
+        others, pending = list[Reconstruction](), list(groups)
+        trial = replace(run.directory, path=run.directory.path / "trial", trial=True)
+        while pending:
+            views = pending.pop(0)
+            part = replace(_part_of(job, result, trial, views), until="metric")
+            found, _ = _last_named(part)
+            pending += [[views[k] for k in rest] for rest in _unregistered_groups(part, found)]
+            if found.metric is not None and found.metric.trusted:
+                others.append(model_among(model, views, found.metric.reconstruction))
+        rng = stream(run.seed, "metric", attempt, 2)
+        joined = join_all(model, others, rng)
+        return metric if joined is model else better_model(job, metric, joined, calibration, rng)
+
+    keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(item)]
+    variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
+    key = run.key("metric", variants, keys, code_digest(join_models), run.seed)
+    found: MetricResult = run.cached("metric", f"{item}-joined", key, join)
+    return found
 
 
 def attempt_cameras(
@@ -205,11 +238,10 @@ def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
 def _with_further_models(job: Job, result: RunResult) -> RunResult:
     """Reconstruct the other groups and the images left over, in folders; remove those that are gone."""
     run, folder, places, further = job.run, job.run.directory.path, dict[int, str](), list[RunResult]()
-    prior = known_cameras(job.prior, result.metric)
     pending = deque[Sequence[int]]([*groups_of(job, result.pairs)[1:], *_unregistered_groups(job, result)])
     while pending:
         views, name = pending.popleft(), f"group-{len(run.groups) + 2}"
-        part, found = _run_group(job, result, name, views, prior_of_views(prior, views))
+        part, found = _run_group(job, result, name, views)
         pending.extend([views[k] for k in rest] for rest in _unregistered_groups(part, found))
         if (model := found.best_reconstruction) is not None:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
@@ -243,19 +275,24 @@ def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
     # A projective run may end at the core of a large set.
     if model is None or not model.registered.any() or job.until == "projective":
         return []
-    return groups_left_over(job, pairs_of_group(job, result.pairs), model)
+    pairs = pairs_of_group(job, result.pairs)
+    return image_groups(len(job.images), pairs, ~model.registered) if job.config.images.groups else []
 
 
-def _run_group(
-    whole: Job, result: RunResult, name: str, views: Sequence[int], known: IntrinsicsPrior
-) -> tuple[Job, RunResult]:
-    """Reconstruct a group as a run with the prior ``known``; add it to the summary of the whole."""
-    directory = RunDirectory(whole.run.directory.path / name, whole.run.directory.shared, part=True)
+def _part_of(whole: Job, result: RunResult, directory: RunDirectory, views: Sequence[int]) -> Job:
+    """The job of some images of a result, with what is known about their cameras."""
     inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
-    front = FromRun(whole, views, result.features, result.pairs)
-    run = whole.run.inside(directory)
-    part = Job(run, inputs, front, whole.until, whole.surface_required, known)
-    identity = identity_of(run, inputs)
+    model = result.best_reconstruction
+    front = FromRun(whole, views, result.features, result.pairs, None if model is None else model.tracks)
+    known = prior_of_views(whole.run.cameras or whole.prior, views)
+    return Job(whole.run.inside(directory), inputs, front, whole.until, whole.surface_required, known)
+
+
+def _run_group(whole: Job, result: RunResult, name: str, views: Sequence[int]) -> tuple[Job, RunResult]:
+    """Reconstruct a group as a run with the cameras of the whole; add it to the summary of the whole."""
+    directory = replace(whole.run.directory, path=whole.run.directory.path / name, part=True)
+    part = _part_of(whole, result, directory, views)
+    known, identity = part.prior, identity_of(part.run, part.inputs)
     with directory.claim(identity, overwrite=True):
         directory.adopt(identity, overwrite=True, results=RESULT_FILES)
         found, failure = _last_named(part)

@@ -31,8 +31,8 @@ from thesisrecon.pipeline.large_sets import tracks_of_part
 from thesisrecon.pipeline.matching import (
     FromImages,
     report_choice,
+    report_given,
     report_matches,
-    report_tracks,
     values_at,
     verify_matches,
 )
@@ -104,13 +104,10 @@ class Given:
         self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
     ) -> Tracks:
         """The given tracks, or those of the matches."""
-        tracks, run = self.tracks, job.run
-        if tracks is None:
+        if self.tracks is None:
             return FromImages().track(job, views, pairs)
-        if among is not None:
-            tracks = tracks_of_part(tracks, np.array(among))
-        key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy)
-        return report_tracks(run, run.cached("tracks", "tracks", key, lambda: tracks))
+        some = self.tracks if among is None else tracks_of_part(self.tracks, np.array(among))
+        return report_given(job.run, some, pairs)
 
 
 @dataclass(frozen=True)

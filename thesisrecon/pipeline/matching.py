@@ -23,7 +23,7 @@ from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
-from thesisrecon.pipeline.large_sets import has_narrow_cut
+from thesisrecon.pipeline.large_sets import has_narrow_cut, tracks_of_part
 from thesisrecon.pipeline.run import Batch, Job, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Seeds, Tracks, TwoView
 
@@ -203,9 +203,11 @@ class FromRun:
     divides = False
 
     def __init__(
-        self, whole: Job, views: Sequence[int], features: Sequence[Features], pairs: Sequence[TwoView]
-    ) -> None:
+        self, whole: Job, views: Sequence[int], features: Sequence[Features], pairs: Sequence[TwoView],
+        tracks: Tracks | None = None,
+    ) -> None:  # fmt: skip
         self.whole, self.views, self.features, self.pairs = whole, views, features, pairs
+        self.tracks = tracks
 
     def detect(self, job: Job) -> Sequence[Features]:
         """The features of the images."""
@@ -240,8 +242,10 @@ class FromRun:
     def track(
         self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
     ) -> Tracks:
-        """The tracks that the other run gives these images."""
-        return self.whole.front.track(job, views, pairs, self.views)
+        """The tracks of the other run's model, if it leaves these images over, or those it gives them."""
+        if self.tracks is None or not np.isin(self.views, self.tracks.view_index).all():
+            return self.whole.front.track(job, views, pairs, self.views)
+        return report_given(job.run, tracks_of_part(self.tracks, np.array(self.views)), pairs)
 
 
 class PreparedViews(Sequence[Any]):
@@ -463,6 +467,13 @@ def require_accepted_pair(pairs: Sequence[TwoView]) -> None:
         best = max(pairs, key=lambda pair: pair.inliers)
         tried, verified = counted(len(pairs), "pair"), counted(best.inliers, "verified match")
         raise StageFailure.of("no-match", tried, verified, best.reason)
+
+
+def report_given(run: Run, tracks: Tracks, pairs: Sequence[TwoView]) -> Tracks:
+    """Store and report tracks that need not be built, and the pairs they come with; return them."""
+    geometry = [[pair.i, pair.j, pair.F] for pair in pairs if pair.accepted]
+    key = run.key("tracks", "given", tracks.view_index, tracks.point_index, tracks.xy, geometry)
+    return report_tracks(run, run.cached("tracks", "tracks", key, lambda: tracks))
 
 
 def report_tracks(run: Run, tracks: Tracks) -> Tracks:

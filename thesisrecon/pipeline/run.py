@@ -99,6 +99,7 @@ class Run:
     resumed: list[str] = field(default_factory=list, init=False)  #: stages read from the cache
     warnings: list[str] = field(default_factory=list, init=False)
     groups: list[dict[str, Any]] = field(default_factory=list, init=False)  #: results of runs inside this one
+    cameras: IntrinsicsPrior | None = field(default=None, init=False)  #: known before models are joined
     started: float = field(default_factory=time.perf_counter, init=False)
     _stage: str = field(default="", init=False)  # the one being computed
 

@@ -23,15 +23,12 @@ from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.matching.pair_selection import reject_repeated_structure
-from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.pipeline.large_sets import (
     align_parts,
     calibrate_with_core,
     from_metric,
-    input_of_part,
-    reconstruct_part,
+    tracks_of_part,
 )
-from thesisrecon.pipeline.matching import image_groups
 from thesisrecon.pipeline.run import Batch, Job, name_images, stream
 from thesisrecon.records import (
     DepthMap,
@@ -245,11 +242,6 @@ NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k
 # a camera must explain them with twice as many equations: they are used for missing images only.
 
 
-def groups_left_over(job: Job, pairs: Sequence[TwoView], model: Reconstruction) -> list[list[int]]:
-    """The groups of images that ``pairs`` connect with each other and that the model does not contain."""
-    return image_groups(len(model.registered), pairs, ~model.registered) if job.config.images.groups else []
-
-
 def register_more(
     job: Job, views: Sequence[Any], pairs: Sequence[TwoView], calibration: SelfCalibration,
     metric: MetricResult, attempt: int,
@@ -263,7 +255,7 @@ def register_more(
     def register() -> MetricResult:
         rng = stream(run.seed, "metric", attempt, 1)
         tracks = job.config.tracks.build(views, more, map_all=run.workers.map_all, rng=rng)
-        return _better_model(job, metric, cameras_on_tracks(old, tracks), calibration, rng)
+        return better_model(job, metric, cameras_on_tracks(old, tracks), calibration, rng)
 
     upstream = run.logs["metric"].keys[f"attempt-{attempt}"]
     key = run.key("metric", upstream, run.variant_key("tracks"), run.seed)
@@ -282,7 +274,7 @@ def pairs_of_missing(pairs: Sequence[TwoView], missing: B8) -> list[TwoView]:
     return [pair for pair in reject_repeated_structure(more, len(missing)) if pair.accepted]
 
 
-def _better_model(
+def better_model(
     job: Job, old: MetricResult, start: Reconstruction, calibration: SelfCalibration, rng: np.random.Generator
 ) -> MetricResult:
     """Refine ``start``: if it then has more images, all of the old ones, and is as trusted; else ``old``."""
@@ -305,33 +297,16 @@ def cameras_on_tracks(metric: Reconstruction, tracks: Tracks) -> Reconstruction:
     return replace(metric, X=X, valid=valid, inlier=seen & valid[tracks.point_index], tracks=tracks)
 
 
-def join_left_over(
-    job: Job, pairs: Sequence[TwoView], calibration: SelfCalibration, metric: MetricResult,
-    attempt: int, attempts: int,
-) -> MetricResult:  # fmt: skip
-    """Reconstruct groups left over, join those that share points and adjust; else the old model."""
-    run, model, item = job.run, metric.reconstruction, f"attempt-{attempt}"
-    if not (groups := joinable(model, groups_left_over(job, pairs, model))):
-        return metric
-
-    def join() -> MetricResult:
-        rng, known = stream(run.seed, "metric", attempt, 2), known_cameras(job.prior, metric)
-        others, pending, n = list[Reconstruction](), list(groups), len(model.registered)
-        while pending:
-            views = np.array(pending.pop(0))
-            given = input_of_part(model.tracks, pairs, model.sizes, known, views)
-            own = reconstruct_part(job.config, given, len(others), run.seed, attempts)
-            if (other := align_parts(model.tracks, model.sizes, [views], [views], own)) is not None:
-                others.append(other)
-                pending += image_groups(n, pairs, np.isin(np.arange(n), views) & ~other.registered)
-        joined = join_all(model, others, rng)
-        return metric if joined is model else _better_model(job, metric, joined, calibration, rng)
-
-    keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(item)]
-    variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
-    key = run.key("metric", variants, keys, code_digest(join_models), run.seed)
-    found: MetricResult = run.cached("metric", f"{item}-joined", key, join)
-    return found
+def model_among(model: Reconstruction, views: Sequence[int], part: Reconstruction) -> Reconstruction:
+    """The model of some views as a model of all views and points of another one."""
+    rows = np.array(views)
+    tracks = tracks_of_part(model.tracks, rows)
+    # Further matches may have led to other tracks.
+    same = np.array_equal(part.tracks.point_index, tracks.point_index)
+    found = part if same else cameras_on_tracks(part, tracks)
+    aligned = align_parts(model.tracks, model.sizes, [rows], [rows], [found])
+    assert aligned is not None
+    return aligned
 
 
 def known_cameras(prior: IntrinsicsPrior, metric: MetricResult | None) -> IntrinsicsPrior:

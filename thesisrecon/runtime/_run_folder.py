@@ -14,7 +14,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -148,9 +148,13 @@ class StageFolder:
 
     path: Path
     shared: Path | None = None
+    trial: bool = False  #: nothing is written
+    kept: dict[str, Any] = field(default_factory=dict)  #: records by key that trial runs computed
 
     def load(self, item: str, key: str) -> Any:
         """The record of an item, from this run or the shared folder; None if it must be computed."""
+        if self.trial:
+            return self.kept.get(key)
         own, changed = self.path / f"{item}.npz", None
         for place in [own] if self.shared is None else [own, self.shared / f"{key}.npz"]:
             try:
@@ -164,10 +168,15 @@ class StageFolder:
                 return record
         if changed is not None:
             raise changed
-        return None
+        if (record := self.kept.get(key)) is not None:
+            self.save(item, key, record)
+        return record
 
     def save(self, item: str, key: str, record: Any) -> None:
         """Write the record of an item."""
+        if self.trial:
+            self.kept[key] = record
+            return
         own = self.path / f"{item}.npz"
         write_atomically(own, bytes_from_record(record, key), cached=True)
         if self.shared is not None:
@@ -175,6 +184,8 @@ class StageFolder:
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
         """Write the manifest of a finished stage and remove stale records and partial files."""
+        if self.trial:
+            return
         try:
             # Nothing is removed through a link.
             there = [] if self.path.is_symlink() else self.path.iterdir()
@@ -212,10 +223,13 @@ class RunDirectory:
     path: Path
     shared: Path | None = None
     part: bool = False  #: of a group, in the folder of the whole run
+    trial: bool = False  #: nothing is written; the run in a folder that repeats it takes what is kept
+    kept: dict[str, Any] = field(default_factory=dict)  #: records by key that trial runs computed
 
     def stage(self, folder: str) -> StageFolder:
         """The folder of a stage, such as ``01-features``."""
-        return StageFolder(self.path / folder, None if self.shared is None else self.shared / folder)
+        shared = None if self.shared is None else self.shared / folder
+        return StageFolder(self.path / folder, shared, self.trial, self.kept)
 
     def mark(self, stage: StageFolder, item: str) -> None:
         """Set the time of a reused record to that of this run, so that only unused records are older."""
