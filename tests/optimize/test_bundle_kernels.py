@@ -304,6 +304,14 @@ def test_noise_is_found_beside_outliers_and_leverages_are_those_of_the_points():
     for s, e in ((0, 3), (3, 7)):
         J = B[s:e].reshape(-1, 3)
         np.testing.assert_allclose(leverage[s:e].ravel(), np.diag(J @ np.linalg.pinv(J)), rtol=1e-9)
+    # Orthonormal columns in any unit, also of a point on one ray.
+    B[5:, :, 2] = 0.0
+    point = np.array([0, 0, 0, 2, 2, 3, 3])
+    for unit in (1e-8, 1.0, 1e8):
+        Q = scatter._orthonormal(unit * B, point, 4)
+        for rows in (point == 0, point == 2, point == 3):
+            J, q = B[rows].reshape(-1, 3), Q[rows].reshape(-1, 3)
+            np.testing.assert_allclose(q @ q.T, J @ np.linalg.pinv(J), atol=1e-9)
     rng = np.random.default_rng(0)
     residual, leverage = 0.3 * rng.normal(size=(5000, 2)), np.zeros((5000, 2))
     assert robust_sigma(residual, leverage, 0) == pytest.approx(0.3, rel=0.02)

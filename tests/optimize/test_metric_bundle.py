@@ -91,6 +91,10 @@ def test_unseen_parts_come_back_untouched():
     np.testing.assert_array_equal(result.cameras.intrinsics, cameras.intrinsics)
     np.testing.assert_array_equal(result.X[-1], X[-1])
     assert not result.pose_covariance[fixed].any()
+    # A point that no view sees has no effect, wherever it is.
+    X[-1] = 1e6
+    elsewhere = _refine(cameras, X, seen, free=np.zeros(6, bool))
+    np.testing.assert_array_equal(elsewhere.X[:-1], result.X[:-1])
 
 
 def test_degenerate_input_is_guarded():

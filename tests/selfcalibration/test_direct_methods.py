@@ -15,6 +15,7 @@ from tests.selfcalibration.stratified_scenes import calibrated, with_calibration
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.strata import upgrade_cameras
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.least_squares import central_differences, soft_l1
@@ -27,7 +28,12 @@ from thesisrecon.selfcalibration._refinement import (
     minimize_batch,
     refine_hypotheses,
 )
-from thesisrecon.selfcalibration._upgrade import Candidate, distinct_candidates, square_pixel_calibrations
+from thesisrecon.selfcalibration._upgrade import (
+    Candidate,
+    _projective_noise,
+    distinct_candidates,
+    square_pixel_calibrations,
+)
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.kruppa import (
     KruppaEquations,
@@ -102,6 +108,10 @@ def test_wide_and_long_lenses_are_found_without_a_prior(method, focal, rtol):
     scene = with_poses(replace(scene, K=K), scene.R, -np.einsum("vba,vb->va", scene.R, t))
     answer = calibrated(method, scene, prior_for(scene), seed=3)
     np.testing.assert_allclose(answer.K[:, 0, 0], focal, rtol=rtol)
+    # The cameras are scaled rotations: the plane at infinity is that of these focal lengths.
+    P = projective_reconstruction(scene, seed=3).P
+    sizes = upgrade_cameras(P, answer.K, answer.metric_from_projective)[2]
+    np.testing.assert_allclose(sizes, np.tile(sizes[:, 1:2], 3), rtol=5.0 * rtol)
 
 
 @pytest.mark.parametrize("method", EXACT, ids=name)
@@ -155,6 +165,12 @@ def test_estimates_have_stds_of_the_size_of_their_errors(method):
         scaled.append((K - truth)[moved] / K_std[moved])
     # The noise of cameras is not independent, which the residuals do not know.
     assert 0.3 < np.sqrt(np.mean(np.square(scaled))) < 4.0
+
+
+def test_the_noise_of_projective_cameras_is_that_of_the_matches():
+    scene = make_scene(sigma_px=0.5, seed=1)
+    found = _projective_noise(adjusted(scene, 1), np.arange(len(scene.tracks.xy)))
+    assert found == pytest.approx(0.5, rel=0.05)
 
 
 def test_stds_are_those_of_the_prior_or_the_estimate_and_unknown_where_there_is_bias():

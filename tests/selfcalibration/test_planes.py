@@ -26,6 +26,7 @@ from thesisrecon.selfcalibration.cheirality import (
     CheiralityRegion,
     CheiralitySearch,
     ModulusConstraint,
+    _local_minima,
     _modulus_coefficients,
     _modulus_residuals,
     _pairs_of_constant_cameras,
@@ -83,6 +84,20 @@ def test_the_cheirality_bounds_hold_the_true_plane(seed):
     planes = [np.linalg.inv(part.quasi_affine).T @ np.append(plane, 1.0) for part in region.polytopes]
     inside = [part.contains(v[None, :3] / v[3])[0] for part, v in zip(region.polytopes, planes, strict=True)]
     assert sum(inside) == 1
+
+
+def test_local_minima_of_a_grid_are_those_of_a_search_of_all_neighbours():
+    rng = np.random.default_rng(0)
+    score = rng.integers(0, 12, (5, 5, 5)).astype(float)
+    score[rng.random((5, 5, 5)) < 0.2] = np.inf
+    steps = np.vstack([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
+
+    def is_least(cell):
+        beside = [tuple(n) for n in cell + steps if (n >= 0).all() and (n < 5).all()]
+        return np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in beside)
+
+    expected = [k for k, cell in enumerate(np.ndindex(5, 5, 5)) if is_least(cell)]
+    assert _local_minima(score).tolist() == sorted(expected, key=lambda k: score.flat[k])
 
 
 def test_samples_of_the_bounds_are_inside_them():
