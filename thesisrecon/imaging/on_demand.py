@@ -64,6 +64,10 @@ class OnDemand(Sequence[Value]):
         place = range(self._count)[number]
         return self._kept.get(place, lambda: self._make(place))
 
+    def keep(self, number: int, value: Value) -> None:  # type: ignore[misc]
+        """Take an item that was made elsewhere."""
+        self._kept.get(number, lambda: value)
+
     def __reduce__(self) -> tuple[type[list[Value]], tuple[list[Value]]]:
         return list, (list(self),)
 
