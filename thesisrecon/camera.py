@@ -9,19 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import (
-    B8,
-    F64,
-    Record,
-    number,
-    numbers,
-    require_calibration,
-    require_finite,
-    require_rotations,
-    require_shapes,
-    resizing_transform,
-    sizes_of_images,
-)
+from thesisrecon import arrays
+from thesisrecon.arrays import B8, F64, Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,17 +70,19 @@ class Camera(Record):
         given = {name: getattr(self, name) for name in ("K", "R", "t", "distortion")}
         if self.distortion is None:
             del given["distortion"]
-        fields = {name: array.copy() for name, array in zip(given, numbers("Camera", **given), strict=True)}
+        fields = {
+            name: array.copy() for name, array in zip(given, arrays.numbers("Camera", **given), strict=True)
+        }
         K, R, t = fields["K"], fields["R"], fields["t"]
-        require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
+        arrays.require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
         if "distortion" in fields:
-            require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
+            arrays.require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
             _require_radial(fields["distortion"])
-        require_finite("Camera", *fields.values())
-        require_calibration("Camera", K)
-        require_rotations("Camera", R)
+        arrays.require_finite("Camera", *fields.values())
+        arrays.require_calibration("Camera", K)
+        arrays.require_rotations("Camera", R)
         try:
-            width, height = (operator.index(side) for side in sizes_of_images(self.size))
+            width, height = (operator.index(side) for side in arrays.sizes_of_images(self.size))
         except (TypeError, ValueError):
             raise ValueError(f"Camera needs a size of two whole numbers; got {self.size}") from None
         if min(width, height) < 1:
@@ -116,8 +107,8 @@ class Camera(Record):
         Camera
             Without distortion.
         """
-        (P,) = numbers("Camera.from_matrix", P=P)
-        require_shapes("Camera.from_matrix", P=(P, (3, 4)))
+        (P,) = arrays.numbers("Camera.from_matrix", P=P)
+        arrays.require_shapes("Camera.from_matrix", P=(P, (3, 4)))
         return cls(*decompose_camera(P), size)
 
     @property
@@ -148,8 +139,8 @@ class Camera(Record):
         ndarray (N, 2)
             Pixels xy.
         """
-        (X,) = numbers("Camera.project", missing=("X",), X=X)
-        require_shapes("Camera.project", X=(X, ("N", 3)))
+        (X,) = arrays.numbers("Camera.project", missing=("X",), X=X)
+        arrays.require_shapes("Camera.project", X=(X, ("N", 3)))
         return project_camera(self.K, self.R, self.t, X, distortion=self._coefficients)
 
     def unproject(self, xy: F64, depth: F64 | None = None) -> F64:
@@ -166,10 +157,10 @@ class Camera(Record):
             Points in the world frame; without ``depth`` unit vectors of the viewing rays in the world frame.
             NaN for pixels farther out than the distortion images any point.
         """
-        (xy,) = numbers("Camera.unproject", missing=("xy",), xy=xy)
-        z = None if depth is None else numbers("Camera.unproject", missing=("depth",), depth=depth)[0]
+        (xy,) = arrays.numbers("Camera.unproject", missing=("xy",), xy=xy)
+        z = None if depth is None else arrays.numbers("Camera.unproject", missing=("depth",), depth=depth)[0]
         given = {} if z is None else {"depth": (z, ("N",))}
-        require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
+        arrays.require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
         xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
         places = xh[:, :2] / xh[:, 2:]
         plane = undistort(places, self._coefficients)
@@ -197,10 +188,10 @@ class Camera(Record):
         -------
         Camera
         """
-        if not 0.0 < number("Camera.scaled", "factor", factor, "a finite factor above 0") < math.inf:
+        if not 0.0 < arrays.number("Camera.scaled", "factor", factor, "a finite factor above 0") < math.inf:
             raise ValueError(f"Camera.scaled needs a finite factor above 0; got {factor}")
         width, height = (max(1, round(side * factor)) for side in self.size)
-        S = resizing_transform(np.divide((width, height), self.size))
+        S = arrays.resizing_transform(np.divide((width, height), self.size))
         return replace(self, K=S @ self.K, size=(width, height), std=None)
 
     @property

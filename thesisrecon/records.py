@@ -10,19 +10,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon.arrays import (
-    B8,
-    F32,
-    F64,
-    I64,
-    Record,
-    Stratum,
-    eight_bit,
-    image_levels,
-    numbers,
-    require_shapes,
-    resizing_transform,
-)
+from thesisrecon import arrays
+from thesisrecon.arrays import B8, F32, F64, I64, Record, Stratum
 from thesisrecon.errors import Notice, counted
 
 
@@ -44,7 +33,7 @@ class Image(Record):
     def __post_init__(self) -> None:
         if isinstance(self.rgb, np.ndarray) and self.rgb.dtype == np.uint8 and self.rgb.shape[2:] == (3,):
             return
-        rgb, known = eight_bit(image_levels(self.rgb)[0])
+        rgb, known = arrays.eight_bit(arrays.image_levels(self.rgb)[0])
         if rgb.size == np.prod(rgb.shape[:2]):
             rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
         if rgb.ndim != 3 or rgb.shape[2] != 3:
@@ -71,7 +60,7 @@ class Image(Record):
     @property
     def original_from_working(self) -> F64:
         """Transform of homogeneous pixels (3, 3), (x + 0.5) / scale - 0.5."""
-        return resizing_transform(1 / self.scale)
+        return arrays.resizing_transform(1 / self.scale)
 
     @property
     def gray(self) -> F32:
@@ -482,7 +471,7 @@ def as_mesh(caller: str, mesh: TexturedMesh) -> TexturedMesh:
         given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
         raise ValueError(f"{caller} needs a TexturedMesh; {given}")
     missing = ("vertices", "faces", "uv")
-    vertices, corners = numbers(caller, missing=missing, vertices=mesh.vertices, faces=mesh.faces)
+    vertices, corners = arrays.numbers(caller, missing=missing, vertices=mesh.vertices, faces=mesh.faces)
     n = len(vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         advice = "; divide homogeneous ones by their last coordinate" if vertices.shape[1:] == (4,) else ""
@@ -497,7 +486,7 @@ def as_mesh(caller: str, mesh: TexturedMesh) -> TexturedMesh:
         raise ValueError(f"{caller}: the faces refer to vertices that do not exist")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise ValueError(f"{caller}: the vertices of faces must be finite")
-    uv = None if mesh.uv is None else numbers(caller, missing=missing, uv=mesh.uv)[0]
+    uv = None if mesh.uv is None else arrays.numbers(caller, missing=missing, uv=mesh.uv)[0]
     if uv is not None and uv.shape != (*faces.shape, 2):
         raise ValueError(f"{caller}: uv must be {(*faces.shape, 2)}; got {uv.shape}")
     if uv is not None and not np.isfinite(uv).all():
@@ -521,9 +510,9 @@ def _halves(quads: NDArray[Any]) -> NDArray[Any]:
 
 def _colours(caller: str, name: str, given: Any, shape: tuple[int | str, ...]) -> NDArray[np.uint8]:
     """Colours (..., 3) as uint8; those of (..., 4) lose their alpha."""
-    (levels,) = image_levels(given)
+    (levels,) = arrays.image_levels(given)
     levels = levels[..., :3] if levels.shape[-1:] == (4,) else levels
-    require_shapes(caller, **{name: (levels, (*shape, 3))})
+    arrays.require_shapes(caller, **{name: (levels, (*shape, 3))})
     if not np.isfinite(levels).all():
         raise ValueError(f"{caller}: {name} must be finite")
     return np.ascontiguousarray(np.rint(np.clip(levels, 0.0, 255.0)), dtype=np.uint8)

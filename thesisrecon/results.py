@@ -11,25 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from thesisrecon import records
 from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
 from thesisrecon.camera import Camera
-from thesisrecon.records import (
-    DepthMap,
-    Features,
-    HeldOut,
-    Image,
-    IntrinsicInterval,
-    MetricResult,
-    PairChoice,
-    PinholeView,
-    Reconstruction,
-    SelfCalibration,
-    Similarity,
-    StageReport,
-    TexturedMesh,
-    Tracks,
-    TwoView,
-)
 
 SUMMARY = "summary.json"
 
@@ -41,7 +25,9 @@ class SeenPoints(NamedTuple):
     point: I64
 
 
-def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> IntrinsicInterval:
+def in_original_pixels(
+    name: str, interval: records.IntrinsicInterval, scale: float
+) -> records.IntrinsicInterval:
     """Convert an intrinsic, if its name ends in ``_px``, from working to original pixels."""
     if not name.endswith("_px"):
         return interval
@@ -49,7 +35,7 @@ def in_original_pixels(name: str, interval: IntrinsicInterval, scale: float) -> 
     return replace(interval, value=interval.value / scale + shift, std=interval.std / scale)
 
 
-def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
+def pose_deviations(metric: records.MetricResult, i: int) -> dict[str, float]:
     """Return the standard deviations of a pose as in :attr:`thesisrecon.Camera.std`, none if unknown."""
     if metric.pose_std is None or not np.isfinite(metric.pose_std[i]).all():
         return {}
@@ -58,7 +44,7 @@ def pose_deviations(metric: MetricResult, i: int) -> dict[str, float]:
     return stds | {f"centre_{axis}": std for axis, std in zip("xyz", centre, strict=True)}
 
 
-def _number_of(image: str | int, images: tuple[Image, ...]) -> int:
+def _number_of(image: str | int, images: tuple[records.Image, ...]) -> int:
     """The number of an image by its name or number, which may count from the end; ``KeyError`` if none."""
     if isinstance(image, str):
         numbers = [i for i, one in enumerate(images) if one.name == image]
@@ -73,7 +59,9 @@ def _number_of(image: str | int, images: tuple[Image, ...]) -> int:
 class Cameras(Mapping[str, Camera]):
     """The registered cameras by image name, or by the number of the image among all that were read."""
 
-    def __init__(self, images: tuple[Image, ...], metric: MetricResult, *, as_stored: bool) -> None:
+    def __init__(
+        self, images: tuple[records.Image, ...], metric: records.MetricResult, *, as_stored: bool
+    ) -> None:
         self._images, self._metric, self._as_stored = images, metric, as_stored
 
     def __getitem__(self, image: str | int) -> Camera:
@@ -111,23 +99,23 @@ class RunResult(Record):
     """
 
     out: Path | None  #: output folder, None if the run had none
-    images: tuple[Image, ...]  #: the V views at working size
+    images: tuple[records.Image, ...]  #: the V views at working size
     unread: Mapping[str, str]  #: file name -> reason of unreadable images
-    features: tuple[Features, ...]
-    pairs: tuple[TwoView, ...]  #: all matched pairs, accepted or not
+    features: tuple[records.Features, ...]
+    pairs: tuple[records.TwoView, ...]  #: all matched pairs, accepted or not
     groups: I64  #: (V,) camera number of each view
     settings: Mapping[str, Mapping[str, Any]]  #: stage -> field -> value
-    pair_choice: PairChoice | None = None
-    tracks: Tracks | None = None
-    projective: Reconstruction | None = None
-    calibration: SelfCalibration | None = None
-    metric: MetricResult | None = None
+    pair_choice: records.PairChoice | None = None
+    tracks: records.Tracks | None = None
+    projective: records.Reconstruction | None = None
+    calibration: records.SelfCalibration | None = None
+    metric: records.MetricResult | None = None
     #: undistorted images and, below, their depth maps; of many, some are made or read when they are used
-    views: Sequence[PinholeView] = ()
-    depth_maps: Sequence[DepthMap] = ()
-    mesh: TexturedMesh | None = None
-    held_out: HeldOut | None = None
-    reports: tuple[StageReport, ...] = ()  #: one per stage
+    views: Sequence[records.PinholeView] = ()
+    depth_maps: Sequence[records.DepthMap] = ()
+    mesh: records.TexturedMesh | None = None
+    held_out: records.HeldOut | None = None
+    reports: tuple[records.StageReport, ...] = ()  #: one per stage
     warnings: tuple[str, ...] = ()  #: of all stages
     summary: Mapping[str, Any] = field(default_factory=dict)  #: content of ``summary.json``
     failure: str = ""  #: the failure that ended the run
@@ -143,7 +131,7 @@ class RunResult(Record):
         return f"RunResult(out={str(self.out) if self.out else None!r}, {text}, failure={self.failure!r})"
 
     @property
-    def best_reconstruction(self) -> Reconstruction | None:
+    def best_reconstruction(self) -> records.Reconstruction | None:
         """The metric reconstruction, else the projective one, else None."""
         return self.metric.reconstruction if self.metric is not None else self.projective
 
@@ -157,7 +145,7 @@ class RunResult(Record):
         reasons = {image.name: reason or "no reason was recorded" for image, in_, reason in views if not in_}
         return {**self.unread, **reasons}
 
-    def _metric_result(self, what: str) -> MetricResult:
+    def _metric_result(self, what: str) -> records.MetricResult:
         if self.metric is None:
             stage = "the run ended before the metric stage" if not self.failure else self.failure
             raise AttributeError(f"there are no {what}: {stage}")
@@ -177,7 +165,7 @@ class RunResult(Record):
         return np.asarray(X[:, :3] / X[:, 3:])
 
     @property
-    def reconstruction(self) -> Reconstruction:
+    def reconstruction(self) -> records.Reconstruction:
         """The metric reconstruction in original pixels; ``metric.reconstruction`` is in working ones."""
         r = self._metric_result("cameras").reconstruction
         assert r.K is not None
@@ -274,7 +262,7 @@ class SparseModel(Record):
         """Colours (N, 3) of the points; mid-grey if they are not known."""
         return np.full((len(self.X), 3), 128, np.uint8) if self.colors is None else self.colors
 
-    def transformed(self, similarity: Similarity) -> SparseModel:
+    def transformed(self, similarity: records.Similarity) -> SparseModel:
         """Return the model in another world: y = scale R x + t of its points and camera centres."""
         views = []
         for view in self.views:
@@ -327,7 +315,9 @@ class ModelComparison(Record):
     rotation_error_deg: F64
     focal_error_rel: F64  #: (V,) f / f_b - 1, f the geometric mean of fx and fy; NaN without intrinsics
     principal_point_error_px: F64  #: (V,) distances of the principal points, in pixels of b
-    similarity: Similarity | None  #: least squares of the centres (Umeyama), a to b; None if undetermined
+    similarity: (
+        records.Similarity | None
+    )  #: least squares of the centres (Umeyama), a to b; None if undetermined
     points: PointDistances | None  #: if both models have points and there is a similarity
     only_a: tuple[str, ...]  #: cameras that the other model does not have
     only_b: tuple[str, ...]

@@ -15,6 +15,7 @@ from tests.pipeline import fake_stages as fakes
 from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.api import export as export_module
 from thesisrecon.cli.commands import run_command
+from thesisrecon.io import _images
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.results import SparseModel, SparseView
 
@@ -473,7 +474,7 @@ def test_an_export_does_not_replace_its_input(tmp_path, images):
 def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monkeypatch, total, together):
     """An image of 160 x 120 px takes 0.6 MB."""
     working, most, gate = [], [], threading.Barrier(together)
-    read, write = export_module.read_image, export_module.write_image
+    read, write = _images.read_image, export_module.write_image
 
     def counted(*given, **options):
         working.append(1)
@@ -486,7 +487,7 @@ def test_images_are_undistorted_within_the_memory_budget(tmp_path, images, monke
         working.pop()
 
     monkeypatch.setattr(export_module, "_budget", MemoryBudget(int(total)))
-    monkeypatch.setattr(export_module, "read_image", counted)
+    monkeypatch.setattr(_images, "read_image", counted)
     monkeypatch.setattr(export_module, "write_image", ended)
     export(make_model(BARREL, PINCUSHION), tmp_path / "out", to="nerfstudio", images=images, threads=4)
     assert (len(most), max(most)) == (4, together)

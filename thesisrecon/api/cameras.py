@@ -8,20 +8,9 @@ from typing import get_args
 import numpy as np
 from numpy.random import Generator
 
+from thesisrecon import arrays
 from thesisrecon.api.given import calibrated_arrays, checked_sizes
-from thesisrecon.arrays import (
-    F64,
-    I64,
-    Stratum,
-    generator,
-    number,
-    numbers,
-    require_calibration,
-    require_finite,
-    require_rotations,
-    require_shapes,
-    whole_number,
-)
+from thesisrecon.arrays import F64, I64, Stratum
 from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import require_word
 from thesisrecon.geometry.homogeneous import homogenize
@@ -51,21 +40,15 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
-    P, X = numbers("cheirality", missing=("X",), P=P, X=X)
-    require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
+    P, X = arrays.numbers("cheirality", missing=("X",), P=P, X=X)
+    arrays.require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
 
 def resect(
-    X: F64,
-    xy: F64,
-    K: F64 | None = None,
-    *,
-    threshold_px: float | None = 1.0,
-    confidence: float = 0.9999,
-    max_samples: int = 100_000,
-    seed: int | Generator = 0,
-) -> Resection:
+    X: F64, xy: F64, K: F64 | None = None, *, threshold_px: float | None = 1.0, confidence: float = 0.9999,
+    max_samples: int = 100_000, seed: int | Generator = 0,
+) -> Resection:  # fmt: skip
     """Estimate a camera from space points and their pixels, some of them wrong (section 6.4; HZ 7).
 
     RANSAC over samples of six points (DLT), or with K of three (P3P), then the least reprojection error of
@@ -109,15 +92,15 @@ def resect(
     >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
     (500.0, [0.2, -0.1, 4.0])
     """
-    X, xy = numbers("resect", X=X, xy=xy)
-    require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
+    X, xy = arrays.numbers("resect", X=X, xy=xy)
+    arrays.require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
     if K is not None:
-        (K,) = numbers("resect", K=K)
-        require_calibration("resect", K)
-    require_finite("resect", X, xy)
+        (K,) = arrays.numbers("resect", K=K)
+        arrays.require_calibration("resect", K)
+    arrays.require_finite("resect", X, xy)
     require_threshold(threshold_px, xy)
     budget = search_budget(confidence, max_samples)
-    return resect_robust(X, xy, K, threshold_px, budget, generator("resect", seed))
+    return resect_robust(X, xy, K, threshold_px, budget, arrays.generator("resect", seed))
 
 
 def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
@@ -152,11 +135,11 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     """
     if method is not None:
         require_word("method", method, get_args(TriangulationMethod))
-    P, xy = numbers("triangulate", missing=("xy",), P=P, xy=xy)
-    require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    P, xy = arrays.numbers("triangulate", missing=("xy",), P=P, xy=xy)
+    arrays.require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     if len(P) < 2:
         raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
-    require_finite("triangulate, for its cameras,", P)
+    arrays.require_finite("triangulate, for its cameras,", P)
     if not np.abs(P).max(axis=(1, 2)).all():
         raise ValueError("triangulate needs cameras that are not all zero")
     if np.isinf(xy).any():
@@ -210,18 +193,18 @@ def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tup
     caller = "reconstruction_from_cameras"
     K: F64 | None = None
     if len(cameras) == 1:
-        (P,) = numbers(caller, P=cameras[0])
-        require_shapes(caller, P=(P, ("V", 3, 4)))
-        require_finite(caller, P)
+        (P,) = arrays.numbers(caller, P=cameras[0])
+        arrays.require_shapes(caller, P=(P, ("V", 3, 4)))
+        arrays.require_finite(caller, P)
         if metric:
             K, R, t = (np.stack(part) for part in zip(*map(decompose_camera, P), strict=True))
             P = compose_camera(K, R, t)
     elif len(cameras) == 3 and metric:
         K, R, t = calibrated_arrays(caller, *cameras)
-        require_finite(caller, K, R, t)
+        arrays.require_finite(caller, K, R, t)
         for one in K:
-            require_calibration(caller, one)
-        require_rotations(caller, R)
+            arrays.require_calibration(caller, one)
+        arrays.require_rotations(caller, R)
         P = compose_camera(K, R, t)
     else:
         raise ValueError(f"{caller} needs P, or K, R and t of a metric frame; got {len(cameras)} arrays")
@@ -251,16 +234,16 @@ def _checked_points(
     caller = "reconstruction_from_cameras"
     if xy is None:
         xy = np.full((len(P), 0 if X is None else len(X), 2), np.nan)
-    (xy,) = numbers(caller, missing=("xy",), xy=xy)
-    require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    (xy,) = arrays.numbers(caller, missing=("xy",), xy=xy)
+    arrays.require_shapes(caller, P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     point, views = np.nonzero(np.isfinite(xy).all(axis=2).T)
     require_inside(views, xy[views, point], sizes)
     if X is None:
         X = triangulate_points(P, xy) if xy.shape[1] else np.zeros((0, 4))
-    (X,) = numbers(caller, X=X)
+    (X,) = arrays.numbers(caller, X=X)
     X = homogenize(X) if X.ndim == 2 and X.shape[1] == 3 else X
-    require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
-    require_finite(caller, X)
+    arrays.require_shapes(caller, X=(X, ("N", 4)), xy=(xy[0], ("N", 2)))
+    arrays.require_finite(caller, X)
     if finite:
         near = np.abs(X[:, 3:]) > 1e-12 * np.linalg.norm(X, axis=1, keepdims=True)
         X = np.where(near, X / np.where(near, X[:, 3:], 1.0), 0.0)
@@ -271,7 +254,8 @@ def require_threshold(threshold_px: float | None, *points: F64) -> None:
     """Raise ``ValueError`` unless a threshold is None, or positive and smaller than the extents of points."""
     if threshold_px is None:
         return
-    if not 0.0 < number("the search", "threshold_px", threshold_px, "a positive number or None") < np.inf:
+    given = arrays.number("the search", "threshold_px", threshold_px, "a positive number or None")
+    if not 0.0 < given < np.inf:
         raise ValueError(
             f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
         )
@@ -285,6 +269,6 @@ def require_threshold(threshold_px: float | None, *points: F64) -> None:
 
 def search_budget(confidence: float, max_samples: int) -> Budget:
     """The budget of a search, checked."""
-    if not 0.0 < number("the search", "confidence", confidence) < 1.0:
+    if not 0.0 < arrays.number("the search", "confidence", confidence) < 1.0:
         raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
-    return Budget(confidence, whole_number("the search", "max_samples", max_samples, 1))
+    return Budget(confidence, arrays.whole_number("the search", "max_samples", max_samples, 1))

@@ -18,19 +18,10 @@ from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io import _exports as formats
+from thesisrecon.io import _images
 from thesisrecon.io._colmap import COLMAP_FILES, has_skew, write_sparse_model
 from thesisrecon.io._exports import write_image
 from thesisrecon.io._files import as_path, first_repeated, read_json, require_image_name, write_atomically
-from thesisrecon.io._images import (
-    MAX_DECODED_BYTES,
-    USELESS_MASKS,
-    find_images,
-    find_masks,
-    may_be_transparent,
-    read_image,
-    read_mask,
-    rotation_words,
-)
 from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
@@ -40,7 +31,7 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
 
-_budget = MemoryBudget(MAX_DECODED_BYTES)
+_budget = MemoryBudget(_images.MAX_DECODED_BYTES)
 """Separate from the budget for decoding, which each image needs while it occupies this one."""
 
 
@@ -151,16 +142,16 @@ def export(
             file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
     undistorted = _undistorted(model, bundler=to == "bundler")
-    may_mask = masks is not None or any(map(may_be_transparent, _image_paths(images, model)))
+    may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask and to != "bundler"]
     _require_distinct(names, "have the mask")
-    found = {} if masks is None else find_masks(Path(masks), model.names)[0]
+    found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
     paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
         has_mask = _write_images(folder, model, undistorted, paths, found, names, threads)
         masked = masks is not None or any(has_mask)
-        notes += [USELESS_MASKS] if masked and not any(has_mask) else []
+        notes += [_images.USELESS_MASKS] if masked and not any(has_mask) else []
         notes += ["no masks are written: Bundler has none"] if masked and not names else []
         # Programs want a mask for every image or for none.
         for view, name, there in zip(undistorted.views, names if masked else (), has_mask, strict=False):
@@ -309,7 +300,7 @@ def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
     if images is None:
         message = "the model does not record the folder of its images; give it with --images (images=)"
         raise UsageError(message)
-    return find_images(Path(images), model.names)
+    return _images.find_images(Path(images), model.names)
 
 
 def _write_images(
@@ -324,14 +315,14 @@ def _write_images(
         pinhole_K, pinhole_size, _ = pinholes.views[i].intrinsics
         # Measured: 17 bytes per pixel of the original and of the result.
         with _budget.reserve(17 * (math.prod(size) + math.prod(pinhole_size))):
-            (image,) = read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
+            (image,) = _images.read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
             if image.size != size:
-                rule = rotation_words(model.as_stored)
+                rule = _images.rotation_words(model.as_stored)
                 sizes = f"{image.size} pixels {rule}, but {size} (width, height) in the model"
                 raise UsageError(f"{paths[i]} has {sizes}; give the images of the model")
             mask, file = image.mask, masks.get(model.names[i])
             if file is not None:
-                mask = read_mask(file, image, as_stored=model.as_stored)
+                mask = _images.read_mask(file, image, as_stored=model.as_stored)
             rgb, used = image.rgb, mask
             if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
                 frames = K, distortion, pinhole_K, pinhole_size

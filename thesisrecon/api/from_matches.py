@@ -260,4 +260,4 @@ def _reconstruct(
 def _without_folder(found: RunResult) -> RunResult:
     """The result with all depth maps in memory, as its folder is removed."""
     further = tuple(_without_folder(model) for model in found.further_models)
-    return replace(found, out=None, depth_maps=found.depth_maps[:], further_models=further)
+    return replace(found, out=None, depth_maps=list(found.depth_maps), further_models=further)

@@ -10,19 +10,9 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from thesisrecon import arrays
 from thesisrecon.api.cameras import require_threshold, search_budget
-from thesisrecon.arrays import (
-    F32,
-    F64,
-    I64,
-    U8,
-    generator,
-    number,
-    numbers,
-    require_finite,
-    require_shapes,
-    whole_number,
-)
+from thesisrecon.arrays import F32, F64, I64, U8
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
@@ -136,10 +126,10 @@ def draw_epipolar_lines(
     >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
     ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
     """
-    F, xy1, xy2 = numbers("draw_epipolar_lines", F=F, xy1=xy1, xy2=xy2)
-    whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
-    require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite("draw_epipolar_lines", F, xy1, xy2)
+    F, xy1, xy2 = arrays.numbers("draw_epipolar_lines", F=F, xy1=xy1, xy2=xy2)
+    arrays.whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
+    arrays.require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    arrays.require_finite("draw_epipolar_lines", F, xy1, xy2)
     some = np.unique(np.linspace(0, len(xy1) - 1, min(max_lines, len(xy1))).astype(np.int64))
     xy1, xy2 = xy1[some], xy2[some]
     first, second = read_pixels(image1, image2)
@@ -147,14 +137,9 @@ def draw_epipolar_lines(
 
 
 def estimate_homography(
-    xy1: F64,
-    xy2: F64,
-    *,
-    threshold_px: float | None = 1.0,
-    confidence: float = 0.9999,
-    max_samples: int = 2_000_000,
-    seed: int | Generator = 0,
-) -> HomographyFit:
+    xy1: F64, xy2: F64, *, threshold_px: float | None = 1.0, confidence: float = 0.9999,
+    max_samples: int = 2_000_000, seed: int | Generator = 0,
+) -> HomographyFit:  # fmt: skip
     """Estimate the homography x2 ~ H x1 of matches with outliers (section 3.6.4; HZ 4.8).
 
     RANSAC over samples of four, then the least Sampson distance of the inliers, which is to first order the
@@ -195,12 +180,12 @@ def estimate_homography(
     >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
     (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
     """
-    xy1, xy2 = numbers("estimate_homography", xy1=xy1, xy2=xy2)
-    require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite("estimate_homography", xy1, xy2)
+    xy1, xy2 = arrays.numbers("estimate_homography", xy1=xy1, xy2=xy2)
+    arrays.require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    arrays.require_finite("estimate_homography", xy1, xy2)
     require_threshold(threshold_px, xy1, xy2)
     budget = search_budget(confidence, max_samples)
-    return fit_homography(xy1, xy2, threshold_px, budget, generator("estimate_homography", seed))
+    return fit_homography(xy1, xy2, threshold_px, budget, arrays.generator("estimate_homography", seed))
 
 
 def estimate_trifocal(
@@ -250,19 +235,23 @@ def estimate_trifocal(
     >>> bool(estimate_trifocal(*points).point_residuals_px.max() < 1e-6)
     True
     """
-    if not number("estimate_trifocal", "loss_px", loss_px) > 0.0:
+    if not arrays.number("estimate_trifocal", "loss_px", loss_px) > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
-    xy1, xy2, xy3, segments = numbers("estimate_trifocal", xy1=xy1, xy2=xy2, xy3=xy3, segments=segments)
+    xy1, xy2, xy3, segments = arrays.numbers(
+        "estimate_trifocal", xy1=xy1, xy2=xy2, xy3=xy3, segments=segments
+    )
     require_threshold(threshold_px, xy1, xy2, xy3)
-    require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
+    arrays.require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
     points = np.stack([xy1, xy2, xy3])
-    require_shapes("a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2)))
-    require_finite("a trifocal tensor", points, segments)
+    arrays.require_shapes(
+        "a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2))
+    )
+    arrays.require_finite("a trifocal tensor", points, segments)
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
         raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
-    rng = generator("estimate_trifocal", seed)
+    rng = arrays.generator("estimate_trifocal", seed)
     return fit_trifocal(points, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
 
 
@@ -320,9 +309,9 @@ def estimate_fundamental(
     >>> linear.covariance.shape
     (9, 9)
     """
-    xy1, xy2 = numbers("estimate_fundamental", xy1=xy1, xy2=xy2)
+    xy1, xy2 = arrays.numbers("estimate_fundamental", xy1=xy1, xy2=xy2)
     require_word("method", method, get_args(Method))
-    rng = generator("estimate_fundamental", seed)
+    rng = arrays.generator("estimate_fundamental", seed)
     require_threshold(threshold_px, xy1, xy2)
     if threshold_px is None:
         threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
@@ -363,8 +352,8 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
     [[0.0, 1.0, 30.0]]
     """
-    F, xy1 = numbers("epipolar_lines", missing=("xy1",), F=F, xy1=xy1)
-    require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
+    F, xy1 = arrays.numbers("epipolar_lines", missing=("xy1",), F=F, xy1=xy1)
+    arrays.require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return lines_of_points(F, xy1)
 
 

@@ -12,19 +12,8 @@ from thesisrecon.arrays import F64
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.config.text import Config, Pairs, Settings, build_config
 from thesisrecon.errors import Notice, UsageError, counted
+from thesisrecon.io import _images
 from thesisrecon.io._frames import FrameSource
-from thesisrecon.io._images import (
-    USELESS_MASKS,
-    ImageSet,
-    ImageSource,
-    add_masks,
-    check_masks_folder,
-    images_folder,
-    list_images,
-    list_of_images,
-    read_images,
-    scene_name,
-)
 from thesisrecon.matching.pair_selection import ListedPairs
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
 from thesisrecon.pipeline.matching import FromImages
@@ -33,7 +22,7 @@ from thesisrecon.results import RunResult
 
 
 def reconstruct(
-    images: ImageSource, out: str | Path, *, config: Config | None = None, preset: str | None = None,
+    images: _images.ImageSource, out: str | Path, *, config: Config | None = None, preset: str | None = None,
     max_size: int | None = None, cameras: str | None = None, pairs: Pairs | None = None, set: Settings = (),
     masks: str | Path | None = None, every: int | None = None, seed: int = 0,
     progress: Progress | None = None, **options: Unpack[RunOptions],
@@ -114,14 +103,14 @@ def reconstruct(
         if Path(images).is_file() and frames is None:
             message = f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
             raise UsageError(message)
-        if frames is None and not list_images(Path(images)):
+        if frames is None and not _images.list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
-        run.title = scene_name(Path(images)) or run.title
+        run.title = _images.scene_name(Path(images)) or run.title
     else:
-        images = list_of_images("reconstruct", images)
-    run.images_folder = images_folder(images) if frames is None else frames.home(run.directory.path)
+        images = _images.list_of_images("reconstruct", images)
+    run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
     if masks is not None:
-        run.masks_folder = check_masks_folder(Path(masks), run.images_folder)
+        run.masks_folder = _images.check_masks_folder(Path(masks), run.images_folder)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     source = None if frames is None else frames.identity
@@ -135,7 +124,7 @@ def reconstruct(
         return run_adopted(job, overwrite=overwrite, source=source)
 
 
-def _frame_source(images: ImageSource, every: int, run: Run) -> FrameSource:
+def _frame_source(images: _images.ImageSource, every: int, run: Run) -> FrameSource:
     if not isinstance(images, str | Path):
         raise UsageError("every needs a video or a folder of frames, not a list of images")
     if isinstance(run.config.pairs, ListedPairs):
@@ -144,7 +133,7 @@ def _frame_source(images: ImageSource, every: int, run: Run) -> FrameSource:
     return FrameSource(Path(images), every)
 
 
-def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None) -> ImageSet:
+def _read_inputs(run: Run, images: _images.ImageSource | FrameSource, masks: Path | None) -> _images.ImageSet:
     warnings: list[str] = []
     counts: dict[str, int] = {}
     with run.clock("images"):
@@ -153,10 +142,10 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
                 run.directory.path, run.workers.threads, run.workers.map_all, run.progress
             )
         size = run.config.images.max_size_px
-        inputs = read_images(images, max_size_px=size, map_all=run.workers.map_all)
+        inputs = _images.read_images(images, max_size_px=size, map_all=run.workers.map_all)
         unused: list[str] = []
         if masks is not None:
-            inputs, unused = add_masks(inputs, masks, map_all=run.workers.map_all)
+            inputs, unused = _images.add_masks(inputs, masks, map_all=run.workers.map_all)
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("the list of images is empty")
@@ -166,7 +155,7 @@ def _read_inputs(run: Run, images: ImageSource | FrameSource, masks: Path | None
     warnings += unused if not counts else []
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
     masked = sum(image.mask is not None for image in inputs.images)
-    warnings += [USELESS_MASKS] if masks is not None and inputs.images and not masked else []
+    warnings += [_images.USELESS_MASKS] if masks is not None and inputs.images and not masked else []
     counts |= {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
     run.finish("images", counts=counts, warnings=warnings)
     return inputs

@@ -15,21 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from thesisrecon import __version__
-from thesisrecon.cli.common import (
-    DEBUG_VARIABLE,
-    MaxSize,
-    OutputFolder,
-    Overwrite,
-    Seed,
-    Threads,
-    cap_threads,
-    exit_code_of,
-    folder_argument,
-    folder_option,
-    interruptible,
-    parse_folder,
-    progress_bars,
-)
+from thesisrecon.cli import common
 from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._files import printable, read_json
 from thesisrecon.runtime._executors import available_threads
@@ -37,16 +23,18 @@ from thesisrecon.runtime._signals import set_error_stream
 
 _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 """Small depth maps: the demo should show a model soon."""
-Images = Annotated[Path | None, folder_argument("IMAGES", "Folder of images; with --every also a video.")]
+Images = Annotated[
+    Path | None, common.folder_argument("IMAGES", "Folder of images; with --every also a video.")
+]
 _EVERY_HELP = "Take the sharpest of each N frames of a video or folder."
 Every = Annotated[int | None, typer.Option("--every", min=1, metavar="N", help=_EVERY_HELP)]
 _SOURCE_HELP = (
     "Take the matches of a COLMAP database, or the tracks of a COLMAP sparse model; its cameras are not used."
 )
-Source = Annotated[Path | None, folder_option(_SOURCE_HELP, "--from", metavar="DATABASE|SPARSE")]
+Source = Annotated[Path | None, common.folder_option(_SOURCE_HELP, "--from", metavar="DATABASE|SPARSE")]
 _IMAGES_HELP = "With --from: the folder of the images, for colours and the model."
-ImagesFolder = Annotated[Path | None, folder_option(_IMAGES_HELP, "--images")]
-Masks = Annotated[Path | None, folder_option("Folder of masks: black pixels are left out.", "--masks")]
+ImagesFolder = Annotated[Path | None, common.folder_option(_IMAGES_HELP, "--images")]
+Masks = Annotated[Path | None, common.folder_option("Folder of masks: black pixels are left out.", "--masks")]
 _PRESET_HELP = "Pipeline to start from (default: default)."
 Preset = Annotated[Literal["default", "thesis"] | None, typer.Option("--preset", help=_PRESET_HELP)]
 _CAMERAS_HELP = "One camera per image size, or one per image."
@@ -71,14 +59,14 @@ OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)
 
 
 def reconstruct(
-    out: OutputFolder, images: Images = None, every: Every = None, source: Source = None,
+    out: common.OutputFolder, images: Images = None, every: Every = None, source: Source = None,
     images_folder: ImagesFolder = None, masks: Masks = None, preset: Preset = None, cameras: Cameras = None,
-    config: Config = None, settings: Settings = None, seed: Seed = 0, threads: Threads = 0,
-    max_size: MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
+    config: Config = None, settings: Settings = None, seed: common.Seed = 0, threads: common.Threads = 0,
+    max_size: common.MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
     overwrite: OverwriteRun = False,
 ) -> None:  # fmt: skip
     """Reconstruct cameras, points and a textured model from images."""
-    cap_threads(threads)
+    common.cap_threads(threads)
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
     chosen |= {"max_size": max_size, "set": settings or [], "masks": masks}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
@@ -92,9 +80,11 @@ def reconstruct(
     _run(source, out, seed, chosen | options | {"images": images_folder}, matched=True)
 
 
-def demo(out: OutputFolder = Path("out/demo"), threads: Threads = 0, overwrite: OverwriteRun = False) -> None:
+def demo(
+    out: common.OutputFolder = Path("out/demo"), threads: common.Threads = 0, overwrite: OverwriteRun = False
+) -> None:
     """Reconstruct the courtyard images that come with the package."""
-    cap_threads(threads)
+    common.cap_threads(threads)
     from thesisrecon.io._images import demo_images
 
     options = {"threads": threads or None, "overwrite": overwrite}
@@ -109,12 +99,12 @@ def _run(source: Any, out: Path, seed: int, options: Mapping[str, Any], *, match
         function = from_matches.reconstruct_from_colmap
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"repeat the command to resume from {printable(str(out))}"
-    with interruptible(advice), progress_bars() as progress:
+    with common.interruptible(advice), common.progress_bars() as progress:
         result = function(source, out, seed=seed, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
 
 
-def inspect(out: Annotated[Path, folder_argument("OUT", "Output folder of a run.")]) -> None:
+def inspect(out: Annotated[Path, common.folder_argument("OUT", "Output folder of a run.")]) -> None:
     """Print the summary of a run, or where it stands if it has not finished."""
     from thesisrecon.pipeline.run import run_position
     from thesisrecon.runtime._run_folder import is_running
@@ -215,24 +205,24 @@ _LIGHT_HELP = "Lighting: none, camera headlight or sun."
 _BACKGROUND_HELP = "Background colour, such as white or #20304f."
 _METHOD_HELP = "Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."
 _TWO_OR_THREE = typer.Argument(
-    parser=parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."
+    parser=common.parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."
 )
 Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
 
 
 def compare(
-    a: Annotated[Path, folder_argument("A", f"Model: {_KINDS}.")],
-    b: Annotated[Path, folder_argument("B", "Reference: any of these.")],
+    a: Annotated[Path, common.folder_argument("A", f"Model: {_KINDS}.")],
+    b: Annotated[Path, common.folder_argument("B", "Reference: any of these.")],
     json: Annotated[Path | None, typer.Option("--json", help="Write all numbers to this file.")] = None,
     page: Annotated[Path | None, typer.Option("--page", help=_PAGE_HELP)] = None,
     max_time_difference: Annotated[
         float, typer.Option("--max-time-difference", min=0.0, help="Largest difference of paired times, s.")
     ] = 0.01,
     time_offset: Annotated[float, typer.Option("--time-offset", help="Added to the times of B, s.")] = 0.0,
-    overwrite: Overwrite = False,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Compare two models of the same images after a similarity alignment."""
-    cap_threads(0)
+    common.cap_threads(0)
     from thesisrecon.api.models import compare_models
     from thesisrecon.io._files import json_text, write_new
     from thesisrecon.report._assessment import camera_table, headline, point_table, summary_table
@@ -262,16 +252,16 @@ def compare(
 
 
 def export(
-    model: Annotated[Path, folder_argument("OUT", "Folder of a run, or a COLMAP model.")],
-    folder: OutputFolder, to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=_TO_HELP)],
-    images: Annotated[Path | None, folder_option(_ORIGINALS_HELP, "--images")] = None,
-    masks: Annotated[Path | None, folder_option(_MASKS_HELP, "--masks")] = None,
+    model: Annotated[Path, common.folder_argument("OUT", "Folder of a run, or a COLMAP model.")],
+    folder: common.OutputFolder, to: Annotated[str, typer.Option("--to", metavar="FORMAT", help=_TO_HELP)],
+    images: Annotated[Path | None, common.folder_option(_ORIGINALS_HELP, "--images")] = None,
+    masks: Annotated[Path | None, common.folder_option(_MASKS_HELP, "--masks")] = None,
     scale: Annotated[tuple[str, str, float] | None, _SCALE] = None,
     align: Annotated[Path | None, typer.Option("--align", metavar="FILE", help=_ALIGN_HELP)] = None,
-    threads: Threads = 0, overwrite: Overwrite = False,
+    threads: common.Threads = 0, overwrite: common.Overwrite = False,
 ) -> None:  # fmt: skip
     """Write cameras, points and undistorted images for another program."""
-    cap_threads(threads)
+    common.cap_threads(threads)
     if scale is not None and align is not None:
         raise UsageError("--scale and --align exclude each other; positions determine the scale")
     from thesisrecon.api.export import export as write_export
@@ -289,7 +279,7 @@ def export(
     if align is not None:
         found, report = align_to_positions(found, align)
         typer.echo("\n".join(map(printable, str(report).splitlines())))
-    with interruptible("repeat the command to write all files"):
+    with common.interruptible("repeat the command to write all files"):
         images, lost = images or recorded_images(model), list[str]()
         if masks is None:
             masks, lost = recorded_masks(model, to)
@@ -302,23 +292,23 @@ def export(
 
 
 def render(
-    run: Annotated[Path, folder_argument("OUT", "Output folder of a run.")],
+    run: Annotated[Path, common.folder_argument("OUT", "Output folder of a run.")],
     path: Annotated[Literal["orbit", "interpolate"], typer.Option("--path", help=_PATH_HELP)] = "orbit",
     frames: Frames = 90,
     size: Annotated[str | None, typer.Option("--size", metavar="WxH", help=_SIZE_HELP)] = None,
     light: Annotated[Literal["none", "camera", "sun"], typer.Option("--light", help=_LIGHT_HELP)] = "none",
     background: Annotated[str, typer.Option("--background", help=_BACKGROUND_HELP)] = "black",
-    folder: Annotated[Path | None, folder_option("Output folder (OUT/views/PATH).")] = None,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
+    folder: Annotated[Path | None, common.folder_option("Output folder (OUT/views/PATH).")] = None,
+    threads: common.Threads = 0,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Render the model of a run along a camera path."""
-    cap_threads(threads)
+    common.cap_threads(threads)
     if run.is_file():
         raise UsageError(f"render takes the output folder of a run; {run} is a file")
     from thesisrecon.cli.view_files import render_run
 
-    with interruptible("repeat the command to render all frames"), progress_bars() as progress:
+    with common.interruptible("repeat the command to render all frames"), common.progress_bars() as progress:
         written = render_run(
             run, folder or run / "views" / path, path=path, frames=frames,
             size=None if size is None else _size(size), light=light, background=_color(background),
@@ -353,20 +343,20 @@ def interpolate(
         Literal["interpolation", "tensor"], typer.Option("--method", help=_METHOD_HELP)
     ] = "interpolation",
     frames: Frames = 21,
-    seed: Seed = 0,
-    max_size: MaxSize = None,
-    folder: Annotated[Path | None, folder_option("Output folder (views/METHOD).")] = None,
-    threads: Threads = 0,
-    overwrite: Overwrite = False,
+    seed: common.Seed = 0,
+    max_size: common.MaxSize = None,
+    folder: Annotated[Path | None, common.folder_option("Output folder (views/METHOD).")] = None,
+    threads: common.Threads = 0,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Compute views between two or three images."""
-    cap_threads(threads)
+    common.cap_threads(threads)
     if max_size is not None and max_size < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
     from thesisrecon.cli.view_files import STRIP, interpolate_images
 
     folder = folder or Path("views") / method
-    with interruptible("repeat the command to compute all frames"), progress_bars() as progress:
+    with common.interruptible("repeat the command to compute all frames"), common.progress_bars() as progress:
         written = interpolate_images(
             folder, images, method=method, frames=frames, seed=seed, max_size_px=max_size,
             threads=threads or available_threads(), progress=progress, overwrite=overwrite,
@@ -402,7 +392,7 @@ def run_command(arguments: list[str]) -> int:
     with warnings.catch_warnings():
         # Unreadable images are reported by this program, in one sentence.
         warnings.filterwarnings("ignore", module=r"PIL\.")
-        return exit_code_of(lambda: app(arguments, standalone_mode=False))
+        return common.exit_code_of(lambda: app(arguments, standalone_mode=False))
 
 
 def _silence_c_libraries() -> None:
@@ -424,6 +414,6 @@ def main() -> None:
     # File names may hold characters that the terminal cannot encode.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    if not os.environ.get(DEBUG_VARIABLE):
+    if not os.environ.get(common.DEBUG_VARIABLE):
         _silence_c_libraries()
     sys.exit(run_command(sys.argv[1:]))

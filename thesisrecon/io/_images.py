@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, U8, eight_bit, image_levels
 from thesisrecon.errors import Notice, StageFailure, UsageError
+from thesisrecon.io import _pixels
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
     SPECIAL_FILE,
@@ -33,20 +34,6 @@ from thesisrecon.io._files import (
     natural_key,
     printable,
     require_image_name,
-)
-from thesisrecon.io._pixels import (
-    EXIF_INVERSE,
-    EXIF_TRANSFORMS,
-    RAW_FILE,
-    RAW_SIGNATURE,
-    RAW_SUFFIXES,
-    MemoryBudget,
-    StoredImage,
-    UnusableImage,
-    decoding_bytes,
-    opaque_part,
-    refuse_raw_file,
-    resized_to,
 )
 from thesisrecon.records import Image
 
@@ -57,13 +44,13 @@ ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image
 # Raw files, and HEIC files without their reader, are listed so that they are refused by name, not overlooked.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
-    *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", *RAW_SUFFIXES),
+    *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", *_pixels.RAW_SUFFIXES),
 )
 """Suffixes of files that are listed unseen; others are listed if they begin like an image."""
 _SIGNATURE = re.compile(
     rb"\xff\xd8\xff|\x89PNG\r\n|II[*+]\0|MM\0[*+]|BM.{4}\0{4}.{4}[\x0c\x28\x34\x38\x40\x6c\x7c]\0\0\0|GIF8[79]a"
     rb"|RIFF.{4}WEBP|\0\0\0\x0cj[PX]|\xff\x4f\xff\x51|.{4}ftyp(?:avi[fs]|mif1|msf1|hei[cmsx]|hev[cmsx])"
-    rb"|P[1-6]\s+(?:#[^\n]*\n\s*)*\d+\s+\d+\s|" + RAW_SIGNATURE.pattern,
+    rb"|P[1-6]\s+(?:#[^\n]*\n\s*)*\d+\s+\d+\s|" + _pixels.RAW_SIGNATURE.pattern,
     re.DOTALL,
 )
 """First bytes of images and raw files, under any name."""
@@ -74,7 +61,7 @@ MIN_SIDE = 64
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP", "GIF", "JPEG2000", "AVIF", "HEIF", "PPM")
 """Formats that Pillow may open: some of its other readers start external programs."""
 _ANY_SIZE = int(np.iinfo(np.int32).max)
-_budget = MemoryBudget(MAX_DECODED_BYTES)
+_budget = _pixels.MemoryBudget(MAX_DECODED_BYTES)
 
 
 @dataclass(frozen=True)
@@ -203,7 +190,7 @@ def read_images(
             return Notice("file-name", IMAGE_NAME_RULE)
         try:
             return _read(*item, max_size_px, as_stored)
-        except UnusableImage as refusal:
+        except _pixels.UnusableImage as refusal:
             return str(refusal)
 
     results = list(map_all(read, items))
@@ -249,10 +236,10 @@ def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedIma
     decoded = with_digest(decoded)
     rgb, mask = decoded.image.rgb, decoded.image.mask
     if min(rgb.shape[:2]) < MIN_SIDE:
-        raise UnusableImage(Notice("too-small", rgb.shape[1], rgb.shape[0], MIN_SIDE, MIN_SIDE))
+        raise _pixels.UnusableImage(Notice("too-small", rgb.shape[1], rgb.shape[0], MIN_SIDE, MIN_SIDE))
     used = rgb.reshape(-1, 3) if mask is None else rgb[mask]
     if len(used) and np.ptp(used, axis=0).max() < 8:
-        raise UnusableImage(Notice("blank"))
+        raise _pixels.UnusableImage(Notice("blank"))
     return decoded
 
 
@@ -274,44 +261,46 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
     try:
         found = path.stat()
     except OSError as error:
-        raise UnusableImage(Notice("unreadable", error.strerror)) from None
+        raise _pixels.UnusableImage(Notice("unreadable", error.strerror)) from None
     if not stat.S_ISREG(found.st_mode):
-        raise UnusableImage(Notice("not-a-file", SPECIAL_FILE))
+        raise _pixels.UnusableImage(Notice("not-a-file", SPECIAL_FILE))
     if found.st_size > MAX_FILE_BYTES:
-        raise UnusableImage(Notice("file-too-large", found.st_size / 2**30, MAX_FILE_BYTES / 2**30))
+        raise _pixels.UnusableImage(Notice("file-too-large", found.st_size / 2**30, MAX_FILE_BYTES / 2**30))
     try:
         # Opened here, since Pillow does not close files that it cannot read.
         with path.open("rb") as stream:
-            refuse_raw_file(stream, path.suffix)
+            _pixels.refuse_raw_file(stream, path.suffix)
             stream.seek(0)
             with PIL.Image.open(stream, formats=_formats()) as file:
-                needed = decoding_bytes(file)
+                needed = _pixels.decoding_bytes(file)
                 if needed > MAX_DECODED_BYTES:
                     kind = "progressive JPEG" if file.format == "JPEG" else file.format
                     megapixels, limit = file.size[0] * file.size[1] / 1e6, MAX_DECODED_BYTES / 2**30
-                    raise UnusableImage(Notice("decoding-memory", megapixels, kind, needed / 2**30, limit))
+                    raise _pixels.UnusableImage(
+                        Notice("decoding-memory", megapixels, kind, needed / 2**30, limit)
+                    )
                 with _budget.reserve(needed), closing(file):
                     return use(file)
-    except UnusableImage:
+    except _pixels.UnusableImage:
         raise
     except PIL.Image.DecompressionBombError:
         limit = 2 * (PIL.Image.MAX_IMAGE_PIXELS or 0) // 10**6
-        raise UnusableImage(Notice("too-many-pixels", limit)) from None
+        raise _pixels.UnusableImage(Notice("too-many-pixels", limit)) from None
     except PIL.UnidentifiedImageError:
-        if path.suffix.lower() in RAW_SUFFIXES:
-            raise UnusableImage(RAW_FILE) from None
+        if path.suffix.lower() in _pixels.RAW_SUFFIXES:
+            raise _pixels.UnusableImage(_pixels.RAW_FILE) from None
         heic = path.suffix.lower() in (".heic", ".heif") and "HEIF" not in _formats()
-        raise UnusableImage(Notice("heic") if heic else Notice("unknown-format")) from None
+        raise _pixels.UnusableImage(Notice("heic") if heic else Notice("unknown-format")) from None
     except MemoryError:
-        raise UnusableImage(Notice("too-large-for-memory")) from None
+        raise _pixels.UnusableImage(Notice("too-large-for-memory")) from None
     except Exception as error:
         # Decoders raise errors of any kind on damaged files; the other images are still read.
         reason = printable(getattr(error, "strerror", None) or str(error))
-        raise UnusableImage(Notice("undecodable", reason)) from None
+        raise _pixels.UnusableImage(Notice("undecodable", reason)) from None
 
 
-def _image(name: str, stored: StoredImage, max_size_px: int) -> Image:
-    rgb, mask = opaque_part(resized_to(stored, max_size_px))
+def _image(name: str, stored: _pixels.StoredImage, max_size_px: int) -> Image:
+    rgb, mask = _pixels.opaque_part(_pixels.resized_to(stored, max_size_px))
     return Image(name, rgb, stored.size, mask)
 
 
@@ -328,8 +317,8 @@ def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image
 def may_be_transparent(path: Path) -> bool:
     """Whether the header of an image file states transparency."""
     try:
-        return decode_file(path, lambda file: StoredImage(file).layered)
-    except UnusableImage:
+        return decode_file(path, lambda file: _pixels.StoredImage(file).layered)
+    except _pixels.UnusableImage:
         return False
 
 
@@ -342,15 +331,17 @@ def _formats() -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in PIL.Image.OPEN)
 
 
-def load_pixels(file: PIL.Image.Image, *, as_stored: bool) -> tuple[StoredImage, float]:
+def load_pixels(file: PIL.Image.Image, *, as_stored: bool) -> tuple[_pixels.StoredImage, float]:
     """Decode an opened file; return the image, upright or as stored, and the 35 mm focal length or 0."""
     # Pillow turns TIFF images itself when it loads them, and then removes their orientation.
     stated = _exif(file)[0]
     file.load()
     orientation, focal = _exif(file)
     if not as_stored:
-        return StoredImage(file, EXIF_TRANSFORMS.get(orientation)), focal
-    return StoredImage(file, None if orientation == stated else EXIF_INVERSE.get(stated)), focal
+        return _pixels.StoredImage(file, _pixels.EXIF_TRANSFORMS.get(orientation)), focal
+    return _pixels.StoredImage(
+        file, None if orientation == stated else _pixels.EXIF_INVERSE.get(stated)
+    ), focal
 
 
 def rotation_words(as_stored: bool) -> str:
@@ -433,8 +424,8 @@ def _levels_of(source: Any, *, keep_grey: bool) -> U8 | F32:
     return image.rgb if image.mask is None else image.levels
 
 
-def _stored(source: U8 | PIL.Image.Image) -> StoredImage:
-    return StoredImage(source if isinstance(source, PIL.Image.Image) else PIL.Image.fromarray(source))
+def _stored(source: U8 | PIL.Image.Image) -> _pixels.StoredImage:
+    return _pixels.StoredImage(source if isinstance(source, PIL.Image.Image) else PIL.Image.fromarray(source))
 
 
 def full_image(source: Any) -> Image:
@@ -443,7 +434,7 @@ def full_image(source: Any) -> Image:
         return read_image(source, max_size_px=_ANY_SIZE).images[0]
     try:
         return _image("", _stored(source), _ANY_SIZE)
-    except UnusableImage as refusal:
+    except _pixels.UnusableImage as refusal:
         raise StageFailure(Notice("unusable-image", refusal)) from None
 
 
@@ -504,7 +495,7 @@ def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None
     """Pixels to use of an image at working size, by nearest neighbour, within its own mask; None: all."""
     try:
         full = decode_file(path, lambda file: load_pixels(file, as_stored=as_stored)[0].unmasked())
-    except UnusableImage as refusal:
+    except _pixels.UnusableImage as refusal:
         raise UsageError(f"the mask {path} {refusal}; replace or remove it") from None
     size, (width, height) = full.shape[::-1], image.original_size
     # Each side of a mask of another size may be rounded.

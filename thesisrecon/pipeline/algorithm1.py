@@ -17,12 +17,7 @@ from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
-from thesisrecon.pipeline.large_sets import (
-    calibrated_part,
-    cameras_from_parts,
-    from_metric,
-    prior_of_views,
-)
+from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (
     REPLACED_FILES,

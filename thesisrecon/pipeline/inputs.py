@@ -15,15 +15,8 @@ import scipy
 from thesisrecon.arrays import F64, I64, numbers, rows_of_views, sizes_of_images
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import Notice, UsageError, counted
+from thesisrecon.io import _images
 from thesisrecon.io._files import require_image_name
-from thesisrecon.io._images import (
-    DecodedImage,
-    ImageSet,
-    eight_bit_images,
-    image_without_pixels,
-    read_image,
-    rotation_words,
-)
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.projection import Observations, sort_observations
@@ -119,19 +112,21 @@ class Views:
     images: Path | Sequence[Any] | None
     as_stored: bool = False
 
-    def read(self, run: Run, digests: Sequence[str]) -> ImageSet:
+    def read(self, run: Run, digests: Sequence[str]) -> _images.ImageSet:
         """The images at working size, or grey placeholders of original size; each with its input digest."""
-        return ImageSet(tuple(self._read(run, i, digest) for i, digest in enumerate(digests)), {})
+        return _images.ImageSet(tuple(self._read(run, i, digest) for i, digest in enumerate(digests)), {})
 
-    def _read(self, run: Run, i: int, digest: str) -> DecodedImage:
+    def _read(self, run: Run, i: int, digest: str) -> _images.DecodedImage:
         width, height = (int(side) for side in self.sizes[i])
         if self.images is None:
-            return DecodedImage(image_without_pixels(self.names[i], (width, height), (width, height)), digest)
+            return _images.DecodedImage(
+                _images.image_without_pixels(self.names[i], (width, height), (width, height)), digest
+            )
         source = self.images / self.names[i] if isinstance(self.images, Path) else self.images[i]
         size = run.config.images.max_size_px
-        (found,) = read_image(source, max_size_px=size, as_stored=self.as_stored).decoded
+        (found,) = _images.read_image(source, max_size_px=size, as_stored=self.as_stored).decoded
         if found.image.original_size != (width, height):
-            now, rule = found.image.original_size, rotation_words(self.as_stored)
+            now, rule = found.image.original_size, _images.rotation_words(self.as_stored)
             raise UsageError(Notice("wrong-image-size", self.names[i], *now, width, height, rule))
         image = replace(found.image, name=self.names[i])
         return replace(found, image=image, digest=key_of(digest, found.digest))
@@ -160,7 +155,7 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
     elif images is not None:
         if len(images) != count:
             raise UsageError(f"there are {len(images)} images and {count} sizes")
-        images = eight_bit_images(*images)
+        images = _images.eight_bit_images(*images)
     return Views(names, table.astype(np.int64), images, as_stored)
 
 

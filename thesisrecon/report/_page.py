@@ -24,16 +24,9 @@ from thesisrecon.arrays import F64, U8
 from thesisrecon.errors import made
 from thesisrecon.records import Reconstruction, StageReport
 from thesisrecon.report import _assessment as words
+from thesisrecon.report import _data
 from thesisrecon.report import _drawing as drawing
 from thesisrecon.report import _figures as figures
-from thesisrecon.report._data import (
-    MAX_PICTURED,
-    ReportData,
-    pictured,
-    point_colors,
-    reprojection_distances,
-    summarize_distances,
-)
 from thesisrecon.results import ModelComparison
 
 _INTRINSICS = {
@@ -134,13 +127,13 @@ class _Pictures:
         return made(f"{what} in report.html", lambda: draw(*given, **options), self.warnings, None)
 
 
-def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
+def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> str:
     """Render the page of a run; pictures that cannot be drawn are left out, with one of ``warnings``."""
     pictures = _Pictures([] if warnings is None else warnings)
     best, names = data.best_reconstruction, [image.name for image in data.images]
-    working = reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
+    working = _data.reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
-    overall = summarize_distances(np.concatenate([np.zeros(0), *distances]))
+    overall = _data.summarize_distances(np.concatenate([np.zeros(0), *distances]))
     size = {"width": 200.0, "height": 44.0}
     drawn = pictures.make("the histograms of the residuals", figures.histograms, distances, **size)
     limit_px, bars = drawn or (1.0, [""] * len(distances))
@@ -153,7 +146,7 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
     side = drawing.depth_side(_sharing(len(data.depths)))
     depths = [
         (i + 1, names[i], picture)
-        for i in pictured(len(names))
+        for i in _data.pictured(len(names))
         if i in data.depths
         and (picture := pictures.make("a depth map", drawing.draw_depth, data.depths[i], side=side))
     ]
@@ -166,7 +159,7 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
         name for view in data.original_intrinsics for name, found in view.items() if found.std != 0.0
     )
     lists = {name: value for name, value in data.summary.items() if isinstance(value, list)}
-    sizes = {name: len(value) for name, value in lists.items() if len(value) > MAX_PICTURED}
+    sizes = {name: len(value) for name, value in lists.items() if len(value) > _data.MAX_PICTURED}
     long = {name: f"{size} entries, see summary.json" for name, size in sizes.items()}
     return render_page(
         page_resource("template.html.j2"), [*scripts, *model_scripts],
@@ -185,10 +178,12 @@ def render_report(data: ReportData, warnings: list[str] | None = None) -> str:
 
 def _sharing(images: int) -> int:
     """Number of thumbnails that share a size budget: that of the images, at most twice ``MAX_PICTURED``."""
-    return min(images, 2 * MAX_PICTURED)
+    return min(images, 2 * _data.MAX_PICTURED)
 
 
-def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int, int]:
+def _figures(
+    data: _data.ReportData, names: Sequence[str], pictures: _Pictures
+) -> tuple[dict[str, Any], int, int]:
     """The figures by id (not "scene", which plotly.js uses), points in 3D, affine cameras left out."""
     found: dict[str, Any] = {}
     points = omitted = 0
@@ -209,7 +204,7 @@ def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tup
     if data.metric is not None and (affine := data.affine) is not None:
         drawn = pictures.make(
             "the figure of the affine stratum",
-            lambda: draw_scene(affine, point_colors(affine, data.images), 5_000),
+            lambda: draw_scene(affine, _data.point_colors(affine, data.images), 5_000),
         )
         if drawn is not None:
             found["affine-figure"], _, omitted = drawn
@@ -220,11 +215,11 @@ def _figures(data: ReportData, names: Sequence[str], pictures: _Pictures) -> tup
 
 
 def _cards(
-    data: ReportData, distances: list[F64], bars: list[str], pictures: _Pictures
+    data: _data.ReportData, distances: list[F64], bars: list[str], pictures: _Pictures
 ) -> list[dict[str, Any]]:
     """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
     cards, intrinsics, count = [], data.original_intrinsics, len(data.images)
-    shown = pictured(count)
+    shown = _data.pictured(count)
     for i, image in enumerate(data.images):
         state, level, reason = _state(data, i)
         (width, height), (w, h) = image.original_size, image.size
@@ -235,13 +230,13 @@ def _cards(
             picture = pictures.make("a thumbnail", drawing.thumbnail, image, _sharing(count))
         card = {"number": i + 1, "name": image.name, "state": state, "level": level, "reason": reason}
         card |= {"size": f"{width} × {height} px{processed}{masked}", "picture": picture}
-        card |= {"residuals": summarize_distances(distances[i]), "bars": bars[i]}
+        card |= {"residuals": _data.summarize_distances(distances[i]), "bars": bars[i]}
         estimated = {name: words.plus_minus(v.value, v.std) for name, v in intrinsics[i].items()}
         cards.append({**card, "intrinsics": estimated})
     return cards
 
 
-def _state(data: ReportData, i: int) -> tuple[str, str, str]:
+def _state(data: _data.ReportData, i: int) -> tuple[str, str, str]:
     best = data.best_reconstruction
     if best is None:
         return "read", "open", ""
@@ -251,7 +246,7 @@ def _state(data: ReportData, i: int) -> tuple[str, str, str]:
     return "not registered", "bad", best.reasons[i] or "no reason was recorded"
 
 
-def _drawn_pairs(data: ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
+def _drawn_pairs(data: _data.ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
     """Draw the accepted pairs with most and fewest verified matches, else the best rejected one."""
     accepted = [pair for pair in data.pairs if pair.accepted]
     drawable = accepted or [pair for pair in data.pairs if pair.inliers]
@@ -268,7 +263,7 @@ def _drawn_pairs(data: ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
     return drawn
 
 
-def _warnings(data: ReportData, of_page: Sequence[str]) -> list[tuple[str, str]]:
+def _warnings(data: _data.ReportData, of_page: Sequence[str]) -> list[tuple[str, str]]:
     """Return (stage, sentence) of every warning; those of the whole run are only in its summary."""
     found = [(report.stage, text) for report in data.reports for text in report.warnings]
     of_run, known = data.summary.get("warnings"), {text for _, text in found}

@@ -22,16 +22,7 @@ import numpy as np
 
 from thesisrecon import records
 from thesisrecon.errors import Notice, OutputError, UsageError
-from thesisrecon.io._files import (
-    as_read,
-    is_partial,
-    link,
-    read_bytes,
-    read_json,
-    shortened,
-    write_atomically,
-    write_json,
-)
+from thesisrecon.io import _files
 from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_part
 from thesisrecon.records import StageReport
 
@@ -104,7 +95,7 @@ def read_record(path: Path, key: str) -> Any:
     if not os.path.lexists(path):
         return None
     try:
-        content = read_bytes(path, largest=_MAX_BYTES)
+        content = _files.read_bytes(path, largest=_MAX_BYTES)
         _require_sealed(content)
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             # A compressed one may be a zip bomb.
@@ -122,7 +113,7 @@ def read_record(path: Path, key: str) -> Any:
 def _is_record(path: Path) -> bool:
     """Whether a file is a record, with any key."""
     try:
-        _require_sealed(b"" if path.is_symlink() else read_bytes(path, largest=_MAX_BYTES))
+        _require_sealed(b"" if path.is_symlink() else _files.read_bytes(path, largest=_MAX_BYTES))
     except (OSError, ValueError):
         return False
     return True
@@ -164,7 +155,7 @@ class StageFolder:
                 continue
             if record is not None:
                 if place != own:
-                    link(place, own)
+                    _files.link(place, own)
                 return record
         if changed is not None:
             raise changed
@@ -178,9 +169,9 @@ class StageFolder:
             self.kept[key] = record
             return
         own = self.path / f"{item}.npz"
-        write_atomically(own, bytes_from_record(record, key), cached=True)
+        _files.write_atomically(own, bytes_from_record(record, key), cached=True)
         if self.shared is not None:
-            link(own, self.shared / f"{key}.npz")
+            _files.link(own, self.shared / f"{key}.npz")
 
     def finish(self, report: StageReport, settings: Mapping[str, Any], keys: Mapping[str, str]) -> None:
         """Write the manifest of a finished stage and remove stale records and partial files."""
@@ -190,16 +181,16 @@ class StageFolder:
             # Nothing is removed through a link.
             there = [] if self.path.is_symlink() else self.path.iterdir()
             for stale in [path for path in there if ".npz" in path.suffixes]:
-                if is_partial(stale.name) or (stale.stem not in keys and _is_record(stale)):
+                if _files.is_partial(stale.name) or (stale.stem not in keys and _is_record(stale)):
                     stale.unlink(missing_ok=True)
         except OSError as error:
             raise OutputError(self.path, error) from None
         content = {"format": FORMAT, "settings": settings, "keys": keys, "report": dataclasses.asdict(report)}
-        write_json(self.path / MANIFEST_FILE, content, cached=True)
+        _files.write_json(self.path / MANIFEST_FILE, content, cached=True)
 
     def finished(self, keys: Mapping[str, str]) -> StageReport | None:
         """Return the report of the run that computed these items; None if the keys differ."""
-        content = read_json(self.path / MANIFEST_FILE)
+        content = _files.read_json(self.path / MANIFEST_FILE)
         try:
             return _report(**content["report"]) if content["keys"] == dict(keys) else None
         except (TypeError, KeyError, AttributeError):
@@ -268,8 +259,8 @@ class RunDirectory:
         if self._check(identity, overwrite, self._outputs):
             self.remove(results)
         # A resumed run keeps its file and time: its records are not older.
-        if read_json(self.path / RUN_FILE) != as_read(identity):
-            write_json(self.path / RUN_FILE, identity)
+        if _files.read_json(self.path / RUN_FILE) != _files.as_read(identity):
+            _files.write_json(self.path / RUN_FILE, identity)
         self._outputs.kept = True
 
     def remove(self, names: Sequence[str]) -> None:
@@ -282,19 +273,19 @@ class RunDirectory:
         if not os.path.lexists(self.path / RUN_FILE):
             paths = sorted(self.path.iterdir()) if os.path.lexists(self.path) else []
             strange = [p.name for p in paths if p.is_symlink() or not outputs.lists(outputs.name_of(p))]
-            if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
+            if foreign := [name for name in strange if name != LOCK_FILE and not _files.is_partial(name)]:
                 raise UsageError(Notice("foreign-file", self.path, foreign[0]))
             return False
         there, difference = None, ""
         try:
-            there = json.loads(read_bytes(self.path / RUN_FILE).decode("utf-8"))
+            there = json.loads(_files.read_bytes(self.path / RUN_FILE).decode("utf-8"))
         except OSError as error:
             difference = f"its {RUN_FILE} cannot be read: {error.strerror or error}"
         except (ValueError, RecursionError):
             difference = f"its {RUN_FILE} is damaged, or was not written by thesisrecon"
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
-        difference = difference or next(_differences(there, as_read(identity)), "")
+        difference = difference or next(_differences(there, _files.as_read(identity)), "")
         if difference and not overwrite:
             raise UsageError(Notice("another-run", self.path, difference))
         return bool(difference)
@@ -328,7 +319,7 @@ def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
 
 
 def _short(value: Any) -> str:
-    return "not set" if value is None else shortened(json.dumps(value, ensure_ascii=False))
+    return "not set" if value is None else _files.shortened(json.dumps(value, ensure_ascii=False))
 
 
 def is_running(folder: Path) -> bool:

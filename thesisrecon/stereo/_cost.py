@@ -284,14 +284,9 @@ def _sum_along_column(ring: U16, y: int, masks: U16, out: U16) -> None:
 
 @kernel
 def cost_volume(
-    left: CostFeatures,
-    right: CostFeatures,
-    masks: U8,
-    first: int,
-    weights: I16,
-    outside: np.uint8,
+    left: CostFeatures, right: CostFeatures, masks: U8, first: int, weights: I16, outside: np.uint8,
     volume: U8,
-) -> None:
+) -> None:  # fmt: skip
     """Matching costs (H, D, W) of :func:`_row_costs`, averaged over support arms unless these are empty."""
     height, n, width = volume.shape
     if masks.shape[1] == 0:

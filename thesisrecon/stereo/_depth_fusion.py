@@ -221,12 +221,9 @@ class InverseDepth:
 
 
 def fuse_neighbours(
-    view: int,
-    views: Mapping[int, PinholeView],
-    neighbours: Sequence[int],
-    correspond: Correspond,
+    view: int, views: Mapping[int, PinholeView], neighbours: Sequence[int], correspond: Correspond,
     pool: Executor | None = None,
-) -> InverseDepth:
+) -> InverseDepth:  # fmt: skip
     """Robust weighted mean of the inverse depths measured with all neighbours (2.5)."""
     pairs = zip(neighbours, _with_idle_threads(pool, partial(correspond, view), neighbours), strict=True)
     found = [inverse_depths(views[view].P, views[j].P, pair) for j, pair in pairs if pair is not None]

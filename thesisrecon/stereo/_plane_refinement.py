@@ -201,14 +201,9 @@ def _mean_cost(first: float, second: float) -> float:
 
 @kernel(fastmath=SUMS, forceinline=True)
 def _plane_cost(
-    search: PatchSearch,
-    at: tuple[int, int],
-    plane: F64,
-    samples: F32,
-    variance: float,
-    limit: float,
+    search: PatchSearch, at: tuple[int, int], plane: F64, samples: F32, variance: float, limit: float,
     work: tuple[F64, F64, I64],
-) -> float:
+) -> float:  # fmt: skip
     """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first (occlusion).
 
     ``work``: work space (8,), (K,), and the order (K,) of the neighbours; the best two become its first two.
@@ -270,14 +265,9 @@ def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
 
 @kernel(fastmath=SUMS)
 def sweep_planes(
-    search: PatchSearch,
-    step_px: float,
-    converged_cost: float,
-    backward: bool,
-    planes: F32,
-    cost: F32,
+    search: PatchSearch, step_px: float, converged_cost: float, backward: bool, planes: F32, cost: F32,
     active: U8,
-) -> None:
+) -> None:  # fmt: skip
     """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo).
 
     Each pixel tries the planes of the two neighbours visited before, and its own shifted by ``step_px`` in

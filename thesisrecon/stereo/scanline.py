@@ -171,13 +171,9 @@ def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) ->
 
 @kernel
 def _solve_rows(
-    left: tuple[I16, U8],
-    right: tuple[I16, U8],
-    disparities: tuple[int, int],
-    model: tuple[int, float, int, int],
-    likelihood: F64,
-    out: tuple[I32, F32],
-) -> None:
+    left: tuple[I16, U8], right: tuple[I16, U8], disparities: tuple[int, int],
+    model: tuple[int, float, int, int], likelihood: F64, out: tuple[I32, F32],
+) -> None:  # fmt: skip
     """Solve the rows of a pair from the top, each with cohesion to the previous one.
 
     ``left``, ``right``: channels (K, H, W), valid (H, W); ``disparities``: first, last; ``model``: window

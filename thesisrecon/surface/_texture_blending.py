@@ -208,14 +208,9 @@ def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> No
 
 
 def paint_texture(
-    mesh: TexturedMesh,
-    prepared: Sequence[ViewSurface],
-    cameras: Sequence[Camera],
-    uv: F64,
-    cut_out: U8,
-    *,
+    mesh: TexturedMesh, prepared: Sequence[ViewSurface], cameras: Sequence[Camera], uv: F64, cut_out: U8, *,
     threads: int = 1,
-) -> U8:
+) -> U8:  # fmt: skip
     """Colours of a texture (H, W, 3) as a robust blend of all images that show a point, part by part.
 
     The weight of an image is its number of pixels per area, reduced towards image borders and outlines of

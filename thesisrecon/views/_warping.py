@@ -87,14 +87,9 @@ def _slope(
 
 @kernel
 def _draw_footprint(
-    target: F64,
-    inverse_depth: F32,
-    at: tuple[int, int],
-    limits: F64,
-    rows: tuple[int, int],
-    source: F32,
+    target: F64, inverse_depth: F32, at: tuple[int, int], limits: F64, rows: tuple[int, int], source: F32,
     front: F32,
-) -> None:
+) -> None:  # fmt: skip
     """Draw the parallelogram onto which a pixel maps, from the positions of its neighbours."""
     n_across, ax, ay, an = _slope(target, inverse_depth, at, (0, 1), limits)
     n_down, dx, dy, dn = _slope(target, inverse_depth, at, (1, 0), limits)
@@ -280,13 +275,9 @@ def distances_to_known(inverse_depth: F32) -> I16:
 
 
 def forward_map(
-    target_xy: F64 | F32,
-    inverse_depth: F64 | F32,
-    *,
-    size: tuple[int, int],
-    step: float = np.inf,
+    target_xy: F64 | F32, inverse_depth: F64 | F32, *, size: tuple[int, int], step: float = np.inf,
     threads: int = 1,
-) -> tuple[F32, F32]:
+) -> tuple[F32, F32]:  # fmt: skip
     """Position of an image that each pixel of another view shows, and its inverse depth; NaN for none.
 
     ``target_xy`` (h, w, 2): position of each pixel in the view; ``inverse_depth`` (h, w): larger is in front,

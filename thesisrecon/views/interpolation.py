@@ -76,12 +76,9 @@ def filter_extrapolated_by_median(disparity: F32, sure: F32) -> F32:
 
 
 def blend(
-    colors: tuple[F32, F32],
-    fronts: tuple[F32, F32],
-    weights: tuple[F32, F32],
-    limits: tuple[float, float, float],
-    out: tuple[F32, F32],
-) -> None:
+    colors: tuple[F32, F32], fronts: tuple[F32, F32], weights: tuple[F32, F32],
+    limits: tuple[float, float, float], out: tuple[F32, F32],
+) -> None:  # fmt: skip
     """Blend two warped images of colours (H, W, 3), inverse depths ``fronts`` and ``weights`` (H, W).
 
     The weighted mean if both inverse depths agree; else known before guessed pixels, the nearer of two known

@@ -99,14 +99,9 @@ class Shading:
 
 
 def render_mesh(
-    mesh: TexturedMesh,
-    camera: Camera,
-    *,
-    shading: Shading | None = None,
-    background: tuple[int, int, int] = (0, 0, 0),
-    samples: int = 2,
-    threads: int = 1,
-) -> RenderedView:
+    mesh: TexturedMesh, camera: Camera, *, shading: Shading | None = None,
+    background: tuple[int, int, int] = (0, 0, 0), samples: int = 2, threads: int = 1,
+) -> RenderedView:  # fmt: skip
     """Render a mesh; arguments as for :func:`thesisrecon.render`."""
     shape = camera.size[::-1]
     rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
