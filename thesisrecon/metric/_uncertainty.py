@@ -266,8 +266,8 @@ def pose_std(
     # Errors of a few blocks move some views more than they move the intrinsics.
     noise = np.full((len(poses.views), 2), common)
     for view, part in zip(*np.nonzero(np.isfinite(scatter.pose_ratios[0])), strict=True):
-        own = _inflation(scatter, *scatter.pose_ratios[:, view, part].tolist(), share)
-        noise[view, part] = max(common, own)
+        own, large = (float(ratio) for ratio in scatter.pose_ratios[:, view, part])
+        noise[view, part] = max(common, _inflation(scatter, own, large, share))
     answer = np.full((len(model.registered), 6), np.nan)
     answer[poses.views] = np.sqrt(poses.variances(np.repeat(noise, 3, axis=1), std, fault))
     return answer
