@@ -59,6 +59,22 @@ def numbers(caller: str, *, missing: tuple[str, ...] = (), **arrays: Any) -> lis
     return [_real(caller, name, value, name in missing) for name, value in arrays.items()]
 
 
+def whole_numbers(caller: str, name: str, value: Any) -> I64:
+    """Read an array of whole numbers."""
+    (found,) = numbers(caller, **{name: value})
+    if not (np.isfinite(found).all() and (found == np.rint(found)).all() and (np.abs(found) < 2**53).all()):
+        raise ValueError(f"{caller} needs whole numbers as {name}; some are none")
+    return found.astype(np.int64)
+
+
+def number_or_numbers(caller: str, name: str, value: Any) -> F64:
+    """Read a number, without axes, or an array of numbers."""
+    try:
+        return np.array(number(caller, name, value))
+    except ValueError:
+        return numbers(caller, **{name: value})[0]
+
+
 _LARGEST = 1e100  # Squares and products of a few such numbers are finite
 
 
@@ -112,6 +128,13 @@ def whole_number(caller: str, name: str, value: Any, least: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{caller} needs a whole number of at least {least} as {name}; got {value!r}")
     return int(value)
+
+
+def flag(caller: str, name: str, value: Any) -> bool:
+    """Read True or False."""
+    if not isinstance(value, bool | np.bool_ | int):
+        raise ValueError(f"{caller} needs True or False as {name}; got {value!r}")
+    return bool(value)
 
 
 def white_level(highest: float) -> float:

@@ -31,16 +31,21 @@ class Image(Record):
     mask: B8 | None = None  #: (H, W) pixels to use; None: all
 
     def __post_init__(self) -> None:
-        if isinstance(self.rgb, np.ndarray) and self.rgb.dtype == np.uint8 and self.rgb.shape[2:] == (3,):
-            return
-        rgb, known = arrays.eight_bit(arrays.image_levels(self.rgb)[0])
-        if rgb.size == np.prod(rgb.shape[:2]):
-            rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
-        if rgb.ndim != 3 or rgb.shape[2] != 3:
-            raise ValueError(f"an Image needs rgb (H, W, 3); got {np.shape(self.rgb)}")
-        object.__setattr__(self, "rgb", rgb)
+        rgb, known = self.rgb, None
+        if not (isinstance(rgb, np.ndarray) and rgb.dtype == np.uint8 and rgb.shape[2:] == (3,)):
+            rgb, known = arrays.eight_bit(arrays.image_levels(self.rgb)[0])
+            if rgb.ndim > 1 and rgb.size == np.prod(rgb.shape[:2]):
+                rgb = np.repeat(rgb.reshape(*rgb.shape[:2], 1), 3, axis=2)
+            if rgb.ndim != 3 or rgb.shape[2] != 3:
+                raise ValueError(f"an Image needs rgb (H, W, 3); got {np.shape(self.rgb)}")
+            object.__setattr__(self, "rgb", rgb)
+        if self.mask is not None:
+            plain = type(self.mask) is np.ndarray and self.mask.dtype == bool
+            mask = self.mask if plain else arrays.numbers("an Image", mask=self.mask)[0] != 0.0
+            arrays.require_shapes("an Image", rgb=(rgb, ("H", "W", 3)), mask=(mask, ("H", "W")))
+            known = mask if known is None else known & mask
         if known is not None:
-            object.__setattr__(self, "mask", known if self.mask is None else known & self.mask)
+            object.__setattr__(self, "mask", known)
 
     @property
     def has_pixels(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -17,9 +17,21 @@ from thesisrecon.api.given import (
     cameras_of_model,
     radial_coefficients,
 )
-from thesisrecon.arrays import B8, F64, I64, Record, numbers, require_finite, require_shapes
+from thesisrecon.arrays import (
+    B8,
+    F64,
+    I64,
+    Record,
+    number,
+    number_or_numbers,
+    numbers,
+    require_finite,
+    require_shapes,
+    whole_number,
+    whole_numbers,
+)
 from thesisrecon.camera import Camera
-from thesisrecon.errors import counted, unknown_word
+from thesisrecon.errors import counted, require_word
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.optimize.bundle.knowledge import (
     LOSSES,
@@ -40,6 +52,7 @@ from thesisrecon.optimize.bundle.projection import (
     MetricModel,
     Observations,
     image_points,
+    read_observations,
     sort_observations,
 )
 from thesisrecon.optimize.least_squares import MAD_FACTOR
@@ -194,12 +207,17 @@ def bundle_adjust(
     ((60, 3, 3), 0.5)
     """
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
-    free = (free,) if isinstance(free, str) else tuple(free)
+    free = tuple(free) if isinstance(free, Sequence | Set) and not isinstance(free, str) else (free,)
     chosen = _free(free)
-    if loss not in LOSSES:
-        raise ValueError(unknown_word("loss", loss, LOSSES))
+    require_word("loss", loss, LOSSES)
+    whole_number("bundle_adjust", "max_iterations", max_iterations, 1)
+    loss_px, sigma_px = (
+        None if value is None else number("bundle_adjust", name, value)
+        for name, value in (("loss_px", loss_px), ("sigma_px", sigma_px))
+    )
     start = _start(views, shared, chosen)
-    expected = _prior(start.intrinsics, prior or {}, chosen, free)
+    prior = {} if prior is None else prior
+    expected = _prior(start.intrinsics, prior, chosen, free)
     # Only for its checks of the list.
     sort_observations(observed, len(views), len(X))
     root, inside = _whitening(covariances, dense, observed), _inside(views, observed)
@@ -283,7 +301,7 @@ def _problem(
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
     (X,), shape = numbers("bundle_adjust", X=X), None
     if isinstance(xy, Tracks | Observations):
-        observed = Observations(xy.view_index, xy.point_index, xy.xy)
+        observed = read_observations("bundle_adjust", xy)
     else:
         (xy,) = numbers("bundle_adjust", missing=("xy",), xy=xy)
         shape = (len(views), len(X), 2)
@@ -301,9 +319,7 @@ def _free(names: Sequence[str]) -> B8:
     """Columns (8,) of the intrinsics to refine."""
     chosen = np.zeros(len(STD_NAMES), dtype=bool)
     for name in names:
-        if name not in COLUMNS:
-            raise ValueError(unknown_word("intrinsic in free", name, COLUMNS))
-        chosen[list(COLUMNS[name])] = True
+        chosen[list(COLUMNS[require_word("intrinsic in free", name, COLUMNS)])] = True
     return chosen
 
 
@@ -314,8 +330,8 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
         sizes = list(dict.fromkeys(view.size for view in views))
         number = np.array([sizes.index(view.size) for view in views]) if shared else np.arange(n)
     else:
-        number = np.asarray(shared)
-        if number.shape != (n,) or number.dtype.kind not in "iu":
+        number = whole_numbers("bundle_adjust", "shared, or True or False", shared)
+        if number.shape != (n,):
             raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
     table = np.zeros((n, len(STD_NAMES)))
     for row, K in zip(table, (view.K for view in views), strict=True):
@@ -329,10 +345,13 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
 def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequence[str]) -> IntrinsicsPrior:
     """Gaussian prior of the table of intrinsics (V, 8)."""
     std = np.full(table.shape, np.inf)
+    if not isinstance(prior, Mapping):
+        rule = "a mapping of free intrinsics to standard deviations"
+        raise ValueError(f"prior must be {rule}; got a {type(prior).__name__}")
     for name, value in prior.items():
         if name not in COLUMNS or not free[list(COLUMNS[name])].all():
             raise ValueError(f"prior has {name!r}, which is not among the free intrinsics {tuple(names)}")
-        values = np.asarray(value, dtype=np.float64)
+        values = number_or_numbers("bundle_adjust", f"prior[{name!r}]", value)
         if values.shape not in ((), (len(table),)):
             raise ValueError(
                 f"prior[{name!r}] must be a number or one per camera ({len(table)},); got {value}"
@@ -345,12 +364,12 @@ def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequen
 
 def _mask(name: str, chosen: Chosen, n: int, seen: I64) -> B8 | None:
     """Mask (n,) of the ``seen`` ones of numbers or of a mask; None without any."""
-    index = np.asarray(chosen)
-    if index.dtype == bool and index.shape == (n,):
+    index = whole_numbers("bundle_adjust", name, chosen)
+    if index.shape == (n,) and np.asarray(chosen).dtype == bool:
         index = np.flatnonzero(index)
     if not index.size:
         return None
-    if index.ndim != 1 or index.dtype.kind not in "iu" or index.min() < 0 or index.max() >= n:
+    if index.ndim != 1 or index.min() < 0 or index.max() >= n:
         raise ValueError(f"{name} must be numbers from 0 to {n - 1}, or a mask ({n},); got {chosen}")
     mask = np.isin(np.arange(n), np.intersect1d(index, seen))
     return mask if mask.any() else None
@@ -361,7 +380,7 @@ def _positions(name: str, at: F64 | None, std: float | F64, n: int, seen: I64) -
     if at is None:
         return NO_PRIOR
     (at,) = numbers("bundle_adjust", missing=(name,), **{name: at})
-    widths = np.asarray(std, dtype=np.float64)
+    widths = number_or_numbers("bundle_adjust", f"standard deviation of {name}", std)
     if at.shape != (n, 3) or widths.shape not in ((), (3,), (n, 3)):
         form = f"({n}, 3) with a standard deviation each, (3,) or ({n}, 3)"
         raise ValueError(f"{name} must have the shape {form}; got {at.shape} and {widths.shape}")
@@ -410,8 +429,7 @@ def _placed(
     start: MetricCameras, X: F64, known: BundleKnowledge, gauge: str
 ) -> tuple[MetricCameras, F64, BundleKnowledge]:
     """The start near known positions, and the knowledge that the gauge adds."""
-    if gauge not in ("inner", "two-cameras"):
-        raise ValueError(unknown_word("gauge", gauge, ("inner", "two-cameras")))
+    require_word("gauge", gauge, ("inner", "two-cameras"))
     centres = start.centres
     if remaining_gauge(known, start.R, start.t, X).shape[1] < 7:
         if gauge == "two-cameras":

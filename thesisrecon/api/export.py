@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
-from thesisrecon.arrays import F64, rows_of_views
+from thesisrecon.arrays import F64, flag, rows_of_views
 from thesisrecon.camera import growing_radius, undistort
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -126,9 +126,12 @@ def export(
     """
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
-    images, lost = images or recorded_images(model), list[str]()
+    flag("export", "overwrite", overwrite)
+    images, lost = recorded_images(model) if images is None else as_path("export", "images", images), []
     if masks is None:
         masks, lost = recorded_masks(model, to)
+    else:
+        masks = as_path("export", "masks", masks)
     source = model.out if isinstance(model, RunResult) else None
     source = Path(model) if isinstance(model, str | os.PathLike) else source
     require_separate(folder, to, model=source, images=images, masks=masks)
@@ -395,4 +398,4 @@ def read_mesh(path: str | Path) -> TexturedMesh:
     ...     read_mesh(folder + "/triangle.glb").vertices.tolist()
     [[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 1.0, 2.0]]
     """
-    return mesh_of_file(Path(path))
+    return mesh_of_file(as_path("read_mesh", "path", path))

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
+from thesisrecon.arrays import number, whole_number
 from thesisrecon.config import Detector
+from thesisrecon.errors import require_word
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners
 from thesisrecon.io._images import eight_bit_images, full_image
 from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.records import Features
 
+Formula = Literal["noble", "harris"]
+
 
 def detect_corners(
     image: ImageInput, *, max_corners: int = 2000, threshold_rel: float = 0.002,
-    formula: Literal["noble", "harris"] = "noble", detector: Detector | None = None,
+    formula: Formula = "noble", detector: Detector | None = None,
 ) -> Features:  # fmt: skip
     """Detect the corners of Harris and Stephens in an image at full size (4.2.1).
 
@@ -53,5 +57,10 @@ def detect_corners(
     [(31, 21), (31, 38), (58, 21), (58, 38)]
     """
     if detector is None:
+        whole_number("detect_corners", "max_corners", max_corners, 1)
+        number("detect_corners", "threshold_rel", threshold_rel)
+        require_word("formula", formula, get_args(Formula))
         detector = HarrisCorners(max_corners, threshold_rel, measure=CornerMeasure(formula))
+    elif not callable(getattr(detector, "detect", None)):
+        raise ValueError(f"detect_corners needs a Detector or None as detector; got {detector!r}")
     return detector.detect(full_image(*eight_bit_images(image)))

@@ -236,7 +236,7 @@ def _reconstruct(
         else:
             run.images_folder = images_folder(views.images)
         if masks is not None:
-            run.masks_folder = check_masks_folder(Path(masks), run.images_folder)
+            run.masks_folder = check_masks_folder(masks, run.images_folder)
         matches = [[m.i, m.j, m.xy1, m.xy2] for m in given.matches]
         content = [views.names, views.sizes, given.corners, matches]
         source = {"name": name, "digest": key_of(content)}

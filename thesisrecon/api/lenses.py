@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thesisrecon.api.given import CameraInput, as_cameras
+from thesisrecon.api.given import CameraInput, as_cameras, checked_sizes
 from thesisrecon.arrays import B8, F32, F64, I64, U8, numbers, require_calibration, require_shapes
 from thesisrecon.camera import Camera, distort, undistort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
@@ -223,7 +223,7 @@ def rectify_cameras(
     if not baseline > 1e-12 * float(np.abs(centres).max()):
         raise ValueError(f"rectify_cameras needs two camera centres; both are {centres[0].tolist()}")
     R = rotation_along_baseline(np.array([camera.P for camera in given]))
-    width, height = given[0].size if size is None else size
+    width, height = given[0].size if size is None else checked_sizes("rectify_cameras", size, 1)[0].tolist()
     if K is None:
         focal = float(np.exp(np.mean([np.log(np.diag(camera.K)[:2]) for camera in given])))
         # Where the centres of the images go, about the middle of the frame.
@@ -243,6 +243,8 @@ def rectify_cameras(
 
 
 def _calibration(caller: str, camera: Camera, K: F64 | None) -> F64:
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{caller} needs a thesisrecon.Camera; got a {type(camera).__name__}")
     if K is None:
         return camera.K
     (K,) = numbers(caller, K=K)

@@ -110,7 +110,7 @@ def reconstruct(
         images = _images.list_of_images("reconstruct", images)
     run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
     if masks is not None:
-        run.masks_folder = _images.check_masks_folder(Path(masks), run.images_folder)
+        run.masks_folder = _images.check_masks_folder(masks, run.images_folder)
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     source = None if frames is None else frames.identity

@@ -30,6 +30,7 @@ from thesisrecon.io import _pixels
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
     SPECIAL_FILE,
+    as_path,
     is_image_name,
     natural_key,
     printable,
@@ -442,8 +443,9 @@ _MASK_NAMES = "the mask of IMG.jpg is IMG.jpg.png, or IMG with any suffix"
 USELESS_MASKS = Notice("useless-masks")
 
 
-def check_masks_folder(masks: Path, images: Path | None) -> Path:
-    """Absolute path; UsageError if the folder holds no masks or is the folder of the images."""
+def check_masks_folder(masks: Any, images: Path | None) -> Path:
+    """Absolute path; UsageError if it is none, the folder holds no masks or is the folder of the images."""
+    masks = as_path("a run", "masks", masks)
     if not list_images(masks):
         raise UsageError(f"there are no masks in {masks}; {_MASK_NAMES}")
     if images is not None and images.is_dir() and masks.samefile(images):

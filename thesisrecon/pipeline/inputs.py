@@ -19,7 +19,7 @@ from thesisrecon.io import _images
 from thesisrecon.io._files import require_image_name
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
-from thesisrecon.optimize.bundle.projection import Observations, sort_observations
+from thesisrecon.optimize.bundle.projection import Observations, read_observations, sort_observations
 from thesisrecon.pipeline.large_sets import tracks_of_part
 from thesisrecon.pipeline.matching import (
     FromImages,
@@ -135,15 +135,17 @@ class Views:
 def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored: bool = False) -> Views:
     sizes = sizes_of_images(sizes)
     try:
-        table = np.asarray(sizes, dtype=np.float64).reshape(len(sizes), 2)
-    except (TypeError, ValueError):
+        (table,) = numbers("a run", sizes=sizes)
+        table = table.reshape(len(table), 2)
+    except ValueError:
         raise UsageError("sizes must be (V, 2): width and height of each image in pixels") from None
     if not (np.isfinite(table).all() and (table >= 1).all() and (table == np.rint(table)).all()):
         raise UsageError("sizes must be whole numbers of pixels, at least 1")
     count = len(table)
-    names = [f"image-{i}" for i in range(count)] if names is None else [str(name) for name in names]
-    if len(names) != count or len(set(names)) != count:
-        raise UsageError(f"names must be {count} different names, one for each size; got {len(names)}")
+    given = range(count) if names is None else _listed("names", names, count)
+    names = [f"image-{name}" if names is None else str(name) for name in given]
+    if len(set(names)) != count:
+        raise UsageError(f"names must be {count} different names, one for each size; got {len(set(names))}")
     for name in names:
         require_image_name(name, "the list of names")
     if isinstance(images, str | Path):
@@ -153,9 +155,7 @@ def views_of(sizes: Any, names: Sequence[str] | None, images: Any, *, as_stored:
             raise UsageError(Notice("missing-named-images", len(missing), count, folder, missing[0]))
         images = folder
     elif images is not None:
-        if len(images) != count:
-            raise UsageError(f"there are {len(images)} images and {count} sizes")
-        images = _images.eight_bit_images(*images)
+        images = _images.eight_bit_images(*_listed("images", images, count))
     return Views(names, table.astype(np.int64), images, as_stored)
 
 
@@ -163,8 +163,8 @@ def given_matches(
     keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], PairMatches], views: Views
 ) -> Given:
     count = len(views.names)
-    if keypoints is not None and len(keypoints) != count:
-        raise UsageError(f"there are keypoints of {len(keypoints)} images and {count} sizes")
+    if keypoints is not None:
+        keypoints = _listed("keypoints", keypoints, count)
     if not isinstance(matches, Mapping):
         raise UsageError(Notice("no-table-of-matches", type(matches).__name__))
     corners = None if keypoints is None else [_positions(xy, i, views) for i, xy in enumerate(keypoints)]
@@ -172,7 +172,7 @@ def given_matches(
     for key, given in sorted(matches.items()):
         i, j = _pair(key, count, matches)
         where = f"matches of images {i} and {j}"
-        if isinstance(given, tuple | list) and len(given) == 2 and np.ndim(given[0]) == 2:
+        if isinstance(given, tuple | list) and len(given) == 2 and _dimensions(given[0]) == 2:
             xy1, xy2 = _positions(given[0], i, views), _positions(given[1], j, views)
             if len(xy1) != len(xy2):
                 raise UsageError(Notice("unequal-positions", where, len(xy1), len(xy2)))
@@ -192,6 +192,26 @@ def given_matches(
         corners, found = corners_from_matches(found, count)
     turned = (m if m.i < m.j else _match_record((m.j, m.i), m.index2, m.index1, m.xy2, m.xy1) for m in found)
     return Given(corners, list(turned))
+
+
+def _listed(name: str, given: Any, count: int) -> list[Any]:
+    """The things of a list, one for each size."""
+    try:
+        found = list(np.asarray(given) if hasattr(given, "__array__") else given)
+    except Exception:
+        what = f"a list with one for each of the {count} sizes"
+        raise UsageError(f"{name} must be {what}; got a {type(given).__name__}") from None
+    if len(found) != count:
+        raise UsageError(f"there are {name} of {len(found)} images and {count} sizes")
+    return found
+
+
+def _dimensions(value: Any) -> int:
+    """Number of axes; 2 of lists of different lengths and of what cannot be read, which is refused later."""
+    try:
+        return np.ndim(value)
+    except Exception:
+        return 2
 
 
 def _pair(key: Any, count: int, matches: Mapping[Any, Any]) -> tuple[int, int]:
@@ -231,7 +251,10 @@ def _rows(given: Any, pair: tuple[int, int], corners: Sequence[F64]) -> I64:
     where = f"matches of images {pair[0]} and {pair[1]}"
     if np.ma.is_masked(given):
         raise UsageError(f"{where} have rows that are hidden by a mask; leave them out")
-    rows = np.asarray(given)
+    try:
+        rows = np.asarray(given)
+    except Exception:
+        raise UsageError(Notice("no-rows-of-keypoints", where, "unequal", type(given).__name__)) from None
     if rows.size == 0:
         return np.zeros((0, 2), dtype=np.int64)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
@@ -271,17 +294,17 @@ def given_tracks(tracks: Tracks | F64, views: Views) -> Given:
             raise UsageError(f"tracks must be {kinds}; got a {type(tracks).__name__} {xy.shape}")
         point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
         tracks = Tracks(view, point, xy[view, point], *xy.shape[:2])
-    view, point = np.asarray(tracks.view_index), np.asarray(tracks.point_index)
     if tracks.n_views != count:
         raise UsageError(f"there are tracks of {tracks.n_views} images and {count} sizes")
     try:
-        sort_observations(Observations(view, point, tracks.xy), count, tracks.n_points)
+        view, point, pixels = read_observations("a list of tracks", tracks)
+        sort_observations(Observations(view, point, pixels), count, tracks.n_points)
     except ValueError as error:
         raise UsageError(f"the tracks are not valid: {error}") from None
     # One observation of a point in a view, sorted by point and view.
-    _, kept = np.unique(np.asarray(point, dtype=np.int64) * count + view, return_index=True)
+    _, kept = np.unique(point * count + view, return_index=True)
     kept = kept[np.bincount(point[kept], minlength=tracks.n_points)[point[kept]] >= 2]
-    view, point, xy = view[kept], point[kept], np.asarray(tracks.xy, dtype=np.float64)[kept]
+    view, point, xy = view[kept], point[kept], pixels[kept]
     here = rows_of_views(view, count)
     corners = [_positions(xy[rows], i, views) for i, rows in enumerate(here)]
     found: list[Matches] = []

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, TypedDict, get_args
 import numpy as np
 
 from thesisrecon._numba import code_digest
-from thesisrecon.arrays import I64
+from thesisrecon.arrays import I64, flag, whole_number
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
@@ -31,7 +31,7 @@ from thesisrecon.errors import (
     unknown_word,
 )
 from thesisrecon.imaging.on_demand import OnDemand
-from thesisrecon.io._files import read_json
+from thesisrecon.io._files import as_path, read_json
 from thesisrecon.io._images import ImageSet
 from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
@@ -330,15 +330,17 @@ def start_run(
     until: Until = options.get("until") or "model"
     if until not in get_args(Until):
         raise UsageError(unknown_word("stage", str(until), get_args(Until)))
+    folder, threads = as_path("a run", "out", out), options.get("threads")
     if not str(out).strip():
         raise UsageError("the output folder has no name; write . for the current one")
     seed = _checked_seed(seed)
-    workers = Workers(options.get("threads") or available_threads(), options.get("executor", "local"))
+    threads = 0 if threads is None else whole_number("a run", "threads", threads, 0)
+    workers = Workers(threads or available_threads(), options.get("executor", "local"))
     shared = options.get("shared")
-    directory = _run_folder.RunDirectory(Path(out), None if shared is None else Path(shared))
+    directory = _run_folder.RunDirectory(folder, None if shared is None else Path(shared))
     report = progress or (lambda *_: None)
     run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
-    return until, run, bool(options.get("overwrite", False))
+    return until, run, flag("a run", "overwrite", options.get("overwrite", False))
 
 
 def run_position(folder: Path) -> str:

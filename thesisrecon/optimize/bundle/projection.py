@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import B8, F64, I64, require_finite, require_shapes
+from thesisrecon.arrays import B8, F64, I64, numbers, require_finite, require_shapes, whole_numbers
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,15 @@ class SortedObservations:
         out = np.empty_like(values)
         out[self.order] = values
         return out
+
+
+def read_observations(caller: str, given: Any) -> Observations:
+    """The observations of a record with ``view_index``, ``point_index`` and ``xy``, as arrays of numbers."""
+    view, point = (
+        whole_numbers(caller, name, getattr(given, name)) for name in ("view_index", "point_index")
+    )
+    (xy,) = numbers(caller, xy=given.xy)
+    return Observations(view, point, xy)
 
 
 def sort_observations(observations: Observations, n_views: int, n_points: int) -> SortedObservations:
