@@ -190,7 +190,8 @@ def estimate_homography(
 
 def estimate_trifocal(
     xy1: F64 = NO_POINTS, xy2: F64 = NO_POINTS, xy3: F64 = NO_POINTS, *, segments: F64 = NO_SEGMENTS,
-    threshold_px: float | None = 1.0, loss_px: float = 1.0, seed: int | Generator = 0,
+    threshold_px: float | None = 1.0, loss_px: float = 1.0, confidence: float = 0.9999,
+    max_samples: int = 60_000, seed: int | Generator = 0,
 ) -> TrifocalFit:  # fmt: skip
     """Estimate the trifocal tensor from points and lines of three views (section 3.6.3; HZ 16.4).
 
@@ -209,6 +210,8 @@ def estimate_trifocal(
         search.
     loss_px : float
         Residual at which Huber's loss becomes linear.
+    confidence, max_samples : float, int
+        As for :func:`estimate_fundamental`.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from.
 
@@ -252,12 +255,19 @@ def estimate_trifocal(
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
         raise ValueError("a segment needs two different ends; one has no length")
     rng = arrays.generator("estimate_trifocal", seed)
-    return fit_trifocal(points, segments, threshold_px=threshold_px, loss_px=loss_px, rng=rng)
+    search = _search(threshold_px, confidence, max_samples)
+    return fit_trifocal(points, segments, search=search, loss_px=loss_px, rng=rng)
+
+
+def _search(threshold_px: float | None, confidence: float, max_samples: int) -> LocallyOptimisedRansac | None:
+    budget = search_budget(confidence, max_samples)
+    return None if threshold_px is None else LocallyOptimisedRansac(threshold_px, *budget)
 
 
 def estimate_fundamental(
     xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, method: Method = "locally-optimised",
-    threshold_px: float | None = 1.0, seed: int | Generator = 0,
+    threshold_px: float | None = 1.0, confidence: float = 0.9999, max_samples: int = 60_000,
+    seed: int | Generator = 0,
 ) -> FundamentalEstimate:  # fmt: skip
     """Estimate the fundamental matrix of matches by one of the methods of chapter 5.
 
@@ -273,6 +283,9 @@ def estimate_fundamental(
     threshold_px : float or None
         Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
         "gold-standard" is used instead of these two.
+    confidence, max_samples : float, int
+        Of "locally-optimised": probability of a sample without outliers at which the search ends, and the
+        largest number of samples.
     seed : int or numpy.random.Generator
         Random seed, or the generator to draw from; the same seed gives the same result.
 
@@ -313,10 +326,11 @@ def estimate_fundamental(
     require_word("method", method, get_args(Method))
     rng = arrays.generator("estimate_fundamental", seed)
     require_threshold(threshold_px, xy1, xy2)
+    search = _search(threshold_px, confidence, max_samples)
     if threshold_px is None:
         threshold_px, method = 1.0, "gold-standard" if method in ("locally-optimised", "ransac") else method
-    if method == "locally-optimised":
-        fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
+    if method == "locally-optimised" and search is not None:
+        fit = search.estimate(xy1, xy2, rng)
     else:
         # Imported on use: the default method does not need it.
         from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, fit_all, fit_seven

@@ -284,7 +284,7 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
     with np.errstate(divide="ignore"):
         unit = np.pi * ellipse / np.stack([np.abs(np.linalg.det(A)) * sizes[0], w**2 * sizes[1]])
     found = inliers_by_chance(
-        squared_plane_distances(H, points), points, (gate, _EXACT),
+        squared_plane_distances(H, points), points.T, (gate, _EXACT),
         lambda largest: float(np.minimum(largest * unit, 1.0).max(axis=0).mean()), _SAMPLE,
     )  # fmt: skip
     if found is not None:

@@ -39,8 +39,9 @@ class LocallyOptimisedRansac:
     ----------
     threshold_px : float
         Largest Sampson distance of an inlier during the search.
-    confidence : float
-        Probability that one of six searches draws a sample without outliers.
+    confidence, max_samples : float, int
+        Probability that one of six searches draws a sample without outliers, and the largest number of
+        samples of all searches together.
     starts : int
         Number of searches that must end at the same score.
     inlier_sigmas : float
@@ -54,13 +55,14 @@ class LocallyOptimisedRansac:
 
     threshold_px: float = 1.0
     confidence: float = 0.9999
+    max_samples: int = 60000
     starts: int = 3
     inlier_sigmas: float = np.inf
 
     max_starts = 10  # maximum number of searches
     # Minimum number of samples of six searches together, for any inlier ratio, because a wrong F of a
-    # dominant plane also has many inliers; and maximum number of samples of all searches together.
-    min_samples, max_samples = 4000, 60000
+    # dominant plane also has many inliers.
+    min_samples = 4000
     gates = (2.0, 1.5, 1.0)  # residual limits of the successive refinements, in units of ``threshold_px``
     inlier_floor = 0.3  # residual up to which a match is always an inlier, in units of ``threshold_px``
 
@@ -69,6 +71,8 @@ class LocallyOptimisedRansac:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
         if not 0.0 < self.confidence < 1.0:
             raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
+        if not self.max_samples >= self.max_starts:
+            raise ValueError(f"max_samples must be at least {self.max_starts}; got {self.max_samples}")
         if not 1 <= self.starts <= self.max_starts:
             raise ValueError(f"starts must lie between 1 and {self.max_starts}; got {self.starts}")
         if not self.inlier_sigmas > 0.0:

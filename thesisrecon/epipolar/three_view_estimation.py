@@ -69,12 +69,12 @@ class TrifocalFit(Record):
 
 
 def fit_trifocal(
-    every: F64, segments: F64, *, threshold_px: float | None, loss_px: float, rng: Generator
+    every: F64, segments: F64, *, search: LocallyOptimisedRansac | None, loss_px: float, rng: Generator
 ) -> TrifocalFit:
     """Fit a trifocal tensor to points (3, N, 2) and segments; see :func:`thesisrecon.estimate_trifocal`."""
     inliers = np.ones(every.shape[1], dtype=bool)
-    if threshold_px is not None and len(inliers) >= _SEARCHED:
-        inliers = _epipolar_inliers(every, threshold_px, rng)
+    if search is not None and len(inliers) >= _SEARCHED:
+        inliers = _epipolar_inliers(every, search, rng)
     points = every[:, inliers]
     n, m = points.shape[1], segments.shape[1]
     if 4 * n + 2 * m < NEEDED_EQUATIONS and n < len(inliers):
@@ -95,12 +95,12 @@ def fit_trifocal(
     return replace(fit, point_residuals_px=residuals, inliers=inliers)
 
 
-def _epipolar_inliers(points: F64, threshold_px: float, rng: Generator) -> B8:
+def _epipolar_inliers(points: F64, search: LocallyOptimisedRansac, rng: Generator) -> B8:
     """Points (N,) that agree with the fundamental matrices of all three pairs of views; all if one fails."""
     inliers = np.ones(points.shape[1], dtype=bool)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         try:
-            fit = LocallyOptimisedRansac(threshold_px=threshold_px).estimate(points[i], points[j], rng)
+            fit = search.estimate(points[i], points[j], rng)
         except StageFailure:
             # Points of a line or chance matches: the test of the tensor names them.
             return np.ones(points.shape[1], dtype=bool)

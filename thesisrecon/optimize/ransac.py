@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -129,23 +129,32 @@ def log10_false_alarms(agreeing: float, tried: float, *, chance: float, free: in
 
 
 def inliers_by_chance(
-    squared: F64, data: F64, limits: tuple[float, float], chance: Callable[[float], float], size: int
+    squared: F64,
+    columns: Iterable[F64],
+    limits: tuple[float, float],
+    chance: Callable[[float], float],
+    size: int,
 ) -> int | None:
-    """Inliers (equal ``data`` once) of a model of samples of ``size``, if chance explains them; else None.
+    """Inliers (equal data, ``columns``, once) of a model of samples of ``size``, if chance explains them.
 
     ``limits``: threshold, and rounding. ``chance`` of a squared distance is the probability that a wrong
-    datum is as near. Nothing was chosen if all data are inliers.
+    datum is as near. Nothing was chosen if all data are inliers. Else None.
     """
     threshold, exact = limits
     for reach in REACHES:
         near = squared <= max(reach * threshold, exact) ** 2
+        if near.all():
+            return None
         share = chance(max(float(squared[near].max(initial=0.0)), exact**2))
-        k = len(np.unique(data[near], axis=0))
-        if near.all() or log10_false_alarms(k, len(data), chance=share, free=size) <= CHANCE:
+        # Equal data alone have equal sums with irrational factors.
+        sums = sum(weight * column[near] for weight, column in zip(_IRRATIONAL, columns, strict=False))
+        k = len(np.unique(sums))
+        if log10_false_alarms(k, len(near), chance=share, free=size) <= CHANCE:
             return None
     return k
 
 
+_IRRATIONAL = (2.0**0.5, 3.0**0.5, 5.0**0.5, 7.0**0.5, 11.0**0.5)
 _SAMPLE = 6
 _ANY_PX = 1e4  # search threshold if all points are inliers
 _ROUNDS = 6  # rounds to find the inliers
@@ -230,7 +239,7 @@ def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples
     """Raise ``StageFailure`` if a camera of wrong points would have as many inliers."""
     area = float(np.prod(np.ptp(xy, axis=0)))
     found = inliers_by_chance(
-        _squared_residuals(P[None], homogenize(X), xy)[0], np.column_stack([X, xy]), (threshold, _EXACT_PX),
+        _squared_residuals(P[None], homogenize(X), xy)[0], (*X.T, *xy.T), (threshold, _EXACT_PX),
         lambda largest: np.pi * largest / max(area, largest), size,
     )  # fmt: skip
     if found is not None:
@@ -281,7 +290,7 @@ def resect_projective(
         P = (P * signs[:, :1, None])[(signs == signs[:, :1]).all(axis=1)]
         return np.concatenate([P, of_all, -of_all])
 
-    def squared(P: F64, rows: I64) -> F64:
+    def squared(P: F64, rows: I64 | slice) -> F64:
         return _squared_residuals(P, Y[rows], xy[rows]) / threshold_px**2
 
     def refit(P: F64, rows: I64) -> F64:
@@ -296,7 +305,7 @@ def resect_projective(
     P = refit(found.model, found.inliers)
     if np.sum(squared(P[None], found.inliers) < 1.0) < len(found.inliers):
         P = found.model
-    return frame.cameras_back(P), squared(P[None], np.arange(len(Y)))[0] < 1.0, found.samples
+    return frame.cameras_back(P), squared(P[None], slice(None))[0] < 1.0, found.samples
 
 
 def _squared_residuals(P: F64, X: F64, xy: F64) -> F64:
@@ -338,7 +347,7 @@ def resect_calibrated(
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     row = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
-    def squared(poses: F64, rows: I64) -> F64:
+    def squared(poses: F64, rows: I64 | slice) -> F64:
         return _squared_residuals(poses, Xh[rows], normalized[rows]) / threshold**2
 
     def refit(pose: F64, rows: I64) -> F64:
@@ -357,4 +366,4 @@ def resect_calibrated(
     found = search_models(poses, squared, refit, rng, len(X), 3, budget)
     if found is None:
         return None, none, budget.max_samples
-    return found.model, squared(found.model[None], np.arange(len(X)))[0] < 1.0, found.samples
+    return found.model, squared(found.model[None], slice(None))[0] < 1.0, found.samples

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon._numba import copy_to, empty, full, kernel, zeros
+from thesisrecon._numba import FAST, copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I16, U8, U16
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, StereoImage
@@ -194,42 +194,97 @@ def edge_preserving_mean(disparity: F32, step: np.float32, radius: int, out: F32
             out[y, x] = total[x] / count[x] if count[x] > 0 else np.float32(np.nan)
 
 
-def refine_by_gradient(disparity: F32, left: StereoImage, right: StereoImage) -> F32:
-    """Move disparities (H, W) by least squares of the intensities, at most half a pixel.
+LOCKING_PX = 0.17
+"""Standard deviation of the vertex of two lines about the true disparity: it tends to whole pixels."""
+
+
+def refine_by_gradient(disparity: F32, left: StereoImage, right: StereoImage, passes: int) -> F32:
+    """Move disparities (H, W) by least squares of the intensities; none farther than half a pixel from whole.
 
     In a window (Lucas and Kanade 1981), L(x) = a R(x - d - s) + b with gain a and offset b is linear in a, b
-    and a s for small s. The shift s has the prior of a rounded disparity, with variance 1 / 12, which rules
-    where texture is missing.
+    and a s for small s. Only pixels of the same surface count. The prior of d + s is the given disparity with
+    its pixel locking, which rules where texture is missing; a result beyond half a pixel from the best whole
+    disparity is not that of its minimum, and is dropped.
     """
-    size = 9  # Window in pixels, equal to that of the texture
-    (grey, seen), other = _smoothed(left), _smoothed(right)
-    known = np.isfinite(disparity) & seen
-    place = np.arange(disparity.shape[1], dtype=np.float32) - np.where(known, disparity, np.float32(0.0))
-    value, slope, inside = _sampled_row(*other, place)
-    weight = (known & inside).astype(np.float32)
-    y = grey * weight
+    (grey, seen), other, refined = _smoothed(left), _smoothed(right), disparity
+    for _ in range(passes):
+        known = np.isfinite(refined) & seen
+        place = np.arange(refined.shape[1], dtype=np.float32) - np.where(known, refined, np.float32(0.0))
+        value, slope, inside = _sampled_row(*other, place)
+        step = np.empty_like(refined)
+        used = np.where(known & inside, refined, np.float32(np.nan))
+        _least_squares_steps(used, disparity - refined, (grey, value, slope), step)
+        refined = refined + step
+    with np.errstate(invalid="ignore"):
+        near = np.abs(refined - np.rint(disparity)) <= np.float32(0.5)
+    return np.asarray(np.where(near, refined, disparity), dtype=np.float32)
 
-    def mean(values: F32) -> F32:
-        return np.asarray(scipy.ndimage.uniform_filter(values, size, mode="constant"))
 
-    r, g = value * weight, slope * weight
-    n = np.maximum(mean(weight), np.float32(0.5 / size**2))
-    my, mr, mg = (mean(one) / n for one in (y, r, g))
-    syr, syg, srg = (
-        mean(a * b) / n - ma * mb for a, b, ma, mb in ((y, r, my, mr), (y, g, my, mg), (r, g, mr, mg))
+@kernel
+def _select_similar(other: F32, centre: F32, similar: F32) -> None:
+    for x in range(len(similar)):
+        # A comparison with NaN is false.
+        similar[x] = np.float32(1.0) if abs(other[x] - centre[x]) <= np.float32(1.0) else np.float32(0.0)
+
+
+@kernel
+def _select_difference(similar: F32, values: F32, centre: F32, out: F32) -> None:
+    for x in range(len(out)):
+        out[x] = similar[x] * (values[x] - centre[x])
+
+
+@kernel(fastmath=FAST)
+def _add_product(a: F32, b: F32, out: F32) -> None:
+    for x in range(len(out)):
+        out[x] += a[x] * b[x]
+
+
+@kernel
+def _least_squares_steps(d: F32, prior: F32, images: tuple[F32, F32, F32], step: F32) -> None:
+    """Fill the steps (H, W) of :func:`refine_by_gradient`; ``prior``: where the given disparities are."""
+    # Window of 9 x 9 pixels, equal to that of the texture; every second one, as neighbours share their noise.
+    radius, stride = 4, 2
+    grey, value, slope = images
+    height, width = d.shape
+    sums, parts, none = (
+        empty((10, width), np.float32),
+        empty((4, width), np.float32),
+        zeros(width, np.float32),
     )
-    srr, sgg, syy = (mean(a * a) / n - ma * ma for a, ma in ((r, mr), (g, mg), (y, my)))
-    with np.errstate(all="ignore"):
-        # The variance of the residuals without the prior weights it.
-        det = srr * sgg - srg * srg
-        gain, shift = (syr * sgg - syg * srg) / det, (syg * srr - syr * srg) / det
-        noise = np.maximum(syy - gain * syr - shift * syg, np.float32(LEVELS**2 / 12.0))
-        ridged = sgg + np.float32(12.0) * noise / (n * np.float32(size**2))
-        det = srr * ridged - srg * srg
-        gain, shift = (syr * ridged - syg * srg) / det, (syg * srr - syr * srg) / det
-        step = -shift / gain
-        good = known & (weight > 0) & (gain > 0.25) & (np.abs(step) <= 0.5)
-    return np.asarray(np.where(good, disparity + step, disparity), dtype=np.float32)
+    # Binomial means two pixels apart correlate by 1 / 6 along an axis: 9 / 16 of them are independent.
+    variance, rounding = np.float32(9.0 / 16.0 * LOCKING_PX**2), np.float32(LEVELS**2 / 12.0)
+    for y in range(height):
+        sums[:] = 0.0
+        for b in range(max(y - radius, (y - radius) % stride), min(y + radius + 1, height), stride):
+            for dx in range(-radius, radius + 1, stride):
+                lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
+                if hi <= lo:
+                    continue
+                start, end, n, k = lo + dx, hi + dx, hi - lo, 0
+                _select_similar(d[b, start:end], d[y, lo:hi], parts[0, :n])
+                _select_difference(parts[0, :n], grey[b, start:end], grey[y, lo:hi], parts[1, :n])
+                _select_difference(parts[0, :n], value[b, start:end], value[y, lo:hi], parts[2, :n])
+                _select_difference(parts[0, :n], slope[b, start:end], none[lo:hi], parts[3, :n])
+                for i in range(4):
+                    for j in range(i, 4):
+                        _add_product(parts[i, :n], parts[j, :n], sums[k, lo:hi])
+                        k += 1
+        for x in range(width):
+            step[y, x] = 0.0
+            n = max(sums[0, x], np.float32(1.0))
+            my, mr, mg = sums[1, x] / n, sums[2, x] / n, sums[3, x] / n
+            syy, syr, syg = sums[4, x] / n - my * my, sums[5, x] / n - my * mr, sums[6, x] / n - my * mg
+            srr, srg, sgg = sums[7, x] / n - mr * mr, sums[8, x] / n - mr * mg, sums[9, x] / n - mg * mg
+            # The variance of the residuals without the prior weights it.
+            det = srr * sgg - srg * srg
+            gain, shift = (syr * sgg - syg * srg) / det, (syg * srr - syr * srg) / det
+            ridge = max(syy - gain * syr - shift * syg, rounding) / (n * variance)
+            sgg, syg = sgg + ridge, syg - ridge * gain * prior[y, x]
+            det = srr * sgg - srg * srg
+            gain, shift = (syr * sgg - syg * srg) / det, (syg * srr - syr * srg) / det
+            moved = -shift / gain
+            if gain > np.float32(0.25) and abs(moved) <= np.float32(0.5):
+                step[y, x] = moved
 
 
 def _smoothed(image: StereoImage) -> tuple[F32, B8]:
@@ -277,7 +332,7 @@ def disparity_noise(raw: F32, smooth: F32, *, refined: bool) -> float:
     subsampling = 5  # Row and column step of the pixels used for a median
     # Standard deviation of the errors that neighbours share, measured on known disparities: pixel locking,
     # or 0.03 in clean to 0.13 in noisy images of what the refinement leaves.
-    locking_px = 0.1 if refined else 0.17
+    locking_px = 0.1 if refined else LOCKING_PX
     apart = np.abs(raw[::subsampling, ::subsampling] - smooth[::subsampling, ::subsampling])
     known = apart[np.isfinite(apart)]
     return float(np.hypot(1.4826 * np.median(known), locking_px)) if len(known) else float("nan")

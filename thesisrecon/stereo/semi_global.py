@@ -267,7 +267,7 @@ class SemiGlobalMatching:
     support: bool = True
     """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
     smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
-    refinements: int = 0  #: passes of the least squares of intensities, which remove pixel locking
+    refinements: int = 2  #: passes of the least squares of intensities, which remove pixel locking
 
     # Limit for costs and path sums of one strip of rows.
     memory_mb = 256.0
@@ -355,8 +355,8 @@ class SemiGlobalMatching:
         _postprocessing.check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
         # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
         _postprocessing.remove_speckles(left, texture > np.float32(1.7), step, 60)
-        for _ in range(self.refinements):
-            left = _postprocessing.refine_by_gradient(left, *images)
+        if self.refinements:
+            left = _postprocessing.refine_by_gradient(left, *images, self.refinements)
         closed, smooth = _postprocessing.fill_pinholes(left, least=5), np.empty_like(left)
         closed[np.isnan(texture)] = np.nan
         _postprocessing.edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
