@@ -215,6 +215,17 @@ def sampson_distances(f: F64, points: F64) -> F64:
     return r
 
 
+@kernel(fastmath={"reassoc", "contract"})
+def squared_distances(F: F64, columns: F64) -> F64:
+    """Squared Sampson distances (B, N) of matches (4, N) from models F (B, 9)."""
+    out = empty((len(F), columns.shape[1]))
+    for s in range(len(F)):
+        f = F[s, 0], F[s, 1], F[s, 2], F[s, 3], F[s, 4], F[s, 5], F[s, 6], F[s, 7], F[s, 8]
+        for k in range(columns.shape[1]):
+            out[s, k] = _squared_sampson(f, columns[0, k], columns[1, k], columns[2, k], columns[3, k])
+    return out
+
+
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
     """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the inliers."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
+from thesisrecon.epipolar._sampling import squared_distances
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
+from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.relative_pose import (
     depths_of_matches,
     essential_five_points,
@@ -34,8 +35,12 @@ _GATES = (3.0, 2.0, 1.0)
 # A refit of a model up to this much worse than the best one may be better.
 _NEAR = 1.1
 _REFITTED = 1000  # matches of a refit
+# Leverage that is high, in units of the mean, and expected share of wrong matches at which it is left out.
+_HIGH, _DOUBT = 3.0, 0.05
 # Residuals in units of the frame below which they are rounding errors.
 _EXACT = 1e-9
+
+_TURNS = cross_matrix(np.eye(3))  # derivatives of a rotation about the axes
 
 Pose = tuple[F64, F64]
 
@@ -50,7 +55,8 @@ class EssentialFit:
         E = [t]x R of unit norm; a point X in the frame of the first camera is R X + t in that of the second,
         with \\|t\\| = 1.
     inliers, in_front, sigma_px : ndarray (N,) of bool, ndarray (N,) of bool, float
-        Matches within the noise; those that meet in front of both cameras; standard deviation of one image
+        Matches within the noise that were used, without those that are apart from the others where chance
+        explains them; those that meet in front of both cameras; standard deviation of one image
         coordinate.
     covariance : ndarray (6, 6)
         Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as
@@ -87,13 +93,13 @@ class _Pair:
         """F of E (..., 3, 3) in the frame."""
         return np.asarray(self.inverse2.T @ E @ self.inverse1)
 
-    def squared(self, E: F64, rows: I64) -> F64:
+    def only(self, rows: I64) -> _Pair:
+        """Some of the matches."""
+        return replace(self, points=self.points[rows], x1=self.x1[rows], x2=self.x2[rows])
+
+    def squared(self, E: F64, rows: I64 | slice = slice(None)) -> F64:
         """Squared Sampson distances (B, M) of some matches."""
-        F = self.fundamental(E)
-        a, b = homogenize(self.points[rows, :2]), homogenize(self.points[rows, 2:])
-        l2, l1 = a @ np.swapaxes(F, 1, 2), b @ F
-        e = np.sum(l2 * b, axis=2)
-        return np.asarray(e**2 / (np.sum(l2[..., :2] ** 2 + l1[..., :2] ** 2, axis=2) + 1e-300))
+        return squared_distances(self.fundamental(E).reshape(-1, 9), self.points[rows].T.copy())
 
     def pose(self, E: F64, rows: I64) -> Pose:
         """R and t of E that place most matches in front of both cameras."""
@@ -102,15 +108,22 @@ class _Pair:
     def tangent(self, R: F64, t: F64) -> tuple[F64, F64]:
         """Derivatives (9, 5) of F by rotation and by the two directions (2, 3) across t."""
         across = np.linalg.svd(t[None])[2][1:]
-        turns = [essential_from_pose(essential_from_pose(R, axis), t) for axis in np.eye(3)]
-        moves = [essential_from_pose(R, axis) for axis in across]
-        return across, np.asarray(self.fundamental(np.array([*turns, *moves])).reshape(5, 9).T)
+        turns, moves = cross_matrix(t) @ _TURNS @ R, cross_matrix(across) @ R
+        return across, np.asarray(self.fundamental(np.concatenate([turns, moves])).reshape(5, 9).T)
 
-    def normal_equations(self, R: F64, t: F64, rows: I64) -> DenseSystem:
-        """Those of the Sampson distances of some matches over the five unknowns of :meth:`tangent`."""
-        points, G, h = np.ascontiguousarray(self.points[rows]), np.empty((9, 9)), np.empty(9)
+    def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
+        """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
+        F = self.fundamental(essential_from_pose(R, t))
+        a, b = homogenize(self.points[:, :2]), homogenize(self.points[:, 2:])
+        slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
+        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ self.tangent(R, t)[1] / slope[:, None]
+        return np.asarray(np.sum(J @ np.linalg.pinv(J[inliers].T @ J[inliers]) * J, axis=1))
+
+    def normal_equations(self, R: F64, t: F64) -> DenseSystem:
+        """Those of the Sampson distances of all matches over the five unknowns of :meth:`tangent`."""
+        G, h = np.empty((9, 9)), np.empty(9)
         f = np.ascontiguousarray(self.fundamental(essential_from_pose(R, t)).ravel())
-        cost, J = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)[1]
+        cost, J = normal_equations(f, self.points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)[1]
         return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
 
 
@@ -130,6 +143,7 @@ def fit_essential(
     inliers = np.ones(n, dtype=bool) if threshold_px is None else pair.squared(E[None], every)[0] < gate**2
     if threshold_px is not None:
         _require_more_than_chance(xy1, xy2, inliers, threshold_px, samples)
+    share = chance_of_agreement(xy1, xy2, threshold_px) if threshold_px is not None else 0.0
     for _ in range(_ROUNDS):
         if inliers.sum() <= _SAMPLE:
             raise _undetermined(f"{inliers.sum()} of {n} matches agree with the best of {samples} samples")
@@ -139,7 +153,8 @@ def fit_essential(
             break
         near = distance[distance < max(2.0 * gate, float(np.median(distance[inliers])))]
         noise = trimmed_noise_scale(near, float(np.median(near)) / 0.6745, parameters=_UNKNOWN)
-        before, inliers = inliers, distance <= max(INLIER_SIGMAS * noise, _EXACT)
+        limit = max(INLIER_SIGMAS * noise, _EXACT)
+        before, inliers = inliers, _without_apart(pair, pose, distance <= limit, noise, share * limit / gate)
         if np.array_equal(inliers, before):
             break
     return _finished(pair, pose, inliers, frame.scale)
@@ -158,7 +173,7 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
             inside = some[distance < (wide * gate) ** 2]
             if len(inside) <= _SAMPLE:
                 return E
-            pose = _refined(pair, pose, inside, iterations=5)
+            pose = _refined(pair, pose, inside, iterations=3)
         return unit_norm(essential_from_pose(*pose))
 
     found = search_models(
@@ -174,8 +189,7 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
 def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
     """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
 
-    def linearize(state: Pose) -> DenseSystem:
-        return pair.normal_equations(*state, rows)
+    some = pair.only(rows)
 
     def retract(state: Pose, step: F64) -> Pose:
         R, t = state
@@ -183,16 +197,37 @@ def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pos
         return Rotation.from_rotvec(step[:3]).as_matrix() @ R, moved / np.linalg.norm(moved)
 
     def cost(state: Pose) -> float:
-        return 0.5 * float(pair.squared(essential_from_pose(*state)[None], rows).sum())
+        return 0.5 * float(some.squared(essential_from_pose(*state)[None]).sum())
 
-    return run_levenberg_marquardt(linearize, retract, cost, pose, max_iterations=iterations).state
+    return run_levenberg_marquardt(
+        lambda state: some.normal_equations(*state), retract, cost, pose, max_iterations=iterations
+    ).state
+
+
+def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: float) -> B8:
+    """Inliers without those behind a camera, and without those of high leverage if chance explains these.
+
+    A wrong match near its epipolar line, as a ``share`` of them is, has any parallax. It stands apart from
+    the right ones, and pulls the fit to itself (high leverage: Hoaglin and Welsch, The American Statistician
+    32, 1978). Where the parallax is within the noise, depths have any sign.
+    """
+    R, t = pair.pose(essential_from_pose(*pose), np.flatnonzero(inliers))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parallax = np.linalg.norm(dehomogenize(pair.x1 @ R.T) - pair.x2[:, :2], axis=1) / pair.inverse2[0, 0]
+    front = (depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
+    front |= parallax < 2.0 * max(INLIER_SIGMAS * noise, _EXACT)
+    if (inliers & front).sum() <= _SAMPLE:
+        return inliers
+    wrong, inliers = share * np.count_nonzero(~inliers), inliers & front
+    high = inliers & (pair.leverages(R, t, inliers) > _HIGH * _UNKNOWN / inliers.sum())
+    return inliers & ~high if wrong > _DOUBT * high.sum() else inliers
 
 
 def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFit:
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
     R, t = pair.pose(essential_from_pose(*pose), rows)
-    system, across = pair.normal_equations(R, t, rows), pair.tangent(R, t)[0]
+    system, across = pair.only(rows).normal_equations(R, t), pair.tangent(R, t)[0]
     sigma = float(np.sqrt(2.0 * system.cost / max(len(rows) - _UNKNOWN, 1)))
     values, vectors = np.linalg.eigh(system.hessian)
     half = np.zeros((6, 5))

@@ -35,9 +35,10 @@ def unit_normals(l: F64) -> F64:
 
 def cross_matrix(a: F64) -> F64:
     """The skew-symmetric matrix [a]x with [a]x b = a x b."""
-    z = np.zeros(a.shape[:-1])
-    rows = [z, -a[..., 2], a[..., 1], a[..., 2], z, -a[..., 0], -a[..., 1], a[..., 0], z]
-    return np.stack(rows, axis=-1).reshape(*a.shape[:-1], 3, 3)
+    out = np.zeros((*a.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[..., j, i], out[..., i, j] = a[..., k], -a[..., k]
+    return out
 
 
 _MAX_STRETCH = 1e3

@@ -18,6 +18,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, require_finite, require_shapes
+from thesisrecon.geometry._polynomials import horner, roots_in_unit_interval
 from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix
 from thesisrecon.geometry.triangulation import sort_by_point, triangulate_linear
 from thesisrecon.geometry.two_view import fundamental_from_cameras
@@ -32,69 +33,6 @@ _DEGREE = 6
 _MONOTONE = 3.0
 """If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
 _RANK = 1e-13  # singular values below this fraction of the largest are zero
-
-
-@kernel
-def _horner(c: F64, x: float) -> tuple[float, float]:
-    """Return value and derivative of the polynomial c (7,), lowest power first."""
-    value, slope = c[_DEGREE], 0.0
-    for k in range(_DEGREE - 1, -1, -1):
-        slope = slope * x + value
-        value = value * x + c[k]
-    return value, slope
-
-
-@kernel
-def _root_between(c: F64, low: float, high: float, rising: bool) -> float:
-    """Return the root of c (7,) in [low, high] by Newton's method, or bisection outside the bracket."""
-    x = 0.5 * (low + high)
-    for _ in range(100):
-        value, slope = _horner(c, x)
-        if value == 0.0:
-            break
-        if (value > 0.0) == rising:
-            high = x
-        else:
-            low = x
-        moved = x - value / slope
-        if not low < moved < high:
-            moved = 0.5 * (low + high)
-        # The bracket has no number between its ends.
-        if abs(moved - x) <= 1e-16 + 2e-16 * abs(x):
-            break
-        x = moved
-    return x
-
-
-@kernel
-def _roots_in_unit_interval(c: F64, roots: F64) -> int:
-    """Fill roots (8,) with those of c (7,) in [-1, 1] between the roots of its derivative; their number."""
-    d = empty(_DEGREE + 1)
-    cuts = empty(_DEGREE + 2)
-    found = 0
-    for order in range(_DEGREE - 1, -1, -1):
-        d[:] = 0.0
-        for k in range(order, _DEGREE + 1):
-            factor = 1.0
-            for m in range(k - order + 1, k + 1):
-                factor *= m
-            d[k - order] = factor * c[k]
-        cuts[0] = -1.0
-        for k in range(found):
-            cuts[k + 1] = roots[k]
-        cuts[found + 1] = 1.0
-        pieces, found = found + 1, 0
-        left, _ = _horner(d, -1.0)
-        for k in range(pieces):
-            right, _ = _horner(d, cuts[k + 1])
-            if (left < 0.0 < right) or (right < 0.0 < left):
-                roots[found] = _root_between(d, cuts[k], cuts[k + 1], left < 0.0)
-                found += 1
-            elif right == 0.0 and k + 1 < pieces:
-                roots[found] = cuts[k + 1]
-                found += 1
-            left = right
-    return found
 
 
 @kernel(inline="always")
@@ -125,7 +63,7 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
     n0, n1, E0, E1, E2, G, kappa = pencil
     roots, backward = empty(_DEGREE + 2), empty(_DEGREE + 1)
     best, least = math.nan, math.inf
-    for k in range(_roots_in_unit_interval(c, roots)):
+    for k in range(roots_in_unit_interval(c, roots)):
         x = roots[k]
         cost = G * x * x / (1.0 + kappa * x * x) + (n0 + n1 * x) ** 2 / (E0 + 2.0 * E1 * x + E2 * x * x)
         if cost < least:
@@ -134,7 +72,7 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
         for k in range(_DEGREE + 1):
             backward[k] = c[_DEGREE - k]
         # The reversed polynomial may vanish at 0 without a sign change: infinity is always tried.
-        count = _roots_in_unit_interval(backward, roots)
+        count = roots_in_unit_interval(backward, roots)
         roots[count] = 0.0
         for k in range(count + 1):
             y = roots[k]
@@ -168,7 +106,7 @@ def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, 
         # A monotone derivative: the only stationary point of the sector is the global minimum.
         x = 0.0
         for _ in range(30):
-            value, slope = _horner(c, x)
+            value, slope = horner(c, x)
             before = x
             x = min(max(x - value / slope, -1.0), 1.0)
             if abs(x - before) <= 4e-16 * abs(x):

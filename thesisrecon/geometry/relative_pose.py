@@ -2,49 +2,196 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement, product
-
 import numpy as np
 
+from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import F64
-from thesisrecon.geometry.homogeneous import cross_matrix, unit_norm
+from thesisrecon.geometry._polynomials import horner, roots_in_unit_interval
+from thesisrecon.geometry.homogeneous import cross_matrix
 
-# Monomials of degree 3 in (x, y, z, 1): first those of degree 3 in x, y, z alone.
-_MONOMIALS: list[tuple[int, ...]] = sorted(
-    combinations_with_replacement(range(4), 3), key=lambda m: (m.count(3), m)
-)
-_OF_PRODUCT = np.array([_MONOMIALS.index(tuple(sorted(m))) for m in product(range(4), repeat=3)])
-_COLLECT = np.eye(20)[_OF_PRODUCT]
-# Where x times each of the lower monomials stands.
-_TIMES_X = np.array([_MONOMIALS.index((*sorted((0, *m[:2])),)) for m in _MONOMIALS[10:]])
+# Products of the unknowns (x, y, z, 1): those of three as in Nister's table, then those without x^2, xy, y^2.
+_CUBIC = ("000", "111", "001", "011", "002", "003", "112", "113", "012", "013", "022", "023", "033", "122",
+          "123", "133", "222", "223", "233", "333")  # fmt: skip
+_SQUARE = ("00", "01", "02", "03", "11", "12", "13", "22", "23", "33")
+_OF_TWO = np.array([[_SQUARE.index("".join(sorted(f"{i}{j}"))) for j in range(4)] for i in range(4)])
+_OF_THREE = np.array([[_CUBIC.index("".join(sorted(f"{two}{k}"))) for k in range(4)] for two in _SQUARE])
 
 
 def essential_five_points(x1: F64, x2: F64) -> F64:
     """Essential matrices (B', 3, 3) of samples of five matches, rays (B, 5, 3) each, of unit norm.
 
     E = x E0 + y E1 + z E2 + E3 in the null space of the five equations; det E = 0 and 2 E E' E = tr(E E') E
-    are ten cubic equations (Nister, PAMI 26(6), 2004), whose solutions are the eigenvectors of the
-    multiplication by x (Stewenius, Engels and Nister, ISPRS 60, 2006). Up to ten of each sample.
+    are ten cubic equations. Eliminated, they leave three equations in x, y and 1 whose coefficients are
+    polynomials in z, and whose determinant has degree ten (Nister, PAMI 26(6), 2004). Up to ten of each
+    sample.
     """
-    rows = (x2[:, :, :, None] * x1[:, :, None, :]).reshape(len(x1), 5, 9)
-    E = np.linalg.svd(rows)[2][:, 5:].reshape(-1, 4, 3, 3)
-    square = np.einsum("biac,bjdc->bijad", E, E)
-    trace = np.einsum("bijaa->bij", square)
-    cubic = 2.0 * np.einsum("bijac,bkcd->badijk", square, E) - np.einsum("bij,bkad->badijk", trace, E)
-    minors = np.cross(E[:, :, None, 1], E[:, None, :, 2])
-    determinant = np.einsum("bia,bjka->bijk", E[:, :, 0], minors)
-    A = np.concatenate([determinant[:, None], cubic.reshape(-1, 9, 4, 4, 4)], axis=1)
-    A = A.reshape(-1, 10, 64) @ _COLLECT
-    good = np.linalg.cond(A[:, :, :10]) < 1e14
-    A, E = A[good], E[good]
-    # Each monomial in terms of the ten lower ones.
-    unit = np.broadcast_to(np.eye(10), (len(A), 10, 10))
-    lower = np.concatenate([-np.linalg.solve(A[:, :, :10], A[:, :, 10:]), unit], axis=1)
-    values, vectors = np.linalg.eig(lower[:, _TIMES_X])
-    sample, root = np.nonzero(np.abs(values.imag) < 1e-9 * (1.0 + np.abs(values)))
-    v = vectors[sample, :, root].real
-    # The last four lower monomials are x, y, z and 1.
-    return unit_norm(np.einsum("sk,skab->sab", v[:, 6:], E[sample]))
+    models = np.empty((10 * len(x1), 3, 3))
+    return models[: _solve_five(np.ascontiguousarray(x1), np.ascontiguousarray(x2), models.reshape(-1, 9))]
+
+
+@kernel
+def _solve_five(x1: F64, x2: F64, models: F64) -> int:
+    """Fill models (M, 9) with the essential matrices of samples (B, 5, 3); their number."""
+    V, A, B, c, back = empty((9, 9)), empty((10, 20)), empty((3, 3, 5)), empty(11), empty(11)
+    roots, n = empty(11), 0
+    for s in range(len(x1)):
+        for k in range(5):
+            for i in range(3):
+                for j in range(3):
+                    V[k, 3 * i + j] = x2[s, k, i] * x1[s, k, j]
+        _complete_basis(V)
+        _essential_constraints(V[5:], A)
+        if not _reduce(A):
+            continue
+        _determinant_in_z(A, B, c)
+        for k in range(11):
+            back[k] = c[10 - k]
+        for far in range(2):
+            for k in range(roots_in_unit_interval(back if far else c, roots)):
+                z = roots[k]
+                if far and z == 0.0:
+                    continue
+                n += _essential_of_root(B, 1.0 / z if far else z, V[5:], models[n])
+    return n
+
+
+@kernel
+def _complete_basis(V: F64) -> None:
+    """Replace five rows of V (9, 9) by an orthonormal basis of them and its complement (Gram-Schmidt)."""
+    for k in range(9):
+        if k >= 5:
+            # The unit vector farthest from the rows before.
+            far, most = 0, -1.0
+            for j in range(9):
+                left = 1.0
+                for i in range(k):
+                    left -= V[i, j] ** 2
+                if left > most:
+                    far, most = j, left
+            V[k] = 0.0
+            V[k, far] = 1.0
+        for _ in range(2):
+            for i in range(k):
+                along = 0.0
+                for j in range(9):
+                    along += V[i, j] * V[k, j]
+                for j in range(9):
+                    V[k, j] -= along * V[i, j]
+            size = 0.0
+            for j in range(9):
+                size += V[k, j] ** 2
+            size = 1.0 / np.sqrt(size + 1e-300)
+            for j in range(9):
+                V[k, j] *= size
+
+
+@kernel
+def _essential_constraints(N: F64, A: F64) -> None:
+    """Fill A (10, 20) with 2 E E' E - tr(E E') E and det E over ``_CUBIC``; N (4, 9) holds E0 to E3."""
+    G, minor = zeros((3, 3, 10)), empty(10)
+    A[:] = 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                _add_product(2.0, N, 3 * i + k, 3 * j + k, G[i, j])
+                # The trace of all squares.
+                _add_product(-1.0, N, 3 * j + k, 3 * j + k, G[i, i])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                _add_times(G[i, k], N, 3 * k + j, A[3 * i + j])
+        minor[:] = 0.0
+        _add_product(1.0, N, 3 + (i + 1) % 3, 6 + (i + 2) % 3, minor)
+        _add_product(-1.0, N, 3 + (i + 2) % 3, 6 + (i + 1) % 3, minor)
+        _add_times(minor, N, i, A[9])
+
+
+@kernel
+def _add_product(factor: float, N: F64, a: int, b: int, q: F64) -> None:
+    """Add a multiple of the product of two linear forms, columns of N (4, 9), to q (10,) over ``_SQUARE``."""
+    for u in range(4):
+        for v in range(4):
+            q[_OF_TWO[u, v]] += factor * N[u, a] * N[v, b]
+
+
+@kernel
+def _add_times(q: F64, N: F64, a: int, out: F64) -> None:
+    """Add the product of a quadratic form q (10,) and a linear one to ``out`` (20,) over ``_CUBIC``."""
+    for two in range(10):
+        for v in range(4):
+            out[_OF_THREE[two, v]] += q[two] * N[v, a]
+
+
+@kernel
+def _reduce(A: F64) -> bool:
+    """Bring A (10, 20) to the form [I, *] by Gauss-Jordan elimination; False if it is singular."""
+    for k in range(10):
+        pivot = k
+        for i in range(k + 1, 10):
+            if abs(A[i, k]) > abs(A[pivot, k]):
+                pivot = i
+        if not abs(A[pivot, k]) > 1e-14:
+            return False
+        for j in range(k, 20):
+            A[k, j], A[pivot, j] = A[pivot, j], A[k, j]
+        scale = 1.0 / A[k, k]
+        for j in range(k, 20):
+            A[k, j] *= scale
+        for i in range(10):
+            if i != k:
+                factor = A[i, k]
+                for j in range(k, 20):
+                    A[i, j] -= factor * A[k, j]
+    return True
+
+
+@kernel
+def _determinant_in_z(A: F64, B: F64, c: F64) -> None:
+    """Fill the polynomials B (3, 3, 5) in z of x, y and 1, and c (11,) of their determinant.
+
+    The rows x^2 z - z x^2, y^2 z - z y^2 and xyz - z xy of the reduced A have no other products of x and y.
+    """
+    B[:] = 0.0
+    c[:] = 0.0
+    for i in range(3):
+        high, low, first = A[4 + 2 * i], A[5 + 2 * i], 10
+        for part in range(3):
+            count = 4 if part == 2 else 3
+            for k in range(count):
+                B[i, part, count - 1 - k] += high[first + k]
+                B[i, part, count - k] -= low[first + k]
+            first += count
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for a in range(4):
+            for b in range(4):
+                minor = B[j, 0, a] * B[k, 1, b] - B[k, 0, a] * B[j, 1, b]
+                for d in range(5):
+                    c[a + b + d] += minor * B[i, 2, d]
+
+
+@kernel
+def _essential_of_root(B: F64, z: float, N: F64, out: F64) -> int:
+    """Write E (9,) of a root z, of unit norm, if x and y follow from B (3, 3, 5); 1, or 0 if not."""
+    M = empty((3, 3))
+    for i in range(3):
+        for part in range(3):
+            M[i, part] = horner(B[i, part], z)[0]
+    x, y, w = 0.0, 0.0, 0.0
+    for i in range(3):
+        a, b = M[i], M[(i + 1) % 3]
+        third = a[0] * b[1] - a[1] * b[0]
+        if abs(third) > abs(w):
+            x, y, w = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], third
+    if w == 0.0:
+        return 0
+    x, y, total = x / w, y / w, 0.0
+    for m in range(9):
+        out[m] = x * N[0, m] + y * N[1, m] + z * N[2, m] + N[3, m]
+        total += out[m] ** 2
+    for m in range(9):
+        out[m] /= np.sqrt(total)
+    return 1
 
 
 def poses_from_essential(E: F64) -> tuple[F64, F64]:

@@ -92,9 +92,10 @@ def search_models(
                     best, least, inliers = trial
                     share = len(inliers) / len(scored)
         good = (1.0 - LOST) * min(share**size, 1.0 - 1e-9)
-        if drawn * np.log1p(-good) < np.log1p(-budget.confidence) or (best is None and drawn >= WITHOUT):
+        missing = np.log1p(-budget.confidence) / np.log1p(-max(good, 1e-300)) - drawn
+        if missing < 0.0 or (best is None and drawn >= WITHOUT):
             break
-        batch = min(2 * batch, most)
+        batch = int(min(2 * batch, most, missing + 1.0))
     return None if best is None else Found(best, drawn, inliers)
 
 
