@@ -54,9 +54,7 @@ def test_pose_of_matches_lies_within_its_covariance(wrong):
         assert fit.sigma_px == pytest.approx(0.5, rel=0.3)
         assert fit.inliers[int(wrong * 300) :].mean() > 0.95
         assert fit.inliers[: int(wrong * 300)].sum() <= 0.15 * wrong * 300
-        turn = Rotation.from_matrix(R @ fit.R.T).as_rotvec()
-        off = np.concatenate([turn, t - fit.t - np.cross(turn, fit.t)])
-        scores.append(off @ np.linalg.pinv(fit.covariance, rcond=1e-9) @ off / 5)
+        scores.append(_score(fit, R, t))
         E = essential_from_pose(R, t)
         pose = recover_pose(-3.0 * E, xy1[fit.inliers], xy2[fit.inliers], *cameras)
         assert _off_deg(pose.R, pose.t, R, t) < 1e-5
@@ -64,6 +62,26 @@ def test_pose_of_matches_lies_within_its_covariance(wrong):
     # Among many wrong matches a few agree by chance, and count as right ones.
     assert wrong or 0.6 < np.mean(scores) < 1.6
     assert 0.4 < np.median(scores) < 5.0
+
+
+def _score(fit, R, t):
+    """Squared error of the pose in units of its covariance, by degree of freedom."""
+    turn = Rotation.from_matrix(R @ fit.R.T).as_rotvec()
+    off = np.concatenate([turn, t - fit.t - np.cross(turn, fit.t)])
+    return off @ np.linalg.pinv(fit.covariance, rcond=1e-9) @ off / 5
+
+
+def test_wrong_matches_do_not_make_the_covariance_too_small():
+    """A wrong match near its epipolar line has any parallax: one of them moved poses by 13 deviations."""
+    scores = []
+    for seed in range(60):
+        _, xy1, xy2, R, t = _pair(seed, wrong=0.3)
+        fit = estimate_essential(xy1, xy2, K)
+        assert fit.inliers[90:].mean() > 0.93
+        scores.append(_score(fit, R, t))
+    # The squares of five normal numbers have a mean of 1 and a 90 % quantile of 1.85.
+    assert 0.75 < np.mean(scores) < 1.5
+    assert np.quantile(scores, 0.9) < 2.6
 
 
 def test_exact_matches_give_the_exact_pose_and_noisy_ones_that_of_least_sampson_distance():

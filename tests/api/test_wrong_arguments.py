@@ -52,6 +52,7 @@ LISTED = {"view_index": np.tile(np.arange(6), 40), "point_index": np.repeat(np.a
 LISTED["xy"] = XY[LISTED["view_index"], LISTED["point_index"]]
 PAIR = [tr.Camera(K, R[3], np.array([x, 0.0, 0.0]), SIZE) for x in (0.0, 1.0)]
 ROWS, SIZES = tuple((k, k) for k in range(40)), np.array([SIZE] * 6)
+SEARCH = {"confidence": 0.99, "max_samples": 100, "seed": 0}
 RETURNED = {
     "RunResult", "FundamentalEstimate", "FundamentalFit", "TwoView", "BundleAdjustment", "Reconstruction",
     "SelfCalibration", "DisparityMap", "DepthMap", "ModelComparison", "StageFailure", "UsageError",
@@ -184,15 +185,15 @@ CALLS = {
     "kruppa": (tr.kruppa, {"F": KRUPPA, "sizes": SIZE}),
     "estimate_fundamental": (
         tr.estimate_fundamental,
-        {"xy1": XY[0], "xy2": XY[1], "method": "eight-point", "threshold_px": 1.0, "seed": 0},
+        {"xy1": XY[0], "xy2": XY[1], "method": "eight-point", "threshold_px": 1.0} | SEARCH,
     ),
     "estimate_homography": (
         tr.estimate_homography,
-        {"xy1": XY[0], "xy2": 2.0 * XY[0], "threshold_px": 1.0, "max_samples": 100, "seed": 0},
+        {"xy1": XY[0], "xy2": 2.0 * XY[0], "threshold_px": 1.0} | SEARCH,
     ),
     "estimate_essential": (
         tr.estimate_essential,
-        {"xy1": XY[0], "xy2": XY[1], "K1": K, "threshold_px": 1.0, "max_samples": 100, "seed": 0},
+        {"xy1": XY[0], "xy2": XY[1], "K1": K, "threshold_px": 1.0} | SEARCH,
     ),
     "recover_pose": (tr.recover_pose, {"E": K.T @ F @ K, "xy1": XY[0], "xy2": XY[1], "K1": K}),
     "decompose_homography": (
@@ -224,8 +225,8 @@ CALLS = {
             "xy3": XY[2, :9],
             "loss_px": 1.0,
             "threshold_px": None,
-            "seed": 0,
-        },
+        }
+        | SEARCH,
     ),
     "epipolar_lines": (tr.epipolar_lines, {"F": F, "xy1": XY[0]}),
     "draw_epipolar_lines": (

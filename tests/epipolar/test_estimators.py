@@ -290,8 +290,9 @@ def test_searches_that_disagree_are_repeated():
     assert fit.inliers.mean() < 0.5
     assert 3 * 1024 < fit.iterations <= 2 * LocallyOptimisedRansac.max_samples
     # Searches at a threshold below the noise and with the wider gate.
-    narrow = with_constants(LocallyOptimisedRansac, max_samples=6000)(0.02)
-    assert 6000 < drawn(narrow, xy1, xy2).iterations <= 12000
+    assert 6000 < drawn(LocallyOptimisedRansac(0.02, max_samples=6000), xy1, xy2).iterations <= 12000
+    assert 500 < estimate_fundamental(*hopeless, max_samples=1000).iterations <= 2000
+    assert estimate_fundamental(xy1, xy2, confidence=0.5).iterations <= one * 5
 
 
 LINEAR = ("eight-point", "gold-standard")

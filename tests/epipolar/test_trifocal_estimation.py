@@ -207,6 +207,10 @@ def test_wrong_matches_do_not_spoil_the_tensor():
     assert fit.inliers[:40].sum() <= 2
     assert np.isnan(fit.point_residuals_px[:, ~fit.inliers]).all()
     assert np.median(point_transfer_px(fit.T, exact)) < 0.3
+    few = estimate_trifocal(*points, confidence=0.99, max_samples=600)
+    assert (few.inliers == fit.inliers).mean() > 0.95
+    refuses(ValueError, "max_samples must be at least 10", estimate_trifocal, *points, max_samples=5)
+    refuses(ValueError, "confidence must lie", estimate_trifocal, *points, confidence=1.0)
 
 
 def test_wrong_calls_are_named():

@@ -13,7 +13,13 @@ from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multip
 from thesisrecon.epipolar._sampling import squared_distances
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    directions_across,
+    homogenize,
+    unit_norm,
+)
 from thesisrecon.geometry.relative_pose import (
     depths_of_matches,
     essential_five_points,
@@ -105,25 +111,24 @@ class _Pair:
         """R and t of E that place most matches in front of both cameras."""
         return pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
 
-    def tangent(self, R: F64, t: F64) -> tuple[F64, F64]:
-        """Derivatives (9, 5) of F by rotation and by the two directions (2, 3) across t."""
-        across = np.linalg.svd(t[None])[2][1:]
-        turns, moves = cross_matrix(t) @ _TURNS @ R, cross_matrix(across) @ R
-        return across, np.asarray(self.fundamental(np.concatenate([turns, moves])).reshape(5, 9).T)
+    def tangent(self, R: F64, t: F64) -> F64:
+        """Derivatives (9, 5) of F by rotation and by the two directions across t."""
+        turns, moves = cross_matrix(t) @ _TURNS @ R, cross_matrix(directions_across(t)) @ R
+        return np.asarray(self.fundamental(np.concatenate([turns, moves])).reshape(5, 9).T)
 
     def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
         """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
         F = self.fundamental(essential_from_pose(R, t))
         a, b = homogenize(self.points[:, :2]), homogenize(self.points[:, 2:])
         slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
-        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ self.tangent(R, t)[1] / slope[:, None]
+        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ self.tangent(R, t) / slope[:, None]
         return np.asarray(np.sum(J @ np.linalg.pinv(J[inliers].T @ J[inliers]) * J, axis=1))
 
     def normal_equations(self, R: F64, t: F64) -> DenseSystem:
         """Those of the Sampson distances of all matches over the five unknowns of :meth:`tangent`."""
         G, h = np.empty((9, 9)), np.empty(9)
         f = np.ascontiguousarray(self.fundamental(essential_from_pose(R, t)).ravel())
-        cost, J = normal_equations(f, self.points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)[1]
+        cost, J = normal_equations(f, self.points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)
         return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
 
 
@@ -193,7 +198,7 @@ def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pos
 
     def retract(state: Pose, step: F64) -> Pose:
         R, t = state
-        moved = t + step[3:] @ np.linalg.svd(t[None])[2][1:]
+        moved = t + step[3:] @ directions_across(t)
         return Rotation.from_rotvec(step[:3]).as_matrix() @ R, moved / np.linalg.norm(moved)
 
     def cost(state: Pose) -> float:
@@ -227,12 +232,12 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
     R, t = pair.pose(essential_from_pose(*pose), rows)
-    system, across = pair.only(rows).normal_equations(R, t), pair.tangent(R, t)[0]
+    system = pair.only(rows).normal_equations(R, t)
     sigma = float(np.sqrt(2.0 * system.cost / max(len(rows) - _UNKNOWN, 1)))
     values, vectors = np.linalg.eigh(system.hessian)
     half = np.zeros((6, 5))
     # t moves by w x t + d.
-    half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), across.T
+    half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), directions_across(t).T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(

@@ -15,7 +15,7 @@ from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.epipolar._matches import PairFrame, noise_width
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import cross_matrix, homogenize, unit_norm
+from thesisrecon.geometry.homogeneous import cross_matrix, directions_across, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
 from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
 from thesisrecon.optimize.ransac import Budget, inliers_by_chance, search_models
@@ -355,7 +355,7 @@ def _refine(H: F64, points: F64) -> tuple[F64, F64]:
         if not np.isfinite(now) and not np.isfinite(cost):
             raise _undetermined(f"the equations of {counted(len(points), 'match')} have rank below 8")
         if now <= cost:
-            tangent = np.linalg.svd(h[None])[2][1:]
+            tangent = directions_across(h)
             information = tangent @ G @ tangent.T
             kept, cost, gradient = h, now, tangent @ g
             damping = 0.1 * damping if damping > 1e-12 else 0.0

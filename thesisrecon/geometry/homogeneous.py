@@ -33,6 +33,13 @@ def unit_normals(l: F64) -> F64:
     return l / np.where(norm > 0.0, norm, 1.0)
 
 
+def directions_across(v: F64) -> F64:
+    """Orthonormal rows (D - 1, D) orthogonal to a vector (D,): those of a Householder reflection."""
+    u = v / np.linalg.norm(v)
+    u[0] += np.copysign(1.0, u[0])
+    return (np.eye(len(u)) - np.outer(2.0 / (u @ u) * u, u))[1:]
+
+
 def cross_matrix(a: F64) -> F64:
     """The skew-symmetric matrix [a]x with [a]x b = a x b."""
     out = np.zeros((*a.shape, 3))
