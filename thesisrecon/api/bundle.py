@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -209,12 +209,7 @@ def bundle_adjust(
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
     free = tuple(free) if isinstance(free, Sequence | Set) and not isinstance(free, str) else (free,)
     chosen = _free(free)
-    require_word("loss", loss, LOSSES)
-    whole_number("bundle_adjust", "max_iterations", max_iterations, 1)
-    loss_px, sigma_px = (
-        None if value is None else number("bundle_adjust", name, value)
-        for name, value in (("loss_px", loss_px), ("sigma_px", sigma_px))
-    )
+    loss_px, sigma_px = _noise_options(loss, loss_px, sigma_px, max_iterations)
     start = _start(views, shared, chosen)
     prior = {} if prior is None else prior
     expected = _prior(start.intrinsics, prior, chosen, free)
@@ -252,6 +247,15 @@ def bundle_adjust(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
         fit.point_covariance, fit.sigmas_to_minimum * scale,
     )  # fmt: skip
+
+
+def _noise_options(loss: str, loss_px: Any, sigma_px: Any, most: int) -> tuple[float | None, float | None]:
+    """Width of the loss and noise as numbers, if given; the other options are checked alone."""
+    require_word("loss", loss, LOSSES)
+    whole_number("bundle_adjust", "max_iterations", most, 1)
+    given = {"loss_px": loss_px, "sigma_px": sigma_px}
+    width, sigma = (None if v is None else number("bundle_adjust", name, v) for name, v in given.items())
+    return width, sigma
 
 
 def _adjusted(

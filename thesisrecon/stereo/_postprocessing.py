@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from thesisrecon._numba import FAST, copy_to, empty, full, kernel, zeros
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I16, U8, U16
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, StereoImage
@@ -233,7 +233,7 @@ def _select_difference(similar: F32, values: F32, centre: F32, out: F32) -> None
         out[x] = similar[x] * (values[x] - centre[x])
 
 
-@kernel(fastmath=FAST)
+@kernel
 def _add_product(a: F32, b: F32, out: F32) -> None:
     for x in range(len(out)):
         out[x] += a[x] * b[x]
