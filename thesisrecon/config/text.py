@@ -50,7 +50,7 @@ def build_config(
     for stage, word in (("intrinsics", "cameras"), ("images", "max_size"), ("pairs", "pairs")):
         given = over.get(stage, {})
         for key, value in options.get(stage, {}).items():
-            if isinstance(given, Mapping) and given.get(key, value) != value:
+            if isinstance(given, Mapping) and key in given and given[key] != value:
                 raise UsageError(Notice("contradicting-setting", word, stage, key, value, given[key]))
     text, base = "", None
     if isinstance(config, PipelineConfig):
