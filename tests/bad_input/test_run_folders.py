@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from tests.bad_input.files import FEATURES, links, pipe, sparse, writes
 
 pytestmark = pytest.mark.usefixtures("bounded")
 
+OTHER_SIZE = "reconstruct with a smaller --max-size or fewer --threads\n"
 CHANGED = "01-features/00000.npz was damaged or changed by another program and was computed again"
 
 
@@ -190,3 +192,32 @@ def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     assert done.stdout == b""
     files.require_sentence(done.stderr.decode("latin-1"))
     assert done.stderr.count(b"thesisrecon: ") == 1
+
+
+def limited(folder, limit, most, *before):
+    """The command on an image with a limit of the system."""
+    images, out = files.folder_of(folder, "in"), folder / "out"
+    options = ["--until", "features", "--threads", "2"]
+    return subprocess.run(
+        [*before, sys.executable, "-m", "thesisrecon", "reconstruct", str(images), "-o", str(out), *options],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}, capture_output=True, timeout=120,
+        check=False, preexec_fn=lambda: resource.setrlimit(limit, (most, most)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("megabytes", [150, 250])
+def test_too_little_memory_for_the_libraries_is_one_sentence(megabytes, tmp_path):
+    done = limited(tmp_path, resource.RLIMIT_AS, megabytes * 2**20)
+    assert done.returncode == 3
+    assert done.stderr.decode() == "thesisrecon: out of memory; " + OTHER_SIZE
+
+
+def test_a_run_goes_on_with_the_only_process_that_is_allowed(tmp_path):
+    """The limit holds for users other than root, who keeps no right here but that to the files."""
+    rights = "-all,+dac_override,+dac_read_search"
+    other = ["setpriv", "--reuid=54321", "--clear-groups", f"--inh-caps={rights}", f"--ambient-caps={rights}"]
+    if os.getuid() == 0 and shutil.which(other[0]) is None:
+        pytest.skip("setpriv is not on this machine")
+    done = limited(tmp_path, resource.RLIMIT_NPROC, 1, *(other if os.getuid() == 0 else ()))
+    assert done.returncode == 0, done.stderr
+    assert b"corners in 1 image" in done.stdout

@@ -112,10 +112,22 @@ def interruptible(advice: str) -> Iterator[None]:
         raise _Interrupted(*stop.args) from None
 
 
+def _called(command: Callable[[], object]) -> object:
+    """The result of a command; under a limit of memory libraries cannot be loaded either."""
+    try:
+        return command()
+    except (ImportError, OSError) as error:
+        # llvmlite raises a second error without the reason.
+        reasons = f"{error}, {error.__cause__ or error.__context__}"
+        if "failed to map segment" in reasons or "annot allocate memory" in reasons:
+            raise MemoryError from error
+        raise
+
+
 def exit_code_of(command: Callable[[], object]) -> int:
     """Run a command and turn errors into one sentence on stderr and an exit code."""
     try:
-        code = command()
+        code = _called(command)
         return code if isinstance(code, int) else DONE
     except UsageError as error:
         return _report(str(error), USAGE)
