@@ -121,7 +121,17 @@ class StageFailure(Exception):
 
     @classmethod
     def of(cls, code: str, *values: object) -> StageFailure:
-        """Return the failure of a code of ``messages.toml`` with the values of its texts."""
+        """Return the failure of a code of ``messages.toml``.
+
+        Parameters
+        ----------
+        code, *values : str, object
+            Key of reason, evidence and advice, and the values of their texts.
+
+        Returns
+        -------
+        StageFailure
+        """
         reason, *others = (text.format(*values) for text in _entries()[code])
         return cls(Notice.of(code, reason), *others)
 

@@ -127,7 +127,8 @@ def export(
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
     flag("export", "overwrite", overwrite)
-    images, lost = recorded_images(model) if images is None else as_path("export", "images", images), []
+    images = recorded_images(model) if images is None else as_path("export", "images", images)
+    lost: list[str] = []
     if masks is None:
         masks, lost = recorded_masks(model, to)
     else:

@@ -195,7 +195,7 @@ def seven_point_batch_solutions(Y: F64, lane: int, work: F64, F: F64) -> int:
 
 
 @kernel(inline="always")
-def _squared_sampson(f: F64, x1: float, y1: float, x2: float, y2: float) -> float:
+def _squared_sampson(f: F64 | tuple[float, ...], x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance, the summand of (5.4)."""
     a0 = f[0] * x1 + f[1] * y1 + f[2]
     a1 = f[3] * x1 + f[4] * y1 + f[5]

@@ -138,7 +138,9 @@ def fit_essential(
     """Fit an essential matrix; arguments as for :func:`thesisrecon.estimate_essential`."""
     n = len(xy1)
     if n < _SAMPLE + 1 or min(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max()) == 0.0:
-        raise _undetermined(f"{counted(n, 'match')}, at least 6 different ones are needed")
+        raise StageFailure.of(
+            "undetermined-essential", f"{counted(n, 'match')}, at least 6 different ones are needed"
+        )
     frame = PairFrame.of(xy1, xy2)
     pair, every = _Pair.of(frame, xy1, xy2, K1, K2), np.arange(n)
     # Without a search the noise of all matches is the threshold.
@@ -151,7 +153,10 @@ def fit_essential(
     share = chance_of_agreement(xy1, xy2, threshold_px) if threshold_px is not None else 0.0
     for _ in range(_ROUNDS):
         if inliers.sum() <= _SAMPLE:
-            raise _undetermined(f"{inliers.sum()} of {n} matches agree with the best of {samples} samples")
+            raise StageFailure.of(
+                "undetermined-essential",
+                f"{inliers.sum()} of {n} matches agree with the best of {samples} samples",
+            )
         pose = _refined(pair, pose, np.flatnonzero(inliers))
         distance = np.sqrt(pair.squared(essential_from_pose(*pose)[None], every)[0])
         if threshold_px is None:
@@ -187,7 +192,7 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
         refit, rng, len(pair.points), _SAMPLE, budget, near=_NEAR,
     )  # fmt: skip
     if found is None or not len(found.inliers):
-        raise _undetermined("no sample of five matches has an essential matrix")
+        raise StageFailure.of("undetermined-essential", "no sample of five matches has an essential matrix")
     return found
 
 
@@ -245,11 +250,6 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     )
 
 
-def _undetermined(evidence: str) -> StageFailure:
-    advice = "use more matches of one static scene, and the calibration of these images"
-    return StageFailure("the matches do not determine an essential matrix", evidence, advice)
-
-
 def _require_more_than_chance(xy1: F64, xy2: F64, inliers: B8, threshold_px: float, samples: int) -> None:
     """Raise ``StageFailure`` if some pose would have as many inliers among wrong matches."""
     # Weights count matches within two units, here thresholds.
@@ -258,4 +258,4 @@ def _require_more_than_chance(xy1: F64, xy2: F64, inliers: B8, threshold_px: flo
     agreeing, tried = float(weights[inliers].sum()), float(weights.sum())
     if log10_false_alarms(agreeing, tried, chance=share, free=_SAMPLE) > CHANCE:
         said = f"{inliers.sum()} of {len(xy1)} matches agree with the best of {samples} samples"
-        raise _undetermined(f"{said}, which chance explains")
+        raise StageFailure.of("undetermined-essential", f"{said}, which chance explains")

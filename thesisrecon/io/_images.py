@@ -445,12 +445,12 @@ USELESS_MASKS = Notice("useless-masks")
 
 def check_masks_folder(masks: Any, images: Path | None) -> Path:
     """Absolute path; UsageError if it is none, the folder holds no masks or is the folder of the images."""
-    masks = as_path("a run", "masks", masks)
-    if not list_images(masks):
-        raise UsageError(f"there are no masks in {masks}; {_MASK_NAMES}")
-    if images is not None and images.is_dir() and masks.samefile(images):
-        raise UsageError(f"{masks} is the folder of the images; the masks need a folder of their own")
-    return masks.absolute()
+    folder: Path = as_path("a run", "masks", masks)
+    if not list_images(folder):
+        raise UsageError(f"there are no masks in {folder}; {_MASK_NAMES}")
+    if images is not None and images.is_dir() and folder.samefile(images):
+        raise UsageError(f"{folder} is the folder of the images; the masks need a folder of their own")
+    return folder.absolute()
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
