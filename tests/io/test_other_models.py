@@ -135,3 +135,43 @@ def test_images_stand_for_their_sizes_and_corners_are_found():
         assert inward.shape == (4, 2)
         assert 0.0 < inward.min() <= inward.max() < 1.5
         np.testing.assert_allclose(inward, inward[0, 0], atol=1e-6)
+
+
+def _numbers(*arrays):
+    return " ".join(f"{v:.12g}" for a in arrays for v in np.ravel(a))
+
+
+def test_cameras_of_data_sets(tmp_path):
+    model = _model()
+    lines = [f"{v.name} {_numbers(v.K, v.R, v.t)}" for v in model.views]
+    (tmp_path / "dino_par.txt").write_text("\n".join([str(len(lines)), *lines]))
+    found = [read_model(tmp_path / "dino_par.txt")]
+    folders = [tmp_path / name for name in ("cams", "matrices", "pmvs")]
+    for folder in folders:
+        folder.mkdir()
+    for view in model.views:
+        stem, P = view.name.removesuffix(".png"), view.K @ np.c_[view.R, view.t]
+        M = np.r_[np.c_[view.R, view.t], [[0, 0, 0, 1]]]
+        text = f"extrinsic\n{_numbers(M)}\n\nintrinsic\n{_numbers(view.K)}\n\n425.0 2.5\n"
+        (folders[0] / f"{stem}_cam.txt").write_text(text)
+        (folders[1] / f"{stem}.P").write_text(_numbers(-3.0 * P))
+        (folders[2] / f"{stem}.txt").write_text(f"CONTOUR\n{_numbers(P)}\n")
+    found += [read_model(folder) for folder in folders]
+    for other in found:
+        assert [n.removesuffix(".png") for n in other.names] == ["0", "1", "2", "3"]
+        for a, b in zip(other.views, model.views, strict=True):
+            np.testing.assert_allclose(a.K, b.K, atol=1e-6)
+            np.testing.assert_allclose(a.R, b.R, atol=1e-8)
+            np.testing.assert_allclose(a.t, b.t, atol=1e-8)
+    assert compare_models(folders[1], tmp_path / "dino_par.txt").centre_error.max() < 1e-8
+
+
+def test_damaged_cameras_of_data_sets_are_refused(tmp_path):
+    (tmp_path / "par.txt").write_text("2\na.png 1 2 3\n")
+    refuses(UsageError, "2 cameras are announced, 1 follow", read_model, tmp_path / "par.txt")
+    (tmp_path / "cams").mkdir()
+    (tmp_path / "cams" / "0_cam.txt").write_text("extrinsic\n1 0 0 0\nintrinsic\n1 0 0\n")
+    refuses(UsageError, "NAME_cam.txt with extrinsic and intrinsic", read_model, tmp_path / "cams")
+    (tmp_path / "skew").mkdir()
+    (tmp_path / "skew" / "0.P").write_text(_numbers([[500, 40, 300, 1], [0, 500, 200, 2], [0, 0, 1, 3]]))
+    refuses(UsageError, "skewed pixels", read_model, tmp_path / "skew")

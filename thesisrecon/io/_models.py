@@ -32,7 +32,8 @@ def read_model(path: str | Path) -> SparseModel:
     A path is the folder of a run or of a COLMAP model (itself, or the parent of ``0`` or ``sparse/0``), a
     ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
     named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000); a transforms.json,
-    bundle.out, scene.mvs or camchain.yaml. UsageError for anything else.
+    bundle.out, scene.mvs, camchain.yaml or par.txt; a folder with NAME_cam.txt or P of each image.
+    UsageError for anything else.
     """
     path = Path(path)
     if not path.exists():
@@ -49,8 +50,8 @@ def read_model(path: str | Path) -> SparseModel:
 
 _KNOWN = (
     "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, a "
-    "transforms.json, bundle.out, scene.mvs or camchain.yaml, or a trajectory as text with 8 (TUM) or 12 "
-    "(KITTI) numbers per line"
+    "transforms.json, bundle.out, scene.mvs, camchain.yaml or par.txt, a folder with NAME_cam.txt or a "
+    "matrix P of each image, or a trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
 )
 
 
@@ -73,6 +74,8 @@ def _read_folder(folder: Path) -> SparseModel:
         points = replace(model, X=found.X, colors=found.colors)
         return replace(points, view_index=place[kept], point_index=point, xy=xy)
     if colmap is None:
+        if (other := read_other(folder)) is not None:
+            return other
         raise UsageError(f"{folder} holds no model; give {_KNOWN}")
     # The sparse/0 of a run has the pixels of the run.
     run = colmap.resolve().parent.parent
@@ -113,7 +116,8 @@ def _view(name: str, entry: Any, camera: int) -> SparseView:
     Camera(K, R, t, size or (1, 1), k)
     if k.shape != (3,) or max(size or (1, 1)) > MAX_SIDE_PX:
         raise ValueError("three coefficients and possible sides are needed")
-    return SparseView(name, R, t, K, size, k, camera)
+    std = {str(part): float(value) for part, value in entry.get("std", {}).items()}
+    return SparseView(name, R, t, K, size, k, camera, std or None)
 
 
 def _read_trajectory(path: Path) -> list[SparseView]:

@@ -1,5 +1,7 @@
 """Models in the formats of other programs: transforms.json (NeRF, nerfstudio), Bundler, OpenMVS and Kalibr.
 
+Cameras of data sets: par.txt (Middlebury), NAME_cam.txt (MVSNet, BlendedMVS, DTU), a matrix P for each image.
+
 The inverse of the writers of :mod:`thesisrecon.io._exports`, with what other writers of these formats add.
 """
 
@@ -17,6 +19,7 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.arrays import F64
+from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.io._colmap import PIXEL_CENTRE
@@ -26,10 +29,11 @@ from thesisrecon.results import SparseModel, SparseView
 LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 """From axes x right, y down, z forward to x right, y up, z back."""
 _MVS_VERSIONS = range(1, 7)
+_MOST_OF_A_MATRIX = 2000  # bytes
 
 
 def read_other(path: Path) -> SparseModel | None:
-    """The model in a file of another program; None for other files."""
+    """The model in a file or folder of another program; None for others."""
     if path.suffix == ".json" and isinstance(content := read_json(path), dict) and "frames" in content:
         rule = "must hold frames with file_path and transform_matrix (nerfstudio, NeRF)"
         read = read_transforms
@@ -40,6 +44,12 @@ def read_other(path: Path) -> SparseModel | None:
         read = read_bundler
     elif path.suffix in (".yaml", ".yml"):
         read, rule = read_kalibr, "must be a camchain.yaml of pinhole cameras cam0, cam1, ..."
+    elif path.name.endswith("par.txt"):
+        read, rule = read_middlebury, "must have a line with the name, K, R and t of each camera"
+    elif path.is_dir() and any(path.glob("*_cam.txt")):
+        read, rule = read_mvsnet, "must hold files NAME_cam.txt with extrinsic and intrinsic"
+    elif path.is_dir() and (any(path.glob("*.P")) or _matrix_files(path)):
+        read, rule = read_matrices, "must hold a 3 x 4 camera matrix for each image"
     else:
         return None
     try:
@@ -250,6 +260,68 @@ def _platform(b: _Bytes, version: int) -> tuple[list[tuple[F64, tuple[int, int],
         # Without a size K is in units of the long side.
         cameras.append((_calibration(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (width, height), R, C))
     return cameras, [(b.array(3, 3), b.array(3)) for _ in range(b.count())]
+
+
+def read_middlebury(path: Path) -> SparseModel:
+    """Read ``par.txt`` of the Middlebury multi-view data: a name, K, R and t per line after their number."""
+    count, *rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    if len(rows) != int(count[0]):
+        raise ValueError(f"{count[0]} cameras are announced, {len(rows)} follow")
+    views = []
+    for i, (name, *words) in enumerate(rows):
+        values = np.array(words, dtype=np.float64)
+        R, t = checked_pose(values[9:18].reshape(3, 3), values[18:])
+        views.append(SparseView(_name(name), R, t, _upper(values[:9].reshape(3, 3)), None, np.zeros(3), i))
+    return SparseModel(views)
+
+
+def read_mvsnet(path: Path) -> SparseModel:
+    """Read the files ``NAME_cam.txt`` of a folder: ``extrinsic`` (4 x 4, world to camera), ``intrinsic``."""
+    views = []
+    for i, file in enumerate(sorted(path.glob("*_cam.txt"))):
+        words = read_text(file).split()
+        at, K_at = words.index("extrinsic") + 1, words.index("intrinsic") + 1
+        M = np.array(words[at : at + 16], dtype=np.float64).reshape(4, 4)
+        K = np.array(words[K_at : K_at + 9], dtype=np.float64).reshape(3, 3)
+        name = file.name.removesuffix("_cam.txt")
+        views.append(SparseView(name, *checked_pose(M[:3, :3], M[:3, 3]), _upper(K), None, np.zeros(3), i))
+    return SparseModel(views)
+
+
+def read_matrices(path: Path) -> SparseModel:
+    """Read a camera matrix P (3 x 4) in a file of each image, NAME.P or NAME.txt; P = K [R t] (3.1)."""
+    views = []
+    for i, file in enumerate(sorted(path.glob("*.P")) or _matrix_files(path)):
+        P = _matrix_of(file)
+        if P is None:
+            raise ValueError(f"{file.name} holds no 3 x 4 matrix")
+        K, R, t = decompose_camera(P)
+        views.append(SparseView(file.stem, *checked_pose(R, t), _upper(K), None, np.zeros(3), i))
+    return SparseModel(views)
+
+
+def _matrix_files(folder: Path) -> list[Path]:
+    """Files NAME.txt if each holds a matrix P."""
+    found = sorted(folder.glob("*.txt"))
+    return found if found and all(_matrix_of(path) is not None for path in found) else []
+
+
+def _matrix_of(path: Path) -> F64 | None:
+    """The only 12 numbers of a small file, after the word CONTOUR of PMVS if it is there."""
+    if path.stat().st_size > _MOST_OF_A_MATRIX:
+        return None
+    words = read_text(path).removeprefix("CONTOUR").split()
+    try:
+        return np.array(words, dtype=np.float64).reshape(3, 4)
+    except ValueError:
+        return None
+
+
+def _upper(K: F64) -> F64:
+    """A calibration with square or oblong pixels; ``ValueError`` for skew beyond rounding."""
+    if not abs(K[0, 1]) <= 1e-3 * abs(K[0, 0]):
+        raise ValueError("a camera has skewed pixels, which have no model here")
+    return _calibration(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def read_kalibr(path: Path) -> SparseModel:
