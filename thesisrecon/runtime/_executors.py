@@ -43,7 +43,7 @@ WORKERLESS_S = 60.0  # Time a cluster may be without workers during a run, so th
 _log = logging.getLogger(__name__)
 
 
-def _is_dask_address(executor: object) -> bool:
+def is_dask_address(executor: object) -> bool:
     return isinstance(executor, str) and executor.partition(":")[0].lower() == "dask"
 
 
@@ -97,7 +97,7 @@ class _Remote(NamedTuple):
 
 
 @contextmanager
-def _connect_dask(executor: str) -> Iterator[Cluster]:
+def connect_dask(executor: str) -> Iterator[Cluster]:
     """Connect to a Dask scheduler for the duration of a block."""
     place = _dask_place(executor)
     try:
@@ -183,7 +183,7 @@ class Workers:
             raise UsageError(f"threads must be at least 1; got {self.threads}")
         if not isinstance(self.executor, str | futures.Executor):
             raise UsageError(Notice("no-executor", ", ".join(NAMES), self.executor))
-        if _is_dask_address(self.executor):
+        if is_dask_address(self.executor):
             _dask_place(str(self.executor))
         elif isinstance(self.executor, str) and self.executor not in NAMES:
             raise UsageError(unknown_word("executor", self.executor, NAMES))
@@ -206,7 +206,7 @@ class Workers:
     def __enter__(self) -> Workers:
         """Connect to the cluster; processes start when needed."""
         self._open_stack = ExitStack()
-        if _is_dask_address(self.executor):
+        if is_dask_address(self.executor):
             self._remote = self._open_stack.enter_context(self._opened())
         return self
 
@@ -244,8 +244,8 @@ class Workers:
     def _opened(self) -> Iterator[_Remote]:
         if isinstance(self.executor, futures.Executor):
             yield _Remote(self.executor, lambda: self.threads)
-        elif _is_dask_address(self.executor):
-            with _connect_dask(self.executor) as cluster:
+        elif is_dask_address(self.executor):
+            with connect_dask(self.executor) as cluster:
                 yield _Remote(cluster.executor, cluster.parallel, cluster)
         elif self.executor == "local" or (pool := _processes(self.threads)) is None:
             from thesisrecon._numba import ThreadPool

@@ -5,9 +5,20 @@ uncertainty.
     print(analyse(rows))
 """
 
-from validation.ablation.analysis import analyse
+from validation.ablation.analysis import analyse, compare_runs
 from validation.ablation.page import write_analysis
 from validation.ablation.run import Row, Rows, ablate, read_rows
 from validation.ablation.study import Measure, Place, Study
 
-__all__ = ["Measure", "Place", "Row", "Rows", "Study", "ablate", "analyse", "read_rows", "write_analysis"]
+__all__ = [
+    "Measure",
+    "Place",
+    "Row",
+    "Rows",
+    "Study",
+    "ablate",
+    "analyse",
+    "compare_runs",
+    "read_rows",
+    "write_analysis",
+]

@@ -6,20 +6,26 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from thesisrecon.io._files import write_text
 from thesisrecon.io._outputs import join_claim
 from validation.ablation.analysis import (
+    BAD,
+    GOOD,
     Analysis,
     Cell,
     Comparison,
+    Curves,
+    Verdict,
     as_reported,
+    curves_of,
     failures_of,
-    measure_table,
+    measure_tables,
     text_of,
+    with_unit,
 )
-from validation.ablation.plan import Plan
+from validation.ablation.paper import SHADES, write_figures, write_latex
 from validation.ablation.study import Measure
 from validation.runs.page import plot_at, write_page
 from validation.runs.tables import Plot, commit, plot, scatter, slug, stamp, write_csv
@@ -27,7 +33,7 @@ from validation.runs.tables import Plot, commit, plot, scatter, slug, stamp, wri
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
 LOGARITHMIC = {"type": "log"}
-GOOD, BAD, NONE = "#2e7d4f", "#b3372b", "#7b8794"
+NONE = "#7b8794"
 ABOUT = {
     "scenes": "The intervals generalise to similar scenes: the scenes are the sample.",
     "draws": "The intervals apply to these scenes only: the draws of data by the seed are the sample.",
@@ -38,7 +44,8 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
     """Write ``index.html`` and the tables into ``out`` and return the path of the page."""
     out = Path(out)
     with join_claim(out):
-        tables, plan = write_tables(analysis, out), analysis.plan
+        tables, plan = [*write_tables(analysis, out), write_latex(analysis, out)], analysis.plan
+        names = [t.name for t in tables] + ["figures/"] * bool(write_figures(analysis, out))
         write_page(
             out / PAGE,
             Path(__file__).parent / "page.html.j2",
@@ -50,7 +57,9 @@ def write_analysis(analysis: Analysis, out: str | Path) -> Path:
             warnings=analysis.warnings,
             failures=failures_of(analysis.rows),
             versions=[("commit", commit()), *plan.versions.items()],
-            tables=[t.name for t in tables],
+            tables=names,
+            good=GOOD,
+            bad=BAD,
         )
     return out / PAGE
 
@@ -70,11 +79,11 @@ def _facts(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def _findings(analysis: Analysis) -> list[str]:
-    """Summarise each measure: variants better and worse than the baseline."""
+    """Summarise each measure: variants that differ from the baseline."""
     count, found = len(analysis.plan.conditions), []
     for measure in analysis.plan.measures:
         sentences = []
-        for verdict in ("better", "worse"):
+        for verdict in get_args(Verdict)[:6]:
             where = Counter(
                 c.variant for c in analysis.comparisons if (c.measure, c.verdict) == (measure, verdict)
             )
@@ -90,17 +99,15 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
     cells = [c for c in analysis.cells if c.measure == measure]
     comparisons = [c for c in analysis.comparisons if c.measure == measure]
     plots = {
-        "over": _over_conditions(plan, measure, cells),
+        **{f"over-{n}": _over_conditions(measure, c) for n, c in enumerate(curves_of(analysis, measure))},
         "forest": _forest(measure, comparisons, plan.baseline),
         "cost": _cost(measure, cells),
     }
-    head, rows = measure_table(analysis, measure)
     drawn = {c.interval.sample for c in comparisons if c.interval.pairs}
     return {
         "id": name,
         "measure": measure,
-        "head": head,
-        "table": rows,
+        "tables": measure_tables(analysis, measure),
         "baseline": plan.baseline,
         "about": " ".join(ABOUT[sample] for sample in sorted(drawn)),
         "plots": [plot_at(f"{name}-{kind}", p) for kind, p in plots.items() if p is not None],
@@ -110,24 +117,29 @@ def _section(analysis: Analysis, measure: Measure) -> dict[str, Any]:
 # ---------------------------------------------------------------- plots
 
 
-def _over_conditions(plan: Plan, measure: Measure, cells: Sequence[Cell]) -> Plot | None:
-    """The means over a condition that is a number, a line for each variant, where there is but one such."""
-    axes = list(dict.fromkeys(a for c in plan.conditions for a in c.levels))
-    values = [next(iter(c.changes.values()), None) for c in plan.conditions]
-    numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in values)
-    if len(axes) != 1 or len(values) < 2 or not numeric:
-        return None
-    at = {(c.variant, c.condition): c for c in cells}
+def _over_conditions(measure: Measure, curves: Curves) -> Plot:
+    """The means with their 95 % intervals, a line for each variant."""
     traces = []
-    for k, variant in enumerate(plan.variants):
-        y = [_finite(at[variant.name, c.name].mean) for c in plan.conditions]
+    for k, (name, cells) in enumerate(curves.lines.items()):
         line = {"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]}
-        traces.append(scatter(variant.name, values, y, "lines+markers", line=line))
-    log = measure.ratio and all(v is None or v > 0 for t in traces for v in t["y"])
-    title, x = f"{measure.name} over {axes[0]}", axes[0].rpartition(".")[2]
+        errors = _errors([(c.mean, c.low, c.high) for c in cells])
+        y = [_finite(c.mean) for c in cells]
+        traces.append(scatter(name, curves.x, y, "lines+markers", line=line, error_y=errors))
+    title = f"{measure.name} over {curves.title}"
     layout: dict[str, Any] = {"legend": {"orientation": "h", "y": -0.25}, "height": 420}
-    yaxis = LOGARITHMIC if log else {}
-    return plot(title, traces, x, _with_unit(measure.name, measure), yaxis=yaxis, **layout)
+    yaxis = LOGARITHMIC if curves.log else {}
+    return plot(title, traces, curves.axis, with_unit(measure.name, measure.unit), yaxis=yaxis, **layout)
+
+
+def _errors(values: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
+    """Error bars from (mean, low, high)."""
+    return {
+        "type": "data",
+        "symmetric": False,
+        "array": [_finite(high - mean) for mean, _, high in values],
+        "arrayminus": [_finite(mean - low) for mean, low, _ in values],
+        "thickness": 1,
+    }
 
 
 def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) -> Plot | None:
@@ -137,20 +149,14 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
     ratio = all(c.ratio for c in shown)
     shown = [c for c in shown if c.ratio == ratio]
     values = [as_reported(c) for c in shown]
-    errors = {
-        "type": "data",
-        "symmetric": False,
-        "array": [_finite(high - mean) for mean, _, high in values],
-        "arrayminus": [_finite(mean - low) for mean, low, _ in values],
-        "color": "#55636f",
-    }
-    marker = {"color": [{"better": GOOD, "worse": BAD}.get(c.verdict, NONE) for c in shown], "size": 9}
+    errors = _errors(values) | {"color": "#55636f"}
+    marker = {"color": [SHADES.get(c.verdict, NONE) for c in shown], "size": 9}
     names = [f"{c.variant} ({c.condition})" if c.condition else c.variant for c in shown]
     means = [_finite(mean) for mean, _, _ in values]
     trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
     line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
-    x = f"times {baseline}" if ratio else _with_unit(f"difference from {baseline}", measure)
+    x = f"times {baseline}" if ratio else with_unit(f"difference from {baseline}", measure.unit)
     layout: dict[str, Any] = {
         "xaxis": LOGARITHMIC if ratio else {"zeroline": False},
         "yaxis": {"autorange": "reversed", "automargin": True},
@@ -179,11 +185,7 @@ def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     }
     caption = "Filled: Pareto-optimal (no variant is both better and cheaper)."
     title, x = f"{measure.name} against cost", "processor time of a row (s)"
-    return plot(title, traces, x, _with_unit(measure.name, measure), caption, **layout)
-
-
-def _with_unit(text: str, measure: Measure) -> str:
-    return f"{text} ({measure.unit})" if measure.unit else text
+    return plot(title, traces, x, with_unit(measure.name, measure.unit), caption, **layout)
 
 
 def _finite(value: float) -> float | None:

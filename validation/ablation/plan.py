@@ -26,7 +26,8 @@ from thesisrecon.errors import UsageError, unknown_word
 from thesisrecon.io._files import read_bytes
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
-from validation.ablation.changes import PREFIX, STAGES, TASK, Setting, changed, is_own, level_name, load_own
+from validation.ablation.changes import STAGES, TASK, Setting, changed, level_name
+from validation.ablation.own_files import PREFIX, is_own, load_own
 from validation.ablation.study import Axis, Changes, FunctionTask, Measure, Mode, Study, Task
 from validation.ablation.tasks import TASKS, Reconstruction
 
@@ -156,7 +157,11 @@ def _scenes(study: Study, task: Task) -> tuple[str, ...]:
     if isinstance(scenes, str) or not scenes or not all(isinstance(s, str) for s in scenes):
         raise UsageError(f"scenes are a list of at least one name; got {scenes!r}")
     for scene in scenes:
-        task.check(scene)
+        try:
+            task.check(scene)
+        except UsageError as error:
+            names = ", ".join(task.names_of_scenes())
+            raise UsageError(f"{error} (scenes are {names})" if names else str(error)) from None
     count = study.subsets
     if type(count) is not int or count < 0:
         raise UsageError(f"subsets is the number of subsets of each scene, 0 for none; got {count!r}")

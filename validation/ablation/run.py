@@ -6,6 +6,8 @@ import math
 import os
 import pickle
 import shutil
+import signal
+import threading
 import time
 import traceback
 from collections import Counter
@@ -21,15 +23,23 @@ from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, unknown_word
 from thesisrecon.io._files import read_json, write_json
 from thesisrecon.io._outputs import clear_folder, join_claim
-from thesisrecon.runtime._executors import ProcessPool, available_threads
-from validation.ablation.changes import Setting, Source, loaded_sources
+from thesisrecon.runtime._executors import (
+    Cluster,
+    ProcessPool,
+    available_threads,
+    connect_dask,
+    is_dask_address,
+)
+from validation.ablation.changes import Setting
+from validation.ablation.own_files import Source, loaded_sources
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.study import FunctionTask, Place, Study
 from validation.runs.processes import run_jobs
 
 LOST = "the worker process of this row was killed or ran out of memory"
 ROWS, STEPS, SHARED, WORK = "rows", "steps", "shared", "work"
-EXECUTORS = ("local", "processes")
+PLACE = ("variant", "condition", "scene", "seed")
+EXECUTORS = ("local", "processes", "dask://HOST:PORT")
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -68,14 +78,17 @@ def ablate(
     *,
     executor: str = "local",
     threads: int | None = None,
+    limit_s: float | None = None,
     on_progress: Callable[[str], None] = lambda _: None,
 ) -> Rows:
     """Compute the rows of a study that are not in ``out`` yet, and return all of them.
 
     ``out`` may be used again, after a kill or for a study that has grown: rows that are there under the same
-    setting, scene, seed and versions are not computed again. ``executor`` is "local" (this process) or
-    "processes", for which a script needs ``if __name__ == "__main__":``; ``threads`` is their number.
-    ``on_progress`` gets a sentence when a row or a shared step has ended. Errors of a row are stored in it.
+    setting, scene, seed and versions are not computed again. ``executor`` is "local" (this process),
+    "processes", for which a script needs ``if __name__ == "__main__":``, or "dask://HOST:PORT", whose workers
+    see ``out`` under the same path; ``threads`` is the number of processes. A row that takes more than
+    ``limit_s`` seconds fails, not on Dask. ``on_progress`` gets a sentence when a row or a shared step has
+    ended. Errors of a row are stored in it.
     """
     plan, store = plan_study(study), Store(Path(out).resolve())
     with join_claim(store.path):
@@ -83,7 +96,7 @@ def ablate(
         store.prepare()
         todo = {row.key: row for row in plan.rows if store.load(row.key) is None}
         with _workers(executor, threads) as workers:
-            lost = _compute(plan, store, workers, list(todo.values()), on_progress)
+            lost = _compute(plan, store, workers, list(todo.values()), on_progress, limit_s)
         shutil.rmtree(store.path / WORK, ignore_errors=True)
     return _rows(plan, store, lost)
 
@@ -91,6 +104,21 @@ def ablate(
 def read_rows(study: Study, out: str | Path) -> Rows:
     """Return the rows of a study that are in ``out``, without computing."""
     return _rows(plan_study(study), Store(Path(out)), {})
+
+
+def read_earlier_rows(study: Study, out: str | Path) -> Rows:
+    """Return the rows of a study in ``out`` by variant, condition, scene and seed, whatever the code and the
+    settings that they were computed with; the newest of several.
+    """
+    plan, store, keys = plan_study(study), Store(Path(out)), dict[tuple[Any, ...], str]()
+    for path in sorted((store.path / ROWS).glob("*.json"), key=lambda p: (p.stat().st_mtime_ns, p.name)):
+        record = read_json(path)
+        if isinstance(record, dict):
+            keys[tuple(record.get(name) for name in PLACE)] = path.stem
+    found = [p._replace(key=keys.get(tuple(getattr(p, name) for name in PLACE), "")) for p in plan.rows]
+    if not any(p.key for p in found):
+        raise UsageError(f"{out} has no rows of this study")
+    return _rows(plan._replace(rows=tuple(p for p in found if p.key)), store, {})
 
 
 def _rows(plan: Plan, store: Store, lost: Mapping[str, Outcome]) -> Rows:
@@ -207,6 +235,7 @@ def _compute(
     workers: _Workers,
     rows: Sequence[PlannedRow],
     on_progress: Callable[[str], None],
+    limit_s: float | None,
 ) -> dict[str, Outcome]:
     """Carry out all rows; return the outcomes of those that were lost, which are not stored."""
     parts = parts_of(rows)
@@ -222,7 +251,8 @@ def _compute(
 
     def submit(part: Part) -> Future[Outcome]:
         row = part.row
-        return workers.submit(Job(part.name, *packed[row.key], row.scene, row.seed, store.path, part.step))
+        job = Job(part.name, *packed[row.key], row.scene, row.seed, store.path, part.step, limit_s)
+        return workers.submit(job)
 
     for done in run_jobs(waiting, submit, is_ready, workers.most):
         for part, future in done:
@@ -250,7 +280,7 @@ def _record(plan: Plan, part: Part) -> dict[str, Any]:
     if part.step:
         return {"step": part.step, "scene": row.scene, "seed": row.seed}
     return {
-        **{name: getattr(row, name) for name in ("variant", "condition", "scene", "seed")},
+        **{name: getattr(row, name) for name in PLACE},
         "config": tables_from_config(row.setting.config),
         "task": {} if isinstance(task, FunctionTask) else table_from_dataclass(task),
         "versions": dict(plan.versions),
@@ -261,7 +291,9 @@ def _record(plan: Plan, part: Part) -> dict[str, Any]:
 
 
 class Job(NamedTuple):
-    """Input of a worker: ``setting`` as bytes; ``step`` is the shared step, empty for the row itself."""
+    """Input of a worker: ``setting`` as bytes; ``step`` is the shared step, empty for the row itself. It ends
+    after ``limit_s``.
+    """
 
     key: str
     setting: bytes
@@ -270,6 +302,7 @@ class Job(NamedTuple):
     seed: int
     out: Path
     step: str = ""
+    limit_s: float | None = None
 
 
 def _pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
@@ -292,14 +325,15 @@ def carry_out(job: Job) -> Outcome:
     metrics, failure = dict[str, float](), ""
     try:
         own.mkdir(parents=True, exist_ok=True)
-        if job.step:
-            setting.task.prepare(*given, place, step=job.step)
-        else:
-            found = setting.task.run(*given, place)
-            metrics = {str(name): float(value) for name, value in found.items()}
+        with _time_limit(job.limit_s):
+            if job.step:
+                setting.task.prepare(*given, place, step=job.step)
+            else:
+                found = setting.task.run(*given, place)
+                metrics = {str(name): float(value) for name, value in found.items()}
     except OutputError:
         raise
-    except (StageFailure, UsageError) as error:
+    except (StageFailure, UsageError, _TooLongError) as error:
         failure = str(error)
     except Exception as error:
         if isinstance(error, OSError) and error.errno in WRITE_ERRNOS:
@@ -312,18 +346,46 @@ def carry_out(job: Job) -> Outcome:
     return Outcome(metrics, failure, seconds, cpu_s)
 
 
+class _TooLongError(BaseException):
+    """The time of a row is over. No handler of the row's own code catches it."""
+
+
+@contextmanager
+def _time_limit(limit_s: float | None) -> Iterator[None]:
+    """Raise :class:`_TooLongError` in the block after ``limit_s``, in the main thread of the process."""
+    if limit_s is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise _TooLongError(f"exceeded the time limit of {limit_s:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
 @dataclass
 class _Workers:
-    """Processes (``count``), or this process if 0; they get ``most`` jobs, a spare one each."""
+    """Processes (``count``), or this process if 0; they get ``most`` jobs, a spare one each. Or those of a
+    ``cluster``.
+    """
 
     count: int
     pool: ProcessPool | None = None
+    cluster: Cluster | None = None
 
     @property
     def most(self) -> int:
-        return max(1, 2 * self.count)
+        return max(1, 2 * (self.count if self.cluster is None else self.cluster.parallel()))
 
     def submit(self, job: Job) -> Future[Outcome]:
+        if self.cluster is not None:
+            return self.cluster.executor.submit(carry_out, job)
         if not self.count:
             future: Future[Outcome] = Future()
             future.set_result(carry_out(job))
@@ -339,9 +401,13 @@ class _Workers:
 
 @contextmanager
 def _workers(executor: str, threads: int | None) -> Iterator[_Workers]:
-    """Yield the workers of "local" or "processes"; :class:`UsageError` for another name or no thread."""
+    """Yield the workers of an executor; :class:`UsageError` for another name or no thread."""
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1; got {threads}")
+    if is_dask_address(executor):
+        with connect_dask(executor) as cluster:
+            yield _Workers(0, cluster=cluster)
+        return
     if executor not in EXECUTORS:
         raise UsageError(unknown_word("executor", executor, EXECUTORS))
     workers = _Workers(0 if executor == "local" else threads or available_threads())

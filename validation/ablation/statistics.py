@@ -6,7 +6,12 @@ seeds.
 
 Few values use Student's interval. From :data:`STUDENTISED_FROM` on it is the symmetric studentised bootstrap
 (Hall, The Bootstrap and Edgeworth Expansion, 1992, 3.5), which keeps the level for skewed differences. Scenes
-are resampled first, then the subsets inside them.
+are resampled first, then the subsets inside them. Beyond the tenth largest resample its tail is Student's, so
+that p can fall below what the resamples resolve.
+
+Failures have their own tests: :func:`sign_test` of the rows on which only one of two methods fails (exact;
+McNemar 1947), and :func:`signed_rank_test` of all rows, with a failure worse than any number (Wilcoxon 1945;
+for scenes with several rows Rosner, Glynn and Lee 2006).
 """
 
 from __future__ import annotations
@@ -25,6 +30,10 @@ Sample = Literal["draws", "scenes"]
 STUDENTISED_FROM = 12  # With fewer values too many resamples have almost no spread
 MIN_SCENES = 3  # Fewer scenes are no sample of scenes
 RESAMPLES = 4999
+TAIL = 10
+"""Fewer of the resamples are no estimate of a probability."""
+ALL_SIGNS = 12
+"""Up to this many values all choices of their signs are counted."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +101,54 @@ def _interval(
     else:
         drawn = resampled_t(inside)
         quantile = float(drawn[int(np.ceil(level * (RESAMPLES + 1))) - 1])
-        p = float((1 + np.sum(drawn >= abs(t))) / (RESAMPLES + 1))
+        p = _tail(drawn, abs(t), freedom)
     deviation = float(np.sqrt(np.mean([g.var(ddof=1) for g in strata])))
     effect = mean / deviation * (1.0 - 3.0 / (4.0 * freedom - 1.0))
     return Interval(mean, mean - quantile * error, mean + quantile * error, p, effect, pairs, sample, count)
+
+
+def _tail(drawn: F64, t: float, freedom: float) -> float:
+    """Share of ascending resamples at or beyond ``t``; from the tenth largest on Student's tail, stretched so
+    that it passes through that one.
+    """
+    beyond = len(drawn) - int(np.searchsorted(drawn, t))
+    last, share = float(drawn[-TAIL]), TAIL / (len(drawn) + 1)
+    if beyond >= TAIL or not np.isfinite(last):
+        return (1 + beyond) / (len(drawn) + 1)
+    scale = max(1.0, last / float(stats.t.isf(share / 2, freedom)))
+    return float(min(share, 2 * stats.t.sf(t / scale, freedom)))
+
+
+def sign_test(values: F64) -> float:
+    """Two-sided p of as many positive and negative values (N,) by chance, exact; zeros do not count. Of
+    differences in success it is McNemar's test. NaN without a value that is not zero.
+    """
+    up, down = int(np.sum(values > 0.0)), int(np.sum(values < 0.0))
+    return float(stats.binomtest(up, up + down).pvalue) if up + down else float("nan")
+
+
+def signed_rank_test(groups: Sequence[F64]) -> tuple[float, float]:
+    """Return the mean signed rank of differences, between -1 and 1, and its two-sided p. An infinite
+    difference is a failure of one of the two, beyond all others; zeros are dropped. Each group has one sign
+    under the null hypothesis: the rows of a scene, or one draw. NaN where nothing is left.
+    """
+    sizes = [len(g) for g in groups]
+    values = np.concatenate([*groups, np.zeros(0)])
+    ranks = np.zeros(len(values))
+    moved = values != 0.0
+    if not moved.any():
+        return float("nan"), float("nan")
+    ranks[moved] = stats.rankdata(np.abs(values[moved])) * np.sign(values[moved]) / moved.sum()
+    means = np.array([part.mean() for part in np.split(ranks, np.cumsum(sizes)[:-1]) if part.any()])
+    mean = float(ranks.sum() / moved.sum())
+    total = abs(float(means.sum()))
+    if not len(means):
+        return mean, 1.0
+    if len(means) > ALL_SIGNS:
+        return mean, float(2 * stats.norm.sf(total / np.sqrt(np.sum(means**2))))
+    signs = 1 - 2 * (np.arange(2 ** len(means))[:, None] >> np.arange(len(means)) & 1)
+    # Sums that are equal but for rounding are equal.
+    return mean, float(np.mean(np.abs(signs @ means) >= total - 1e-9))
 
 
 def resampled_t(strata: Sequence[Sequence[F64]], *, resamples: int = RESAMPLES) -> F64:

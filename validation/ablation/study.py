@@ -61,6 +61,10 @@ class Task:
         if self.scenes and scene not in self.scenes:
             raise UsageError(unknown_word("scene", scene, self.scenes))
 
+    def names_of_scenes(self) -> Sequence[str]:
+        """The scenes with a name, for messages and pages; others may be accepted too."""
+        return self.scenes
+
     def scene_key(self, scene: str) -> str:
         return scene
 

@@ -15,6 +15,7 @@ import inspect
 import re
 import sys
 import tempfile
+import time
 import tomllib
 import types
 import typing
@@ -158,9 +159,15 @@ def report_progress(text: object) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+LOG_EVERY_S = 30.0
+_last_line = time.monotonic()
+
+
 def report_at_terminal(text: str) -> None:
-    """The same, if the error stream is a terminal."""
-    if sys.stderr.isatty():
+    """The same at a terminal; in a log one line in half a minute."""
+    global _last_line
+    if sys.stderr.isatty() or time.monotonic() - _last_line >= LOG_EVERY_S:
+        _last_line = time.monotonic()
         report_progress(text)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import re
-import tempfile
 from dataclasses import replace
 from functools import lru_cache
 from math import cos, pi, sin, tan
@@ -35,7 +34,7 @@ from validation.scenes.materials import (
 from validation.scenes.pose import Pose, look_at
 from validation.scenes.procedural import fractal
 from validation.scenes.raycast import Surface, World, build_world, trace
-from validation.scenes.real import Scene, read_scene, write_png
+from validation.scenes.real import Scene, cache_folder, read_scene, write_png
 from validation.scenes.sensor import take_image, write_images
 
 FOCAL_REL = 0.9  # Focal length as a share of the long side
@@ -80,7 +79,7 @@ def write_views(folder: Path, count: int, *, size: tuple[int, int] = (480, 360),
 
 
 _YARD = re.compile(r"yard-(\d{1,4})")
-YARDS = Path(tempfile.gettempdir()) / "thesisrecon-yards"
+YARDS = cache_folder("yards")
 YARD_IMAGES, YARD_SIZE = 10, (960, 720)
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import sys
+import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -60,6 +61,18 @@ class Scene:
         if self.truth is None:
             raise ValueError(f"the cameras of {self.name} are not known")
         return self.truth
+
+
+def cache_folder(name: str) -> Path:
+    """A folder of the user's cache for rendered scenes and reference matches; THESISRECON_CACHE moves it.
+
+    The system's temporary folder may be emptied while a study runs.
+    """
+    named = os.environ.get("THESISRECON_CACHE") or os.environ.get("XDG_CACHE_HOME")
+    try:
+        return Path(named or Path.home() / ".cache") / "thesisrecon" / name
+    except RuntimeError:  # No home, as in a container
+        return Path(tempfile.gettempdir()) / f"thesisrecon-{os.getuid()}" / name
 
 
 def data_root() -> Path | None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import tempfile
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -23,10 +22,10 @@ from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io._files import write_atomically
 from validation.references.sift import SETTINGS, SiftKeypoints, detect_sift, match_sift
-from validation.scenes.real import Scene, data_root
+from validation.scenes.real import Scene, cache_folder, data_root
 
 HAND_MADE_RATIO, CAMERA_RATIO = 0.85, 0.8
-CACHE = Path(tempfile.gettempdir()) / "thesisrecon-matches"  # Folder that keeps SIFT matches of image pairs
+CACHE = cache_folder("matches")  # Folder that keeps SIFT matches of image pairs
 CONSISTENT_PX = 1.5
 """Sampson distance to the true F within which a match of a scene with cameras counts as right."""
 FARTHEST = 3.0  # Depth in medians beyond which such a match counts as wrong

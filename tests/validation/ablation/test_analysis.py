@@ -9,7 +9,15 @@ from validation.ablation import Measure, Study, analyse
 from validation.ablation.analysis import as_reported
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import Row, Rows
-from validation.ablation.statistics import STUDENTISED_FROM, holm, on_front, paired_interval, resampled_t
+from validation.ablation.statistics import (
+    STUDENTISED_FROM,
+    holm,
+    on_front,
+    paired_interval,
+    resampled_t,
+    sign_test,
+    signed_rank_test,
+)
 
 
 def rows_of(study, value):
@@ -61,9 +69,80 @@ def test_quotients_where_all_values_allow_them():
     found = compared(rows, "aim = 1")
     assert found.ratio
     assert as_reported(found)[0] == pytest.approx(2.0)
-    with_zero = rows_of(ratio, lambda p: float(p.seed) + (p.variant == "aim = 1"))
-    assert not compared(with_zero, "aim = 1").ratio
-    assert compared(with_zero, "aim = 1").interval.mean == 1.0
+    cells = {c.variant: c.mean for c in analyse(rows).cells}
+    assert cells["aim = 1"] / cells["unchanged"] == pytest.approx(2.0)
+    assert cells["unchanged"] == pytest.approx(stats.gmean(np.arange(1.0, 21.0)))
+
+
+def test_a_zero_counts_as_the_smallest_number_and_negative_ones_are_subtracted():
+    ratio = darts(metrics=[Measure("miss", ratio=True)])
+    rows = rows_of(ratio, lambda p: (p.seed + p.seed % 2) * (2.0 if p.variant == "aim = 1" else 1.0))
+    assert as_reported(compared(rows, "aim = 1"))[0] == pytest.approx(2.0 ** (19 / 20))
+    assert any("zeros of miss count as its smallest positive number, 2" in w for w in analyse(rows).warnings)
+    rows = rows_of(ratio, lambda p: p.seed - 0.5 + (p.variant == "aim = 1"))
+    assert not compared(rows, "aim = 1").ratio
+    assert compared(rows, "aim = 1").interval.mean == 1.0
+    assert any("compared by differences" in w for w in analyse(rows).warnings)
+
+
+def survivors(plan, trial, *, better, give_up):
+    """Rows of a method that fails where it would be worst, beside one that never does."""
+    rng = np.random.default_rng(trial)
+    hard = rng.normal(size=len(plan.rows))
+    noise = {(p.variant, p.scene, p.seed): rng.normal() for p in plan.rows}
+    level = {(p.scene, p.seed): hard[n] for n, p in enumerate(plan.rows)}
+    own = {at[1:]: 0.3 * level[at[1:]] + v for at, v in noise.items() if at[0] == "aim = 1"}
+    limit = np.quantile(list(own.values()), 1.0 - give_up)
+
+    def value(p):
+        at = p.scene, p.seed
+        if p.variant == "aim = 1":
+            return "too hard" if own[at] > limit else better * np.exp(own[at])
+        return np.exp(0.3 * level[at] + noise[(p.variant, *at)])
+
+    return rows_of(plan, value)
+
+
+@pytest.mark.parametrize("sample", ["draws", "scenes"])
+@pytest.mark.parametrize("better", [1.0, 0.95])
+def test_a_method_that_gives_up_its_worst_rows_is_never_better(sample, better):
+    more = {"draws": {}, "scenes": {"task": Boards(), "scenes": [*"abcdefghijkl"], "seeds": 2}}[sample]
+    plan = plan_study(darts(metrics=[Measure("miss", ratio=True)], **more))
+    found = [compared(survivors(plan, n, better=better, give_up=0.3), "aim = 1") for n in range(20)]
+    assert all(c.fails > c.succeeds for c in found)
+    assert "better" not in {c.verdict for c in found}
+    mixed = "better where both succeed, fails more"
+    assert {mixed, "fails more"} & {c.verdict for c in found}
+    assert any(as_reported(c)[2] < 1.0 for c in found)  # Numbers alone would have said "better"
+
+
+def test_failures_on_both_sides_are_decided_by_ranks():
+    # "aim = 1" is better by one where both succeed; each fails alone on eight rows.
+    fails = {"aim = 1": range(8), "unchanged": range(8, 16), "aim = 2": ()}
+
+    def value(p):
+        number = 0.1 * np.sin(len(p.variant) * p.seed) - (p.variant == "aim = 1")
+        return "no luck" if p.seed in fails[p.variant] else number
+
+    found = compared(rows_of(darts(), value), "aim = 1")
+    assert (found.fails, found.succeeds, found.interval.pairs) == (8, 8, 4)
+    assert found.verdict == "no difference shown"
+    good = compared(
+        rows_of(darts(), lambda p: "no" if p.seed < 9 and p.variant == "unchanged" else 1.0), "aim = 1"
+    )
+    assert (good.verdict, good.fails, good.succeeds) == ("fails less", 0, 9)
+
+
+def test_infinite_errors_are_the_worst():
+    plan = plan_study(darts(metrics=["miss"]))
+    rows = [
+        Row(*p[:5], {"miss": 1.0} if p.seed < 12 or p.variant != "aim = 1" else {}, "", 1.0, 1.0)
+        for p in plan.rows
+    ]
+    found = compared(Rows(plan, tuple(rows)), "aim = 1")
+    assert (found.fails, found.verdict) == (8, "fails more")
+    ranks = {c.variant: c.rank for c in analyse(Rows(plan, tuple(rows))).cells}
+    assert ranks == pytest.approx({"unchanged": 1.8, "aim = 1": 2.4, "aim = 2": 1.8})
 
 
 class Boards(Darts):
@@ -99,7 +178,9 @@ def test_only_pairs_count_and_failures_are_reported():
     assert (cell.rows, cell.failed) == (5, 15)
     assert not cell.on_front
     assert compared(rows, "aim = 1").interval.pairs == 5
-    assert "17 (15 of 20 failed)" in str(analysis)
+    assert cell.median == 17.0
+    assert "- (15 of 20 failed)" in str(analysis)
+    assert "fails on 15 rows more and 0 fewer, p < 1e-4" in str(analysis)
     assert "| aim = 1 | a (15 seeds) | no luck |" in str(analysis)
 
 
@@ -161,6 +242,46 @@ def test_at_most_five_per_cent_of_null_effects_are_reported(count):
     # Two standard deviations of a count of trials that each hold in 95 of 100.
     assert held >= 0.95 * trials - 2.0 * np.sqrt(trials * 0.05 * 0.95)
     assert sum(f.p > 0.05 for f in found) == pytest.approx(held, abs=2)
+
+
+@pytest.mark.parametrize("count", [9, 40])
+def test_signed_ranks_are_those_of_scipy(count):
+    d = np.random.default_rng(count).normal(0.4, 1.0, count)
+    mean, p = signed_rank_test([np.array([v]) for v in d])
+    known = stats.wilcoxon(d, method="exact" if count < 12 else "asymptotic", correction=False)
+    assert p == pytest.approx(known.pvalue, rel=1e-9 if count < 12 else 1e-2)
+    ranks = stats.rankdata(np.abs(d))
+    assert mean == pytest.approx(np.sum(np.sign(d) * ranks) / count**2)
+    k = np.argmax(np.abs(d))
+    d[k] = np.copysign(np.inf, d[k])
+    assert signed_rank_test([np.array([v]) for v in d]) == pytest.approx((mean, p))
+
+
+def test_signed_ranks_of_scenes_keep_the_level():
+    rng, trials = np.random.default_rng(8), 400
+    for scenes in (6, 20):
+        found = []
+        for _ in range(trials):
+            shift = rng.normal(size=scenes)  # Rows of one scene have an error in common
+            found.append(signed_rank_test([s + 0.3 * rng.normal(size=rng.integers(1, 5)) for s in shift])[1])
+        assert np.mean(np.array(found) <= 0.05) <= 0.05 + 2.0 * np.sqrt(0.05 * 0.95 / trials)
+
+
+def test_success_is_compared_exactly():
+    # Six rows on which only one fails, one on which only the other does: 2 (1 + 7) / 2^7.
+    assert sign_test(np.array([1.0] * 6 + [-1.0] + [0.0] * 9)) == pytest.approx(0.125)
+    assert np.isnan(sign_test(np.zeros(3)))
+
+
+def test_p_falls_below_what_resamples_resolve():
+    found = []
+    for seed in range(40):
+        d = np.random.default_rng(seed).normal(1.8, 1.0, 20)
+        found.append(np.log(paired_interval([d], "draws").p / stats.ttest_1samp(d, 0.0).pvalue))
+    assert np.median(np.abs(found)) <= np.log(5.0)
+    assert max(np.exp(found)) <= 1e4
+    small = paired_interval([np.random.default_rng(1).normal(3.0, 1.0, 20)], "draws").p
+    assert 0.0 < small < 1e-6
 
 
 def test_holm_by_hand():

@@ -10,6 +10,8 @@ import pytest
 from tests.validation.ablation.toy import Darts, Steps, marks
 from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
+from validation.ablation.own_files import helpers_of
+from validation.ablation.plan import study_from_table
 
 
 def study(log, **more):
@@ -109,3 +111,78 @@ def test_a_row_on_a_full_disk_has_not_failed(executor, tmp_path):
     (tmp_path / "log.room").touch()
     rows = ablate(crowded, out, executor="local")
     assert [r.failure for r in rows] == [""] * 3
+
+
+OWN = '''"""A task that works with two helpers of its folder, one in a package."""
+
+import numpy as np
+
+import aim_factors
+from aim_tools.shift import SHIFT
+from aim_tools import nothing_here_is_a_module
+
+
+def my_task(config, scene, seed):
+    from aim_late import late
+
+    return {"miss": aim_factors.FACTOR * np.float64(seed + 1) + SHIFT + late()}
+'''
+HELPERS = {
+    "aim_factors.py": "FACTOR = 10.0\n",
+    "aim_tools/__init__.py": "from . import shift\nnothing_here_is_a_module = 1\n",
+    "aim_tools/shift.py": "from . import deeper\nSHIFT = deeper.SHIFT\n",
+    "aim_tools/deeper.py": "SHIFT = 0.5\n",
+    "aim_late.py": "def late():\n    return 0.0\n",
+}
+
+
+@pytest.mark.parametrize("executor", ["local", "processes"])
+def test_an_edited_helper_is_computed_again(tmp_path, executor):
+    for name, text in {"mine.py": OWN, **HELPERS}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    table = {"task": "mine.py:my_task", "scenes": ["a"], "seeds": 1, "metrics": ["miss"]}
+    table["axes"] = {"dense.max_side": [512]}
+
+    def misses():
+        rows = ablate(study_from_table(table, tmp_path), tmp_path / "out", executor=executor, threads=1)
+        assert not any(r.failure for r in rows)
+        return {r.metrics["miss"] for r in rows}
+
+    assert misses() == {10.5}
+    for name, text, miss in (
+        ("aim_factors.py", "FACTOR = 1.0\n", 1.5),
+        ("aim_tools/deeper.py", "SHIFT = 2.0\n", 3.0),
+        ("aim_late.py", "def late():\n    return 7.0\n", 10.0),
+        ("aim_late.py", HELPERS["aim_late.py"], 3.0),  # The first rows of this text are found again
+    ):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        assert misses() == {miss}
+    assert len(list((tmp_path / "out" / "rows").iterdir())) == 2 * 4
+
+
+def test_helpers_are_those_outside_installed_packages(tmp_path):
+    for name, text in {"mine.py": OWN, **HELPERS}.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    found = [helper.module for helper in helpers_of(tmp_path / "mine.py", OWN)]
+    tools = ["aim_tools", "aim_tools.deeper", "aim_tools.shift"]
+    assert found == ["aim_factors", "aim_late", *tools]
+
+
+@pytest.mark.parametrize("executor", ["local", "processes"])
+def test_a_row_that_takes_too_long_fails_alone(tmp_path, executor):
+    axes = {"task.pause_s": [60.0]}
+    slow = Study(axes, ["a"], seeds=1, task=Darts(log=str(tmp_path / "log")))
+    rows = ablate(slow, tmp_path / "out", executor=executor, threads=1, limit_s=1.0)
+    assert [r.failure for r in rows] == ["", "exceeded the time limit of 1 s"]
+    assert rows[1].seconds == pytest.approx(1.0, abs=0.5)
+
+
+def test_rows_on_a_dask_cluster_are_those_of_this_process(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    here = ablate(study(tmp_path / "log"), tmp_path / "here")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        place = cluster.scheduler_address.replace("tcp", "dask")
+        there = ablate(study(tmp_path / "log"), tmp_path / "there", executor=place)
+    assert [r.metrics for r in there] == [r.metrics for r in here]

@@ -44,6 +44,9 @@ class ImagePairs(Task):
         Measure("sigma_px", "px", "less", True, "noise of the inliers"),
     )
 
+    def names_of_scenes(self) -> Sequence[str]:
+        return [f"{name}/0" for name in (*_SCENES, "yard-1")]
+
     def scene_of(self, scene: str) -> str:
         return scene.rpartition("/")[0]
 
@@ -114,6 +117,9 @@ class RectifiedPairs(Task):
         Measure("bad2_pct", "%", "less", True, "pixels off by more than 2 px, holes filled along the row"),
         Measure("known_pct", "%", "more", False, "share of the pixels that are known before the filling"),
     )
+
+    def names_of_scenes(self) -> Sequence[str]:
+        return [*STEREO_PAIRS, "yard-1"]
 
     def scene_of(self, scene: str) -> str:
         return window_parts(scene)[0]

@@ -66,6 +66,9 @@ class Reconstruction(Task):
         if self.until not in get_args(Until):
             raise ValueError(unknown_word("stage", self.until, get_args(Until)))
 
+    def names_of_scenes(self) -> Sequence[str]:
+        return [*IMAGE_SCENES, "yard-1", "a folder of images"]
+
     def scene_of(self, scene: str) -> str:
         return window_parts(scene)[0]
 
