@@ -19,10 +19,11 @@ from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.io._files import printable
 from thesisrecon.io._outputs import join_claim
 from thesisrecon.runtime._signals import CODES, with_resume_advice
-from validation.ablation.analysis import analyse, failures_of
+from validation.ablation.analysis import analyse, compare_runs, failures_of
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import STUDIES, Plan, plan_study, read_study
-from validation.ablation.run import Rows, ablate, parts_of, read_rows
+from validation.ablation.run import Rows, ablate, parts_of, read_earlier_rows, read_rows
+from validation.runs.models import report_models
 from validation.runs.page import write_pages
 from validation.runs.processes import own_cores
 from validation.runs.records import ReportOptions, load_images
@@ -53,6 +54,8 @@ def main(arguments: list[str] | None = None) -> int:
         return run_ablation(parsed)
     if parsed.command == "study":
         return run_all(parsed.out)
+    if parsed.command == "report" and (parsed.model or parsed.reference):
+        return _report_models(parsed)
     try:
         options, gates = _report_options(parsed), read_gates()
         for name in options.folders:
@@ -92,6 +95,11 @@ def _parser() -> argparse.ArgumentParser:
             "--resume", type=Path, help="folder of an earlier run whose references are reused"
         )
         command.add_argument("--time-limit", type=float, default=300.0, help="limit of one task in seconds")
+        if name == "report":
+            text = "report an existing model (of any format that thesisrecon compare reads), and run nothing"
+            command.add_argument("--model", action="append", metavar="NAME=PATH", default=[], help=text)
+            text = "what the models are compared with: true cameras, or one more model"
+            command.add_argument("--reference", metavar="[NAME=]PATH", help=text)
         command.add_argument(
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
@@ -136,6 +144,28 @@ def _report_options(parsed: argparse.Namespace) -> ReportOptions:
     )
 
 
+def _report_models(parsed: argparse.Namespace) -> int:
+    """Report existing models; exit code 2 for a model that cannot be read or compared."""
+    try:
+        if not parsed.model or not parsed.reference:
+            raise UsageError("a report of models needs --model NAME=PATH, once or more, and --reference PATH")
+        models = [_named(word) for word in parsed.model]
+        if len(dict(models)) < len(models):
+            raise UsageError(f"two models are called {Counter(n for n, _ in models).most_common(1)[0][0]!r}")
+        page = report_models(dict(models), _named(parsed.reference), parsed.out.resolve())
+    except UsageError as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+    print(f"{counted(len(models), 'model')} compared; the page is {page}")
+    return 0
+
+
+def _named(word: str) -> tuple[str, Path]:
+    """Name and path of NAME=PATH, or of a path with its own name."""
+    name, equals, path = word.partition("=")
+    return (name, Path(path)) if equals and name else (Path(word).name, Path(word))
+
+
 def _print_gates(results: Results) -> None:
     for row in results.rows:
         if row.limit is not None:
@@ -156,11 +186,15 @@ def _add_ablate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     command.add_argument("study", metavar="STUDY", help=text)
     text = "output folder; a rerun continues from its rows"
     command.add_argument("-o", "--out", type=Path, required=True, help=text)
-    command.add_argument("--executor", default="processes", help="local or processes (default)")
+    text = "local, processes (default) or dask://HOST:PORT, whose workers see OUT"
+    command.add_argument("--executor", default="processes", help=text)
+    command.add_argument("--time-limit", type=float, metavar="S", help="a row that takes longer fails")
     text = "number of parallel rows (default: number of processors)"
     command.add_argument("--threads", type=int, help=text)
     command.add_argument("--plan", action="store_true", help="print the plan only")
     command.add_argument("--read", action="store_true", help="only analyse the rows in OUT")
+    text = "also compare with the rows of an earlier OUT, of whatever version; page in OUT/against-NAME"
+    command.add_argument("--against", type=Path, metavar="OUT", help=text)
 
 
 def run_ablation(parsed: argparse.Namespace) -> int:
@@ -173,10 +207,14 @@ def run_ablation(parsed: argparse.Namespace) -> int:
         if parsed.read:
             rows = read_rows(study, parsed.out)
         else:
-            how = {"executor": parsed.executor, "threads": parsed.threads}
+            how = {"executor": parsed.executor, "threads": parsed.threads, "limit_s": parsed.time_limit}
             with with_resume_advice(KEPT.format(parsed.out)):
                 rows = ablate(study, parsed.out, **how, on_progress=report_at_terminal)
         page = write_analysis(analyse(rows), parsed.out)
+        if parsed.against is not None:
+            compared = compare_runs(read_earlier_rows(study, parsed.against), rows)
+            folder = parsed.out / f"against-{parsed.against.resolve().name}"
+            print(f"before and after: {write_analysis(compared, folder)}")
     except UsageError as error:
         print(f"ablate: {error}", file=sys.stderr)
         return 2
