@@ -225,6 +225,7 @@ class SparseView(Record):
     size: tuple[int, int] | None = None  #: width, height
     distortion: F64 | None = None  #: (3,) k1, k2, k3, zeros for a pinhole; None if unknown or of another kind
     camera: int = 0  #: number of the camera; views with equal numbers have the same intrinsics
+    std: Mapping[str, float] | None = None  #: as in :attr:`thesisrecon.Camera.std`; None if not stated
 
     @property
     def centre(self) -> F64:
@@ -267,7 +268,10 @@ class SparseModel(Record):
         views = []
         for view in self.views:
             R = view.R @ similarity.R.T
-            views.append(replace(view, R=R, t=similarity.scale * view.t - R @ similarity.t))
+            t = similarity.scale * view.t - R @ similarity.t
+            # Deviations of centres along other axes need covariances.
+            std = {k: v for k, v in (view.std or {}).items() if not k.startswith("centre")} or None
+            views.append(replace(view, R=R, t=t, std=std))
         return replace(self, views=views, X=similarity.apply(self.X))
 
 

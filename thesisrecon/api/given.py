@@ -84,7 +84,7 @@ def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> Spars
     for (name, one), lens in zip(cameras.items(), lenses, strict=True):
         key = np.concatenate([one.K.ravel(), one.size, lens]).tobytes()
         number = numbers_of.setdefault(key, len(numbers_of))
-        views.append(SparseView(name, one.R, one.t, one.K, one.size, lens, number))
+        views.append(SparseView(name, one.R, one.t, one.K, one.size, lens, number, one.std))
     stored = {camera.as_stored for camera in cameras.values()}
     if len(stored) > 1:
         raise UsageError("a model needs cameras that are all as_stored, or none; some of these are")
@@ -113,8 +113,8 @@ def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:
         if view.distortion is None:
             advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
             raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
-        camera = Camera(view.K, view.R, view.t, view.size, view.distortion, as_stored=model.as_stored)
-        cameras[view.name] = camera
+        fields = view.K, view.R, view.t, view.size, view.distortion
+        cameras[view.name] = Camera(*fields, std=view.std, as_stored=model.as_stored)
     return cameras
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import os
 import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,6 +21,9 @@ from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._files import printable, read_json
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.runtime._signals import set_error_stream
+
+if TYPE_CHECKING:
+    from thesisrecon.results import ModelComparison
 
 _DEMO_SETTINGS = {"dense.max_side": 512, "dense.match_side": 512}
 """Small depth maps: the demo should show a model soon."""
@@ -193,6 +197,13 @@ def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
 
 _KINDS = "folder of a run, COLMAP model, cameras.json, or trajectory (TUM or KITTI)"
 _PAGE_HELP = "Write a page (HTML) with both models in 3D."
+BEYOND_LIMIT = 4
+
+
+def _limit(option: str, what: str) -> Any:
+    return typer.Option(option, min=0.0, help=f"Largest error of a {what}; else exit code {BEYOND_LIMIT}.")
+
+
 _TO_HELP = "colmap, colmap-undistorted, nerfstudio, openmvs, bundler, opencv or kalibr."
 _ORIGINALS_HELP = "Folder of the original images (default: that of the run)."
 _MASKS_HELP = "Folder of the masks of the images (default: that of the run)."
@@ -219,9 +230,12 @@ def compare(
         float, typer.Option("--max-time-difference", min=0.0, help="Largest difference of paired times, s.")
     ] = 0.01,
     time_offset: Annotated[float, typer.Option("--time-offset", help="Added to the times of B, s.")] = 0.0,
+    max_centre_error: Annotated[float | None, _limit("--max-centre-error", "centre, in units of B")] = None,
+    max_rotation_error: Annotated[float | None, _limit("--max-rotation-error", "rotation, degrees")] = None,
+    max_focal_error: Annotated[float | None, _limit("--max-focal-error", "focal length, per cent")] = None,
     overwrite: common.Overwrite = False,
 ) -> None:
-    """Compare two models of the same images after a similarity alignment."""
+    """Compare two models of the same images after a similarity alignment; exit code 4 beyond a limit."""
     common.cap_threads(0)
     from thesisrecon.api.models import compare_models
     from thesisrecon.io._files import json_text, write_new
@@ -248,7 +262,28 @@ def compare(
         files |= {page: html} if html else {}
     write_new(files, overwrite=overwrite, extra=page, warnings=warnings)
     lines += [f"warning: {warning}" for warning in warnings]
-    typer.echo("\n".join(printable(line) for line in lines))
+    limits = [
+        ("centre error", found.centre_error, max_centre_error),
+        ("rotation error in degrees", found.rotation_error_deg, max_rotation_error),
+        ("focal error in per cent", 100.0 * found.focal_error_rel, max_focal_error),
+    ]
+    exceeded = [text for name, errors, limit in limits for text in _exceeded(found, name, errors, limit)]
+    if found.only_b and any(limit is not None for *_, limit in limits):
+        exceeded.append(
+            f"{counted(len(found.only_b), 'camera')} of B missing in A, such as {found.only_b[0]}"
+        )
+    typer.echo("\n".join(printable(line) for line in [*lines, *(f"limit: {text}" for text in exceeded)]))
+    if exceeded:
+        raise typer.Exit(BEYOND_LIMIT)
+
+
+def _exceeded(found: ModelComparison, name: str, errors: Any, limit: float | None) -> list[str]:
+    """A sentence if the largest error is beyond the limit, or an error is not known."""
+    sizes = [abs(error) if error == error else math.inf for error in errors.tolist()]
+    worst = max(range(len(sizes)), key=sizes.__getitem__)
+    if limit is None or sizes[worst] <= limit:
+        return []
+    return [f"the {name} of {found.names[worst]} is {sizes[worst]:.4g}, the limit is {limit:g}"]
 
 
 def export(

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
 from thesisrecon.camera import project_camera
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import dehomogenize, scene_frame
+from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
-from thesisrecon.optimize.bundle.covariance import gauge_directions
 from thesisrecon.records import MetricResult, Reconstruction
+from thesisrecon.testing import pose_errors
 
 TrueCameras = tuple[F64, F64, F64]
 """K, R (V, 3, 3), R world-to-camera, and centres C (V, 3) in some unit of length."""
@@ -136,21 +135,9 @@ def pose_scores(metric: MetricResult, R: F64, C: F64) -> F64:
     views = np.flatnonzero(model.registered)
     Rt = np.linalg.solve(model.K[views], model.P[views])
     X = model.X[model.valid]
-    origin, scale = scene_frame(X[:, :3] / X[:, 3:])
-    found, t = Rt[:, :, :3], scale * (Rt[:, :, 3] + Rt[:, :, :3] @ origin)
-    centres = -np.einsum("vba,vb->va", found, t)
-    U, _, Vt = np.linalg.svd(np.einsum("vab,vac->bc", R[views], found))
-    Q = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    true = C[views] @ Q
-    true = true - true.mean(axis=0)
-    middle = centres.mean(axis=0)
-    true = middle + true * (np.sum(true * (centres - middle)) / np.sum(true**2))
-    turned = Rotation.from_matrix(R[views] @ Q @ np.swapaxes(found, 1, 2)).as_rotvec()
-    shift = -np.einsum("vab,vb->va", found, true - centres)
-    error = np.concatenate([turned, shift], axis=1)
-    N = gauge_directions(np.asarray(found, dtype=np.float64), t)
-    error -= (N @ (N.T @ error.ravel())).reshape(error.shape)
-    error[:, 3:] = -np.einsum("vba,vb->va", found, error[:, 3:]) / scale
+    centres = -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
+    found = np.asarray(Rt[:, :, :3], dtype=np.float64)
+    error = pose_errors(found, centres, R[views], C[views], X[:, :3] / X[:, 3:])
     z = np.full((len(model.registered), 6), np.nan)
     z[views] = error / metric.pose_std[views]
     return z
