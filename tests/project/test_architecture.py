@@ -17,8 +17,8 @@ CHAPTERS = {
     "metric", "stereo", "surface", "views",
 }  # fmt: skip
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}
-OPTIONAL = {"dask", "distributed"}
-"""Optional dependencies of ``runtime``, imported only on request."""
+OPTIONAL = {"runtime": {"dask", "distributed"}, "testing": {"pytest"}}
+"""Optional dependencies by folder, imported only on request."""
 
 
 def test_the_package_imports_only_its_core_dependencies():
@@ -27,7 +27,7 @@ def test_the_package_imports_only_its_core_dependencies():
         nodes = [*ast.walk(tree_of(path))]
         names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
         names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
-        optional = OPTIONAL if path.parent.name == "runtime" else set()
+        optional = OPTIONAL.get(path.parent.name, set())
         assert {name.split(".")[0] for name in names} <= allowed | optional, path
 
 
