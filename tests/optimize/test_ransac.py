@@ -137,13 +137,13 @@ def test_a_threshold_beyond_the_points_is_refused():
 def test_memory_grows_slower_than_a_multiple_of_the_data():
     X, xy, _ = points_of_camera(50_000, 0.0, 0)
     xy1, xy2 = matches_of_plane(50_000, 0.0, 0)
-    for call, data in ((resect, (X, xy, K)), (estimate_homography, (xy1, xy2))):
+    for call, data, most in ((resect, (X, xy, K), 200), (estimate_homography, (xy1, xy2), 600)):
         call(*data)
         tracemalloc.start()
         call(*data)
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        assert peak < 600 * len(X)
+        assert peak < most * len(X)
 
 
 @pytest.mark.parametrize(("n", "size"), [(4, 4), (9, 4), (1000, 6)])

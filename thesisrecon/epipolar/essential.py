@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
-from scipy.spatial.transform import Rotation
 
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
 from thesisrecon.epipolar._sampling import squared_distances
@@ -25,13 +25,11 @@ from thesisrecon.geometry.relative_pose import (
     essential_five_points,
     essential_from_pose,
     pose_in_front,
+    poses_from_essential,
 )
-from thesisrecon.optimize.least_squares import (
-    INLIER_SIGMAS,
-    DenseSystem,
-    run_levenberg_marquardt,
-    trimmed_noise_scale,
-)
+from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.optimize.bundle.projection import move_poses
+from thesisrecon.optimize.least_squares import INLIER_SIGMAS, DenseSystem, trimmed_noise_scale
 from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
 _SAMPLE, _UNKNOWN = 5, 5
@@ -177,7 +175,9 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
     def refit(E: F64, rows: I64) -> F64:
         if len(rows) <= _SAMPLE:
             return E
-        pose = pair.pose(E, rows)
+        # All poses of E have the same distances.
+        R, t = poses_from_essential(E)
+        pose = R[0], t[0]
         for wide in _GATES:
             distance = pair.squared(essential_from_pose(*pose)[None], some)[0]
             inside = some[distance < (wide * gate) ** 2]
@@ -199,19 +199,106 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
 def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
     """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
 
-    some = pair.only(rows)
+    R, t = pose[0][None].copy(), pose[1][None] / np.linalg.norm(pose[1])
+    _refine_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, iterations)
+    return R[0], t[0]
 
-    def retract(state: Pose, step: F64) -> Pose:
-        R, t = state
-        moved = t + step[3:] @ directions_across(t)
-        return Rotation.from_rotvec(step[:3]).as_matrix() @ R, moved / np.linalg.norm(moved)
 
-    def cost(state: Pose) -> float:
-        return 0.5 * float(some.squared(essential_from_pose(*state)[None]).sum())
+@kernel
+def _refine_pose(points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, most: int) -> None:
+    """Move R (1, 3, 3) and unit t (1, 3) to least squared Sampson distances by Levenberg and Marquardt."""
+    H, g, D, step = empty((5, 5)), empty(5), empty((2, 3)), empty(5)
+    H_new, g_new, D_new = empty((5, 5)), empty(5), empty((2, 3))
+    R_new, t_new, move = empty((1, 3, 3)), empty((1, 3)), empty((1, 6))
+    cost, damping = _linearize_pose(points, inverse1, inverse2, R[0], t[0], D, H, g), 1e-4
+    for _ in range(most):
+        before, gain = cost, 0.0
+        while damping < 1e10:
+            if solve_damped(H, g, damping, step):
+                gain = 0.0
+                for a in range(5):
+                    gain -= step[a] * g[a]
+                    for b in range(5):
+                        gain -= 0.5 * step[a] * H[a, b] * step[b]
+                for i in range(3):
+                    move[0, i], move[0, 3 + i] = step[i], step[3] * D[0, i] + step[4] * D[1, i]
+                move_poses(R, t, move, R_new, t_new)
+                t_new /= np.sqrt(t_new[0, 0] ** 2 + t_new[0, 1] ** 2 + t_new[0, 2] ** 2)
+                cost = _linearize_pose(points, inverse1, inverse2, R_new[0], t_new[0], D_new, H_new, g_new)
+                if cost < before or gain <= 1e-12 * before:
+                    break
+            damping *= 10.0
+        if not cost < before:
+            return
+        R[:], t[:], D[:], H[:], g[:] = R_new, t_new, D_new, H_new, g_new
+        # The gain of a damped step says nothing about the minimum.
+        if damping <= 1e-3 and gain <= 1e-10 * before:
+            return
+        damping = max(0.1 * damping, 1e-9)
 
-    return run_levenberg_marquardt(
-        lambda state: some.normal_equations(*state), retract, cost, pose, max_iterations=iterations
-    ).state
+
+@kernel
+def _linearize_pose(
+    points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, D: F64, H: F64, g: F64
+) -> float:
+    """Fill two directions D (2, 3) across t, and the normal equations over x -> exp(w) x + D'd; the cost."""
+    f, T, E, G, h = empty(9), empty((5, 9)), empty((3, 3)), empty((9, 9)), empty(9)
+    _directions_across(t, D)
+    _cross_times(t, R, E)
+    _in_frame(E, inverse1, inverse2, f)
+    cost: float = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
+    axis, change = empty(3), empty((3, 3))
+    for a in range(5):
+        for i in range(3):
+            axis[i] = D[a - 3, i] if a >= 3 else 1.0 if i == a else 0.0
+        # exp(w) turns E as a whole; d changes t alone.
+        _cross_times(axis, E if a < 3 else R, change)
+        _in_frame(change, inverse1, inverse2, T[a])
+    for a in range(5):
+        g[a] = 0.0
+        for i in range(9):
+            g[a] += T[a, i] * h[i]
+        for b in range(5):
+            H[a, b] = 0.0
+            for i in range(9):
+                for j in range(9):
+                    H[a, b] += T[a, i] * G[i, j] * T[b, j]
+    return cost
+
+
+@kernel
+def _directions_across(t: F64, D: F64) -> None:
+    """Fill D (2, 3) with unit vectors across the unit vector t and across each other."""
+    least = 0
+    for i in range(1, 3):
+        if abs(t[i]) < abs(t[least]):
+            least = i
+    for i in range(3):
+        D[0, i] = (1.0 if i == least else 0.0) - t[least] * t[i]
+    D[0] /= np.sqrt(D[0, 0] ** 2 + D[0, 1] ** 2 + D[0, 2] ** 2)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        D[1, i] = t[j] * D[0, k] - t[k] * D[0, j]
+
+
+@kernel
+def _cross_times(v: F64, M: F64, out: F64) -> None:
+    """Fill ``out`` with [v]x M."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            out[i, c] = v[j] * M[k, c] - v[k] * M[j, c]
+
+
+@kernel
+def _in_frame(E: F64, inverse1: F64, inverse2: F64, f: F64) -> None:
+    """Fill f (9,) with inverse2' E inverse1, row by row."""
+    for i in range(3):
+        for j in range(3):
+            f[3 * i + j] = 0.0
+            for a in range(3):
+                for b in range(3):
+                    f[3 * i + j] += inverse2[a, i] * E[a, b] * inverse1[b, j]
 
 
 def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: float) -> B8:

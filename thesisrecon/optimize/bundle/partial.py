@@ -5,6 +5,7 @@ Also triangulation by any method of section 6.3, among them the least reprojecti
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -46,6 +47,8 @@ from thesisrecon.optimize.bundle.projective import (
 )
 from thesisrecon.optimize.least_squares import DenseSystem, invert_information, run_levenberg_marquardt
 
+_BLOCK = 8192
+"""Points whose derivatives are in memory at a time."""
 TriangulationMethod = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
 
@@ -247,10 +250,19 @@ def _one_view_observations(xy: F64) -> Observations:
     return Observations(np.zeros(len(xy), dtype=np.int64), np.arange(len(xy)), np.ascontiguousarray(xy))
 
 
-def _dense_system(cost: float, J: Jacobians) -> DenseSystem:
-    """Return the normal equations of the camera columns."""
-    A, r = J.A.reshape(-1, J.A.shape[2]), J.residual.ravel()
-    return DenseSystem(cost, A.T @ A, A.T @ r)
+def _dense_system(
+    X: F64, xy: F64, columns: int, linearize: Callable[[F64, Observations, Jacobians], float]
+) -> DenseSystem:
+    """Return the normal equations of the columns of one camera, added up over blocks of points."""
+    cost, hessian, gradient = 0.0, np.zeros((columns, columns)), np.zeros(columns)
+    for k in range(0, len(X), _BLOCK):
+        block = X[k : k + _BLOCK]
+        J = Jacobians.empty(len(block), columns, 0)
+        cost += float(linearize(block, _one_view_observations(xy[k : k + _BLOCK]), J))
+        A, r = J.A.reshape(-1, columns), J.residual.ravel()
+        hessian += A.T @ A
+        gradient += A.T @ r
+    return DenseSystem(cost, hessian, gradient)
 
 
 def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: int = 20) -> tuple[F64, F64]:
@@ -267,8 +279,10 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     obs, weighting = _one_view_observations(xy * scale + T[:2, 2]), Weighting(1.0, loss_px * scale)
 
     def linearize(state: F64) -> DenseSystem:
-        J = Jacobians.empty(len(points), 11, 0)
-        return _dense_system(linearize_projective(UnitState.at(state, points), obs, weighting, J), J)
+        return _dense_system(
+            points, obs.xy, 11,
+            lambda X, some, J: linearize_projective(UnitState.at(state, X), some, weighting, J),
+        )  # fmt: skip
 
     def retract(state: F64, step: F64) -> F64:
         s, moved = UnitState.at(state, points), np.empty_like(state)
@@ -309,8 +323,12 @@ def refine_pose(
     start = MetricModel(R[None], moved[None], intrinsics[None], np.zeros(1, dtype=np.int64), points)
 
     def linearize(state: MetricModel) -> DenseSystem:
-        J = Jacobians.empty(len(points), 6 + len(columns), 0)
-        return _dense_system(linearize_metric(state, obs, weighting, columns, columns[:0], J), J)
+        return _dense_system(
+            points, obs.xy, 6 + len(columns),
+            lambda X, some, J: linearize_metric(
+                state._replace(X=X), some, weighting, columns, columns[:0], J
+            ),
+        )  # fmt: skip
 
     def retract(state: MetricModel, step: F64) -> MetricModel:
         R, t = np.empty_like(state.R), np.empty_like(state.t)
