@@ -15,7 +15,7 @@ from validation.references.libraries import NoReference, one_thread
 from validation.scenes.real import load_fixture_scene
 
 Call = Callable[..., Any]
-ROUNDS = 5
+ROUNDS = 7
 
 
 class Bench(Protocol):

@@ -20,7 +20,7 @@ from validation.ablation.plan import STUDIES
 from validation.runs.processes import call_apart
 from validation.runs.study import MODULES, OF_PAGES, load_study, run_studies, run_study, study_parser
 from validation.runs.tables import Metric
-from validation.studies import benchmark_table
+from validation.studies import benchmark_against, benchmark_table
 from validation.studies import growth_of_cost as growth
 from validation.studies.growth_of_cost import Meter, exponent
 from validation.studies.robustness import different, outputs
@@ -91,7 +91,7 @@ def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path):
 
 
 def entry(group, method, seconds):
-    return {"group": group, "extra_info": {"method": method}, "stats": {"min": seconds}}
+    return {"group": group, "extra_info": {"method": method}, "stats": {"median": seconds}}
 
 
 def test_ratios_are_ours_over_each_reference(tmp_path, capsys):
@@ -103,6 +103,46 @@ def test_ratios_are_ours_over_each_reference(tmp_path, capsys):
     assert run_study("benchmark-table", options) == 0
     assert "| F | OpenCV | 8 | **0.25** |" in capsys.readouterr().out
     assert json.loads((tmp_path / "r.json").read_text())["ours_over"] == {"F": {"OpenCV": 0.25}}
+
+
+def test_a_slowdown_of_ten_per_cent_is_found_and_nothing_else():
+    found, false = 0, 0
+    works = {f"work {k}": 10.0 ** (-k % 4) for k in range(25)}
+    for trial in range(20):
+        rng = np.random.default_rng(trial)
+
+        def measure(root, _, rng=rng):
+            # Both versions suffer from what else the machine does, and each piece of work from itself.
+            machine = 1.0 + 0.3 * rng.random()
+            slow = {"work 7": 1.1} if root.name == "now" else {}
+            return {w: machine * slow.get(w, 1.0) * s * np.exp(0.03 * rng.normal()) for w, s in works.items()}
+
+        trees = {"then": Path("then"), "now": Path("now")}
+        text = benchmark_against.compare_trees(trees, 11, measure, Path())
+        rows = [line for line in text.splitlines() if line.endswith("| slower |")]
+        found += any(row.startswith("| work 7 ") for row in rows)
+        false += sum(not row.startswith("| work 7 ") for row in rows)
+    assert found >= 19
+    assert false <= 2
+
+
+def test_stored_runs_are_drawn(tmp_path, monkeypatch):
+    for n, seconds in enumerate((0.002, 0.001)):
+        run = {"commit_info": {"id": f"abcdef012345{n}"}, "machine_info": {"cpu": {"brand_raw": "a chip"}}}
+        run |= {
+            "datetime": f"2026-01-0{2 - n}",
+            "benchmarks": [entry("F", "ours", seconds), entry("F", "X", 0.004)],
+        }
+        (tmp_path / f"{n}.json").write_text(json.dumps(run))
+    (tmp_path / "other.json").write_text("{}")
+    page = benchmark_against.write_trend(sorted(tmp_path.glob("*.json")), tmp_path).read_text(
+        encoding="utf-8"
+    )
+    assert '"y": [1.0, 2.0]' in page or '"y":[1.0,2.0]' in page, "in the order of the dates"
+    assert "abcdef0123 on a chip" in page
+    monkeypatch.setattr(benchmark_against, "STORE", tmp_path / "none")
+    assert run_study("benchmark-against", ["--trend"]) == 2
+    assert run_study("benchmark-against", ["--against", "no-such-revision"]) == 2
 
 
 def test_costs_go_to_the_stage_that_ran_and_powers_are_those_of_the_numbers(tmp_path):
