@@ -73,7 +73,11 @@ def main(arguments: list[str] | None = None) -> int:
         _print_gates(results)
     broken = counted(len(results.broken) + len(results.missing), "gate")
     print(f"{broken} broken; the page is {page}")
-    return int(parsed.command == "check" and bool(results.broken or results.missing))
+    if parsed.command != "check":
+        return 0
+    tested = sum(row.limit is not None for row in results.rows) + len(results.missing)
+    print(f"{tested} of {len(gates)} gates were judged" + ("" if tested else ": that is no check"))
+    return int(not tested or bool(results.broken or results.missing))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -175,6 +179,8 @@ def _print_gates(results: Results) -> None:
     for key in results.missing:
         why = [words for task, words in results.failures.items() if task.split("/")[:2] == key.split("/")[:2]]
         print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")
+    for key in results.not_run:
+        print(f"not run  {key}: --quick leaves its method out")
 
 
 def _add_ablate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

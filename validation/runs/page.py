@@ -118,9 +118,11 @@ def _picture(folder: Path, picture: Picture) -> dict[str, Any]:
 
 ROW_PX, FRAME_PX = 17, 90
 BETTER, WORSE = "#2166ac", "#c2571a"
+COSTS = ("ms", "s", "MB")
 DEFINITION = (
     "Each dot is a number of ours over that of the best reference, inverted where more is better: left of "
-    "the line we are better. Diamonds are geometric means of a stage on a scene; the worst are on top."
+    "the line we are better. Diamonds are geometric means of a stage on a scene, of times and memory apart "
+    "from the rest; the worst are on top."
 )
 
 
@@ -130,7 +132,8 @@ def overview(results: Results) -> dict[str, Any]:
     for row in results.rows:
         if row.ratio is not None:
             where, name = row.key.rsplit("/", 1)
-            ratios.setdefault(where, []).append((row.ratio, name))
+            cost = ", cost" if row.unit in COSTS else ""
+            ratios.setdefault(f"{where}{cost}", []).append((row.ratio, name))
     means = {key: float(np.exp(np.mean(np.log([r for r, _ in found])))) for key, found in ratios.items()}
     # Plotly draws the first row at the bottom.
     order = sorted(means, key=lambda key: (means[key], key))

@@ -103,6 +103,7 @@ class Results:
     failures: Mapping[str, str]
     environment: Mapping[str, Any]
     options: Mapping[str, Any]
+    not_run: Sequence[str] = ()
 
     @property
     def broken(self) -> list[Row]:
@@ -126,19 +127,24 @@ def collect(
     judged: Mapping[tuple[str, str], tuple[Judgement, Mapping[str, Outcome]]],
     gates: Mapping[str, Gate],
 ) -> Results:
-    """Collect all rows of a run; gates without a reported number are ``missing``."""
+    """Collect all rows of a run; gates without a reported number are ``missing``, or ``not_run`` if --quick
+    left their method out and no other failed there.
+    """
     rows = []
     for (stage, _), (judgement, _outcomes) in judged.items():
         rows += [row_of(stage, m, gates.get(key_of(stage, m))) for m in judgement.metrics]
     reported = {row.key for row in rows}
-    missing = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in reported)
+    absent = sorted(k for k in gates if tuple(k.split("/")[:2]) in set(judged) and k not in reported)
     failures = {
         f"{stage}/{scene}/{method}": outcome.failure
         for (stage, scene), (_, outcomes) in judged.items()
         for method, outcome in outcomes.items()
         if not outcome.ok
     }
-    return Results(rows, missing, failures, environment(options), options.to_json())
+    failed = {key.rpartition("/")[0] for key in failures}
+    not_run = [k for k in absent if options.quick and k.rpartition("/")[0] not in failed]
+    missing = [k for k in absent if k not in not_run]
+    return Results(rows, missing, failures, environment(options), options.to_json(), not_run)
 
 
 def environment(options: ReportOptions) -> dict[str, Any]:

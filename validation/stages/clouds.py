@@ -35,6 +35,9 @@ ICP = "Open3D, ICP"
 NEAR_PCT = 0.5  # A point has a partner if the other cloud has a point within this share of its depth (%)
 
 
+SHARED = "points that both observe within a pixel"
+
+
 class CloudsStage(Stage):
     """Two clouds of one scene, aligned by their cameras."""
 
@@ -160,7 +163,7 @@ def _same_points(
     text = "distance of ours to theirs, for points observed by both within a pixel"
     most = f"90 % quantile of the {text}"
     return [
-        row(scene, f"points shared with {name}", "", float(len(pairs)), text, more=True),
+        row(scene, f"points shared with {name}", "", float(len(pairs)), SHARED, more=True, ranked=False),
         _distance(scene, f"shared with {name}: median apart", np.median(apart), f"median {text}"),
         _distance(scene, f"shared with {name}: 90 % within", np.quantile(apart, 0.9), most),
     ]

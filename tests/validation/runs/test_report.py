@@ -68,6 +68,12 @@ def test_gates_check_numbers_and_a_missing_number_breaks_its_gate(ran, tmp_path)
     assert row.reference["good"] == 2.0
     assert results.missing == ["toy/yard/never-reported"]
     assert set(results.failures) == {f"toy/yard/{n}" for n in ("missing", "failing", "crashing", "hanging")}
+    # --quick leaves methods out, which is no failure unless another one fails there.
+    quick = dataclasses.replace(options, quick=True)
+    assert collect(quick, judged, GATES).missing == ["toy/yard/never-reported"]
+    fine = {at: (judgement, {"ours": outcomes["ours"]}) for at, (judgement, outcomes) in judged.items()}
+    left_out = collect(quick, fine, GATES)
+    assert (left_out.missing, left_out.not_run) == ([], ["toy/yard/never-reported"])
     strict = {row.key: dataclasses.replace(GATES[row.key], limit=0.4)}
     assert collect(options, judged, strict).broken[0].key == row.key
     write_results(tmp_path, results)
