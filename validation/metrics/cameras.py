@@ -15,6 +15,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import MetricResult, Reconstruction
 from thesisrecon.testing import pose_errors
+from validation.metrics.poses import relative_pose_errors
 
 TrueCameras = tuple[F64, F64, F64]
 """K, R (V, 3, 3), R world-to-camera, and centres C (V, 3) in some unit of length."""
@@ -48,17 +49,19 @@ class Reprojection(NamedTuple):
 
 
 def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> CameraErrors:
-    """Compare the registered cameras with the truth of the same views."""
-    views = np.flatnonzero(reconstruction.registered)
-    if reconstruction.stratum != "metric" or reconstruction.K is None or len(views) == 0:
+    """Compare the registered cameras with the truth of the same views; views without truth do not count."""
+    registered = np.flatnonzero(reconstruction.registered)
+    if reconstruction.stratum != "metric" or reconstruction.K is None or len(registered) == 0:
         raise ValueError("measure_cameras needs a metric reconstruction with at least one registered camera")
     if len(truth[0]) != len(reconstruction.P):
         counts = f"{len(truth[0])} for {len(reconstruction.P)}"
         raise ValueError(f"measure_cameras needs one truth per view; got {counts}")
-    K, (K_true, R_true, C_true) = reconstruction.K[views], (part[views] for part in truth)
-    focal = np.sqrt(K[:, 0, 0] * K[:, 1, 1] / (K_true[:, 0, 0] * K_true[:, 1, 1]))
-    principal_point = np.linalg.norm(K[:, :2, 2] - K_true[:, :2, 2], axis=1)
-    R, _ = _rotations_translations(reconstruction)
+    known = np.isfinite(truth[2][registered]).all(axis=1)
+    views = registered[known]
+    if not len(views):
+        return CameraErrors(np.nan, np.nan, None, np.nan)
+    R_true, C_true = truth[1][views], truth[2][views]
+    R = _rotations_translations(reconstruction)[0][known]
     try:
         centres = dehomogenize(camera_centre(reconstruction.P[views]))
         moved = estimate_similarity(centres, C_true).apply(centres)
@@ -66,8 +69,28 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     except ValueError:
         centre_error = None
     turn = float(np.median(rotation_errors_deg(R, R_true)))
-    focal_pct = 100.0 * float(np.median(np.abs(focal - 1.0)))
-    return CameraErrors(focal_pct, float(np.median(principal_point)), centre_error, turn)
+    return CameraErrors(*measure_intrinsics(reconstruction, truth[0]), centre_error, turn)
+
+
+def measure_intrinsics(reconstruction: Reconstruction, K_true: F64) -> tuple[float, float]:
+    """Median errors of focal lengths (%) and principal points (px) of registered views whose K is known."""
+    assert reconstruction.K is not None
+    known = reconstruction.registered & np.isfinite(K_true).all(axis=(1, 2))
+    if not known.any():
+        return np.nan, np.nan
+    K, K_true = reconstruction.K[known], K_true[known]
+    principal_point = np.linalg.norm(K[:, :2, 2] - K_true[:, :2, 2], axis=1)
+    return float(np.median(focal_errors_pct(K, K_true))), float(np.median(principal_point))
+
+
+def pose_pair_errors(reconstruction: Reconstruction | None, truth: TrueCameras) -> F64:
+    """Errors (degrees) of the relative poses of pairs with truth; of missing cameras they are infinite."""
+    R, C = np.full_like(truth[1], np.nan), np.full_like(truth[2], np.nan)
+    if reconstruction is not None:
+        views = np.flatnonzero(reconstruction.registered)
+        R[views], t = _rotations_translations(reconstruction)
+        C[views] = -np.einsum("vba,vb->va", R[views], t)
+    return relative_pose_errors(R, C, truth[1], truth[2])
 
 
 def relative_centre_error(errors: CameraErrors, C: F64) -> float:

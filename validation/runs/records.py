@@ -10,7 +10,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from validation.runs.tables import Metric, Plot, slug
-from validation.scenes.real import SUFFIXES, Scene, data_root, load_scene, read_scene, real_folder, with_truth
+from validation.scenes.real import (
+    SUFFIXES,
+    Scene,
+    data_root,
+    load_scene,
+    read_scene,
+    real_folder,
+    with_known_cameras,
+)
 from validation.scenes.stereo import STEREO_PAIRS, stereo_folder
 
 
@@ -148,7 +156,7 @@ def available_scenes(*, quick: bool) -> tuple[str, ...]:
 
 def load_images(name: str, options: ReportOptions) -> Scene:
     """Return the images of a scene with their truth, if known. A folder of the user holds images, or images/
-    with them; its truth is ``cameras.json`` in the folder (as in fixtures) or a COLMAP model in ``sparse/0``.
+    with them; its truth are cameras there, of any format, or K alone (:func:`with_known_cameras`).
     Raises ``ValueError`` if a scene has no images.
     """
     if name in options.folders:
@@ -166,8 +174,5 @@ def _own_scene(folder: Path, name: str) -> Scene:
         paths = tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES))
         if not paths:
             raise ValueError(f"there are no images in {folder}")
-        scene = Scene(name, paths)
-        if (folder / "cameras.json").is_file():
-            scene = with_truth(scene, folder / "cameras.json")
-    model = folder / "sparse" / "0"
-    return scene if scene.has_truth or not model.is_dir() else with_truth(scene, model, complete=False)
+        scene = with_known_cameras(Scene(name, paths), folder)
+    return scene

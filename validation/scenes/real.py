@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image as PillowImage
 
 import thesisrecon
-from thesisrecon.arrays import F64, U8
-from thesisrecon.io._files import write_atomically
+from thesisrecon.arrays import B8, F64, U8
+from thesisrecon.io._files import shortened, write_atomically
 from thesisrecon.io._models import read_model
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,7 +36,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 @dataclass(frozen=True)
 class Scene:
     """A set of images, sorted by name, and its truth where there is one: ``K``, ``R`` (world-to-camera)
-    (V, 3, 3) and ``C`` (V, 3) camera centres in metres.
+    (V, 3, 3) and ``C`` (V, 3) camera centres in metres. Rows of images whose camera is not known are NaN.
     """
 
     name: str
@@ -47,8 +47,15 @@ class Scene:
 
     @property
     def has_truth(self) -> bool:
-        """Return whether the cameras are known."""
-        return self.C is not None
+        """Return whether all cameras are known."""
+        return self.truth is not None and bool(self.known.all())
+
+    @property
+    def known(self) -> B8:
+        """Whether the pose of each image is known (V,)."""
+        if self.C is None:
+            return np.zeros(len(self.image_paths), dtype=bool)
+        return np.asarray(np.isfinite(self.C).all(axis=1))
 
     @property
     def truth(self) -> tuple[F64, F64, F64] | None:
@@ -58,8 +65,8 @@ class Scene:
 
     @property
     def cameras(self) -> tuple[F64, F64, F64]:
-        """Return K, R and C; ``ValueError`` if they are not known."""
-        if self.truth is None:
+        """Return K, R and C; ``ValueError`` if one is not known."""
+        if self.truth is None or not self.has_truth:
             raise ValueError(f"the cameras of {self.name} are not known")
         return self.truth
 
@@ -90,25 +97,82 @@ def read_scene(folder: Path, name: str) -> Scene:
     paths = tuple(p for p in found if p.suffix.lower() in SUFFIXES)
     if not paths:
         raise ValueError(f"a scene needs images in images/; {folder} has none")
-    truth = folder / "cameras.json"
-    if not truth.is_file():
-        return Scene(name, paths)
-    return with_truth(Scene(name, paths), truth)
+    return with_known_cameras(Scene(name, paths), folder)
 
 
-def with_truth(scene: Scene, model: Path, *, complete: bool = True) -> Scene:
-    """The scene with the cameras of a model as its truth. ``ValueError`` if an image has no camera there; if
-    the truth need not be ``complete``, the scene then has none, unless the model is one of other images.
+def with_known_cameras(scene: Scene, folder: Path) -> Scene:
+    """The scene with the truth that its folder holds: cameras of any format, or K.txt alone."""
+    truth = truth_beside(folder)
+    return with_calibration(scene, folder / "K.txt") if truth is None else with_truth(scene, truth)
+
+
+TRUTHS = (
+    *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "bundle.out", "scene.mvs", "camchain.yaml"),
+    *("sparse/0", "sparse", "cams", "cameras", "groundtruth.txt", "poses.txt"),
+)
+
+
+def truth_beside(folder: Path) -> Path | None:
+    """The first model of true cameras in a folder of images, by its usual name, of any format."""
+    found = (path for pattern in TRUTHS for path in sorted(folder.glob(pattern)))
+    return next((path for path in found if path.is_file() or any(path.iterdir())), None)
+
+
+def with_truth(scene: Scene, model: Path) -> Scene:
+    """The scene with the cameras of a model as its truth, found by name, or by name without suffix.
+
+    A file K.txt (3 x 3) beside it gives K to poses. Raises ``ValueError`` if the model has no image of the
+    scene, or no K.
     """
-    views = {view.name: view for view in read_model(model).views if view.K is not None}
-    missing = [path.name for path in scene.image_paths if path.name not in views]
-    if missing and (complete or len(missing) == len(scene.image_paths)):
-        raise ValueError(f"{model} must have a camera with K for every image; it lacks {missing[:3]}")
-    if missing:
-        return scene
-    cameras = [views[path.name] for path in scene.image_paths]
-    K, R, C = (np.array([getattr(view, name) for view in cameras]) for name in ("K", "R", "centre"))
+    views = list(read_model(model).views)
+    paths = scene.image_paths
+    for name_of in (str, _without_suffix):
+        place = {name_of(view.name): view for view in views}
+        cameras = [place.get(name_of(path.name)) for path in paths]
+        if any(cameras):
+            break
+    if not any(cameras):
+        named, other = (
+            shortened(", ".join(names[:3])) for names in ([p.name for p in paths], [v.name for v in views])
+        )
+        raise ValueError(f"{model} has a camera of no image of {scene.name}: {other} there, {named} here")
+    K, R, C = (
+        np.full((len(paths), 3, 3), np.nan),
+        np.full((len(paths), 3, 3), np.nan),
+        np.full((len(paths), 3), np.nan),
+    )
+    common = _calibration_beside(model)
+    for n, view in enumerate(cameras):
+        if view is not None:
+            R[n], C[n] = view.R, view.centre
+            if (own := view.K if view.K is not None else common) is not None:
+                K[n] = own
+    if not np.isfinite(K).any():
+        raise ValueError(f"{model} gives no image a K; put one into K.txt (3 x 3) beside it")
     return replace(scene, K=K, R=R, C=C)
+
+
+def _without_suffix(name: str) -> str:
+    """The name without folder and suffix; a suffix of digits belongs to a time."""
+    path = Path(name)
+    return path.name if path.suffix[1:].isdigit() else path.stem
+
+
+def _calibration_beside(model: Path) -> F64 | None:
+    """K of a file K.txt in the folder of a model."""
+    file = model.parent / "K.txt"
+    if not file.is_file():
+        return None
+    try:
+        return np.loadtxt(file).reshape(3, 3)
+    except ValueError:
+        raise ValueError(f"{file} must hold the 3 x 3 numbers of K") from None
+
+
+def with_calibration(scene: Scene, file: Path) -> Scene:
+    """The scene with one K of all images as its truth, and no poses."""
+    K = _calibration_beside(file)
+    return scene if K is None else replace(scene, K=np.tile(K, (len(scene.image_paths), 1, 1)))
 
 
 def real_folder(name: str) -> Path | None:

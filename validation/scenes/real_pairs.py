@@ -79,9 +79,9 @@ def kusvod2_pairs(cache: Path, names: tuple[str, ...] | None = None) -> Iterator
 
 def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2)) -> Iterator[RealPair]:
     """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise."""
-    if scene is None or scene.K is None or scene.R is None or scene.C is None:
+    if scene is None or not scene.has_truth:
         return
-    cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(scene.K, scene.R, scene.C, strict=True)]
+    cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(*scene.cameras, strict=True)]
     for gap in gaps:
         for i in range(len(cameras) - gap):
             paths = (scene.image_paths[i], scene.image_paths[i + gap])

@@ -18,7 +18,14 @@ from thesisrecon.io._files import read_json
 from thesisrecon.pipeline.run import FOLDERS
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
-from validation.metrics.cameras import focal_errors_pct, measure_cameras, measure_reprojection
+from validation.metrics.cameras import (
+    focal_errors_pct,
+    measure_cameras,
+    measure_intrinsics,
+    measure_reprojection,
+    pose_pair_errors,
+)
+from validation.metrics.poses import area_under_recall
 from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_colmap_model
 from validation.runs.records import IMAGE_SCENES, Judgement, Outcome, ReportOptions, Stage, Task, load_images
 from validation.runs.tables import OURS, Metric, Plot, Values, each, plot, row, scatter
@@ -38,6 +45,7 @@ CENTRE = "mean distance of the camera centres after the least-squares similarity
 PRINCIPAL_POINT = "median distance from the true one"
 REPROJECTION = "median distance of inlier observations from their projected points"
 ROTATION = "median angle after the rotation common to all cameras is taken off"
+AUC = "area under the recall of relative poses over thresholds, all pairs; missing cameras fail"
 SHARE_HELD = "share of focal lengths and principal points whose stated 95 % interval contains the truth"
 
 
@@ -81,7 +89,12 @@ class CamerasStage(Stage):
         metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
         metrics += _before_adjustment(images, outcomes.get(OURS))
         metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
-        return Judgement(metrics, plots=[_plot(images, models)])
+        known, total = int(images.known.sum()), len(images.image_paths)
+        partly = 0 < known < total
+        notes = (
+            [f"The truth has cameras of {known} of {total} images; errors are of those."] if partly else []
+        )
+        return Judgement(metrics, notes, plots=[_plot(images, models)])
 
 
 def read_model(scene: Scene, method: str, outcome: Outcome) -> Reconstruction | None:
@@ -121,7 +134,7 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
     rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
     truth = scene.truth
     if truth is None:
-        return rows
+        return rows if scene.K is None else [*rows, *_intrinsic_errors(scene, models)]
     errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
     for name, unit, field, text in (
         ("focal error", "%", "focal_error_pct", FOCAL),
@@ -133,7 +146,25 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
         rows.append(row(scene.name, name, unit, values, text))
         if THESIS in values:
             rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], text))
+    pairs = {n: pose_pair_errors(m, truth) for n, m in models.items()}
+    for threshold in (1.0, 5.0):
+        areas: Values = {n: 100.0 * area_under_recall(e, threshold) for n, e in pairs.items()}
+        rows.append(row(scene.name, f"AUC@{threshold:g}°", "%", areas, AUC, more=True))
     return rows
+
+
+def _intrinsic_errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """Errors of images of which K alone is known."""
+    assert scene.K is not None
+    K = scene.K
+    errors = (
+        each(models, lambda m: measure_intrinsics(m, K)[0]),
+        each(models, lambda m: measure_intrinsics(m, K)[1]),
+    )
+    return [
+        row(scene.name, "focal error", "%", errors[0], FOCAL),
+        row(scene.name, "principal point error", "px", errors[1], PRINCIPAL_POINT),
+    ]
 
 
 def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
@@ -162,7 +193,7 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
         return rows
     K = _last_record(outcome, "selfcalibration").K
     known = np.isfinite(K).all(axis=(1, 2)) & (K[:, 0, 0] > 0.0)
-    error = float(np.median(focal_errors_pct(K[known], scene.K[known])))
+    error = float(np.nanmedian(focal_errors_pct(K[known], scene.K[known])))
     text = f"{FOCAL}, as self-calibration leaves it"
     return [*rows, row(scene.name, "self-calibrated focal error", "%", error, text)]
 
@@ -190,8 +221,8 @@ def _per_image(scene: Scene, model: Reconstruction | None) -> list[Metric]:
     errors = focal_errors_pct(model.K[model.registered], scene.K[model.registered])
     text, name = "|f / f_true - 1| over the images, with independent cameras", "focal error, a camera each"
     return [
-        row(scene.name, name, "%", float(np.median(errors)), f"median {text}"),
-        row(scene.name, f"worst {name}", "%", float(errors.max()), f"largest {text}"),
+        row(scene.name, name, "%", float(np.nanmedian(errors)), f"median {text}"),
+        row(scene.name, f"worst {name}", "%", float(np.nanmax(errors)), f"largest {text}"),
     ]
 
 
@@ -224,7 +255,7 @@ def _share_held(cameras: list[dict[str, Any]], K: F64) -> float | None:
         abs(interval["value"] - truth[view]) <= 1.96 * interval["std"]
         for view, camera in enumerate(cameras)
         for name, truth in truths.items()
-        if (interval := camera.get(name)) and interval["std"]
+        if (interval := camera.get(name)) and interval["std"] and np.isfinite(truth[view])
     ]
     return 100.0 * float(np.mean(held)) if held else None
 
@@ -239,7 +270,8 @@ def _plot(scene: Scene, models: Mapping[str, Reconstruction | None]) -> Plot:
             seen = zip(focal, model.registered, strict=True)
             traces.append(scatter(name, images, [float(f) if there else None for f, there in seen]))
     if scene.K is not None:
-        true = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
+        focal = np.sqrt(scene.K[:, 0, 0] * scene.K[:, 1, 1]).tolist()
+        true = [f if np.isfinite(f) else None for f in focal]
         marker = {"symbol": "line-ew-open", "size": 18, "color": "#1b2733"}
         traces.append(scatter("truth", images, true, marker=marker))
     return plot("Focal lengths", traces, "image", "focal length (px)")

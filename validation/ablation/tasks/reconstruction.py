@@ -91,7 +91,7 @@ class Reconstruction(Task):
         found = {
             name for step, names in AVAILABLE_FROM.items() if reached < steps.index(step) for name in names
         }
-        return found if _load(scene).has_truth else found | set(NEED_TRUTH)
+        return found | set(NEED_TRUTH) if _load(scene).truth is None else found
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
         """A step is named by all settings up to it; corners alone do not depend on the seed."""
