@@ -32,7 +32,7 @@ from validation.runs.results import Results, collect, read_gates, write_results
 from validation.runs.study import (
     MODULES,
     OF_PAGES,
-    report_at_terminal,
+    progress_lines,
     report_progress,
     run_studies,
     run_study,
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
             load_images(name, options)
         with with_resume_advice("run the same command to start again"), join_claim(options.out) as outputs:
             outputs.require(["index.html", "results.json", "options.json"])
-            judged = run_tasks(options, STAGES, report_at_terminal)
+            judged = run_tasks(options, STAGES, progress_lines())
             results = collect(options, judged, gates)
             write_results(options.out, results)
             page = write_pages(options, STAGES, judged, results)
@@ -215,7 +215,7 @@ def run_ablation(parsed: argparse.Namespace) -> int:
         else:
             how = {"executor": parsed.executor, "threads": parsed.threads, "limit_s": parsed.time_limit}
             with with_resume_advice(KEPT.format(parsed.out)):
-                rows = ablate(study, parsed.out, **how, on_progress=report_at_terminal)
+                rows = ablate(study, parsed.out, **how, on_progress=progress_lines())
         page = write_analysis(analyse(rows), parsed.out)
         if parsed.against is not None:
             compared = compare_runs(read_earlier_rows(study, parsed.against), rows)

@@ -71,8 +71,8 @@ def test_a_mask_changes_the_digest_of_its_image_only(folders):
     assert masked[1].image.mask is None
     # The same mask in an image record.
     assert read_images([masked[0].image], max_size_px=1600).decoded[0].digest == masked[0].digest
-    wrong = Image("d", masked[0].image.rgb, SIZE, masked[0].image.mask[1:])
-    refuses(ValueError, "a mask must be", read_images, [wrong], max_size_px=1600)
+    image = masked[0].image
+    refuses(ValueError, r"needs rgb \(H, W, 3\), mask \(H, W\)", Image, "d", image.rgb, SIZE, image.mask[1:])
 
 
 @pytest.mark.parametrize("size", [SIZE, (90, 60), (37, 25), (600, 400)])

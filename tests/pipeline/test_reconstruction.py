@@ -427,7 +427,7 @@ def test_a_pair_that_fails_is_refused_and_without_an_accepted_pair_the_best_is_n
     ("options", "words"),
     [
         ({"until": "surface"}, "unknown stage"), ({"until": "metrik"}, "did you mean metric"),
-        ({"threads": -1}, "at least 1"), ({"executor": "dask://there"}, "dask://HOST:PORT"),
+        ({"threads": -1}, "at least 0 as threads; got -1"), ({"executor": "dask://there"}, "dask://HOST:PORT"),
         ({"executor": "proceses"}, "did you mean processes"), ({"seed": -1}, "at least 0"),
     ],
 )  # fmt: skip

@@ -198,7 +198,7 @@ def calibrated_arrays(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F6
     return K, R, t
 
 
-def checked_sizes(caller: str, sizes: I64 | F64, n: int) -> I64:
+def checked_sizes(caller: str, sizes: Any, n: int) -> I64:
     """Image sizes (n, 2) of (n, 2) or (2,) whole numbers above 0."""
     (given,) = numbers(caller, sizes=sizes_of_images(sizes))
     if given.shape not in ((2,), (n, 2)):

@@ -223,9 +223,7 @@ def rectify_cameras(
     if not baseline > 1e-12 * float(np.abs(centres).max()):
         raise ValueError(f"rectify_cameras needs two camera centres; both are {centres[0].tolist()}")
     R = rotation_along_baseline(np.array([camera.P for camera in given]))
-    width, height = (
-        given[0].size if size is None else checked_sizes("rectify_cameras", np.array(size), 1)[0].tolist()
-    )
+    width, height = given[0].size if size is None else checked_sizes("rectify_cameras", size, 1)[0].tolist()
     if K is None:
         focal = float(np.exp(np.mean([np.log(np.diag(camera.K)[:2]) for camera in given])))
         # Where the centres of the images go, about the middle of the frame.

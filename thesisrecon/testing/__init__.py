@@ -1,8 +1,8 @@
 """Accuracy gates for pytest: cameras, fundamental matrices and clouds against the truth.
 
-An installed package brings this as a plugin of pytest: the fixtures ``thesisrecon_courtyard`` and
-``thesisrecon_two_views``, the marker ``accuracy_gate``, and a line of the summary for each assertion with the
-smallest error that it would have seen. Errors are held against stated standard deviations where there are
+The plugin of pytest (``pytest_plugins = ["thesisrecon.testing.plugin"]`` in conftest.py) has the fixtures
+``thesisrecon_courtyard`` and ``thesisrecon_two_views``, the marker ``accuracy_gate``, and a line of the
+summary for each assertion with the smallest error that it would have seen. Errors are held against stated standard deviations where there are
 some (a run, :attr:`thesisrecon.Camera.std`, a covariance), else against limits of your own.
 """
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from thesisrecon.arrays import B8, F64
     from thesisrecon.camera import Camera
 
-# Loaded by every run of pytest where the package is installed: numpy and the library are imported on use.
+# Loaded before anything else by pytest: numpy and the library are imported on use.
 POWER = 1.645
 """Standard deviations beyond a limit at which an error is seen in 95 of 100 cases."""
 _SEEN: list[str] = []

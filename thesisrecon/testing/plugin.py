@@ -1,4 +1,8 @@
-"""Plugin of pytest: the marker ``accuracy_gate``, fixtures with truth, and a summary of what gates see."""
+"""Plugin of pytest: the marker ``accuracy_gate``, fixtures with truth, and a summary of what gates see.
+
+It is named in a conftest.py and not found by itself: pytest rewrites the assertions of all modules of a
+package that registers a plugin, which would change the digests of our code and so the keys of stored results.
+"""
 
 from __future__ import annotations
 

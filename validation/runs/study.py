@@ -160,15 +160,19 @@ def report_progress(text: object) -> None:
 
 
 LOG_EVERY_S = 30.0
-_last_line = time.monotonic()
 
 
-def report_at_terminal(text: str) -> None:
-    """The same at a terminal; in a log one line in half a minute."""
-    global _last_line
-    if sys.stderr.isatty() or time.monotonic() - _last_line >= LOG_EVERY_S:
-        _last_line = time.monotonic()
-        report_progress(text)
+def progress_lines() -> Callable[[str], None]:
+    """The same at a terminal; in a log one line in half a minute from now."""
+    last = time.monotonic()
+
+    def report(text: str) -> None:
+        nonlocal last
+        if sys.stderr.isatty() or time.monotonic() - last >= LOG_EVERY_S:
+            last = time.monotonic()
+            report_progress(text)
+
+    return report
 
 
 def pick(names: Sequence[str] | None, known: Iterable[str]) -> list[str]:
