@@ -2,8 +2,9 @@
 
 The plugin of pytest (``pytest_plugins = ["thesisrecon.testing.plugin"]`` in conftest.py) has the fixtures
 ``thesisrecon_courtyard`` and ``thesisrecon_two_views``, the marker ``accuracy_gate``, and a line of the
-summary for each assertion with the smallest error that it would have seen. Errors are held against stated standard deviations where there are
-some (a run, :attr:`thesisrecon.Camera.std`, a covariance), else against limits of your own.
+summary for each assertion with the smallest error that it would have seen. Errors are held against stated
+standard deviations where there are some (a run, :attr:`thesisrecon.Camera.std`, a covariance), else against
+limits of your own.
 """
 
 from __future__ import annotations
