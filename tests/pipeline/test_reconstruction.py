@@ -432,7 +432,7 @@ def test_a_pair_that_fails_is_refused_and_without_an_accepted_pair_the_best_is_n
     ],
 )  # fmt: skip
 def test_wrong_options_are_rejected_before_any_output(tmp_path, options, words):
-    refuses(UsageError, words, run, tmp_path / "out", **options)
+    refuses(ValueError, words, run, tmp_path / "out", **options)
     refuses(TypeError, "did you mean threads", run, tmp_path / "out", thread=3)
     assert not (tmp_path / "out").exists()
 
