@@ -94,7 +94,7 @@ def estimate_essential(
     >>> xy1, xy2 = (Camera(K, np.eye(3), one, (640, 480)).project(X) for one in t)
     >>> xy2[:20] = rng.uniform(0, 480, (20, 2))
     >>> fit = estimate_essential(xy1, xy2, K)
-    >>> int(fit.inliers[20:].sum()), fit.t.round(6).tolist()
+    >>> int(fit.inliers[20:].sum()), (fit.t.round(6) + 0.0).tolist()
     (40, [-0.6, 0.0, 0.8])
     """
     caller = "estimate_essential"

@@ -237,7 +237,7 @@ def _refine_pose(points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, most
         damping = max(0.1 * damping, 1e-9)
 
 
-@kernel
+@kernel(forceinline=True)
 def _linearize_pose(
     points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, D: F64, H: F64, g: F64
 ) -> float:
