@@ -17,13 +17,13 @@ from thesisrecon.testing import _SEEN, POWER, TwoViews, courtyard, two_views
 
 @pytest.fixture(scope="session")
 def thesisrecon_courtyard() -> tuple[list[Path], dict[str, Any]]:
-    """Six images and their true cameras: :func:`thesisrecon.testing.courtyard`."""
+    """Six images and their true cameras: ``thesisrecon.testing.courtyard``."""
     return courtyard()
 
 
 @pytest.fixture
 def thesisrecon_two_views() -> Callable[..., TwoViews]:
-    """The function :func:`thesisrecon.testing.two_views`."""
+    """The function ``thesisrecon.testing.two_views``."""
     return two_views
 
 
