@@ -65,10 +65,10 @@ def moved(truth, seed, *, sigmas=1.0):
 
 def test_errors_in_stated_deviations_are_normal_in_any_world():
     truth = cameras()
-    z = np.array([gates.measure_cameras(moved(truth, seed), truth).z for seed in range(60)])
+    z = np.array([gates.camera_deviations(moved(truth, seed), truth).z for seed in range(60)])
     for columns in (slice(1), slice(1, 3), slice(3, 6), slice(6, 9)):
         assert np.sqrt(np.mean(z[:, :, columns] ** 2)) == pytest.approx(1.0, abs=0.15)
-    exact = gates.measure_cameras(moved(truth, 0, sigmas=0.0), truth)
+    exact = gates.camera_deviations(moved(truth, 0, sigmas=0.0), truth)
     assert np.abs(exact.z).max() < 1e-4
     assert max(exact.focal_pct.max(), exact.rotation_deg.max(), exact.centre.max()) < 1e-5
 

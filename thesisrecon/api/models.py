@@ -22,7 +22,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
-from thesisrecon.io._files import as_path, read_json
+from thesisrecon.io._files import as_path, name_without_suffix, read_json
 from thesisrecon.io._models import read_model, read_positions
 from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
@@ -515,7 +515,7 @@ def _is_trajectory(model: SparseModel) -> bool:
 
 def _times(model: SparseModel) -> F64 | None:
     """Times (V,) in seconds of names that are all numbers, with decimals or of epochs; None otherwise."""
-    names = [_stem(view.name) for view in model.views]
+    names = [name_without_suffix(view.name) for view in model.views]
     if not all(re.fullmatch(r"\d+(\.\d+)?([eE][+-]?\d+)?", name) for name in names):
         return None
     times = np.array(names, dtype=np.float64)
@@ -528,7 +528,7 @@ def _times(model: SparseModel) -> F64 | None:
 
 def _pairs(a: SparseModel, b: SparseModel, notes: list[str]) -> list[tuple[int, int]]:
     """Pairs of cameras with the same name, in the order of a."""
-    for key in (str, _stem):
+    for key in (str, name_without_suffix):
         keys, keys_b = ([key(view.name) for view in model.views] for model in (a, b))
         counts, counts_b = Counter(keys), Counter(keys_b)
         place = {name: j for j, name in enumerate(keys_b) if counts_b[name] == 1}
@@ -541,12 +541,6 @@ def _pairs(a: SparseModel, b: SparseModel, notes: list[str]) -> list[tuple[int, 
     names = (f"{_few(model.names)} in the {which}" for which, model in (("first", a), ("second", b)))
     advice = "give models of the same images, or a trajectory of as many cameras"
     raise UsageError(f"the models have no common camera: {' and '.join(names)}; {advice}")
-
-
-def _stem(name: str) -> str:
-    """The name without folder and suffix; a suffix of digits belongs to a time."""
-    path = Path(name)
-    return path.name if path.suffix[1:].isdigit() else path.stem
 
 
 def _few(names: Sequence[str]) -> str:

@@ -55,6 +55,12 @@ def is_image_name(name: Any) -> bool:
     return not (".." in parts or parts[-1] in ("", ".") or "\0" in name or _ABSOLUTE.match(name))
 
 
+def name_without_suffix(name: str) -> str:
+    """The name without folder and suffix; a suffix of digits belongs to a time."""
+    path = Path(name)
+    return path.name if path.suffix[1:].isdigit() else path.stem
+
+
 def first_repeated(names: Iterable[str], *, as_files: bool = False) -> str | None:
     """Return the first repeated name, if any; ``as_files`` ignores case and Unicode normalisation."""
     seen = set[str]()

@@ -26,10 +26,10 @@ _PARTS = (
     *(f"rotation_{axis}_deg" for axis in "xyz"),
     *(f"centre_{axis}" for axis in "xyz"),
 )
-"""Names in ``Camera.std`` of the columns of :class:`CameraErrors`."""
+"""Names in ``Camera.std`` of the columns of :class:`CameraDeviations`."""
 
 
-class CameraErrors(NamedTuple):
+class CameraDeviations(NamedTuple):
     """Errors of cameras by name after alignment, and in stated standard deviations, NaN where none is stated.
 
     ``focal_pct``, ``rotation_deg`` and ``centre`` (units of the truth) are sizes; ``z`` (V, 9) holds the
@@ -46,7 +46,7 @@ class CameraErrors(NamedTuple):
     std: F64
 
 
-def measure_cameras(model: Any, truth: Any) -> CameraErrors:
+def camera_deviations(model: Any, truth: Any) -> CameraDeviations:
     """Compare two models of the same images, camera by camera.
 
     Parameters
@@ -56,7 +56,7 @@ def measure_cameras(model: Any, truth: Any) -> CameraErrors:
 
     Returns
     -------
-    CameraErrors
+    CameraDeviations
         Errors in the inner gauge: without the similarity that moves the cameras least, which the stated
         standard deviations do not contain either (Triggs et al. 2000, 9.5).
 
@@ -69,13 +69,13 @@ def measure_cameras(model: Any, truth: Any) -> CameraErrors:
     --------
     >>> import numpy as np
     >>> from thesisrecon import Camera
-    >>> from thesisrecon.testing import measure_cameras
+    >>> from thesisrecon.testing import camera_deviations
     >>> K, size = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), (640, 480)
     >>> places = {"1.jpg": [0.0, 0, 0], "2.jpg": [1, 0, 0], "3.jpg": [0, 1, 0]}
     >>> truth = {name: Camera(K, np.eye(3), -np.array(c), size) for name, c in places.items()}
     >>> K_found = K * [[1.01], [1.01], [1]]
     >>> found = {n: Camera(K_found, c.R, 2 * c.t, size, std={"focal_px": 4.0}) for n, c in truth.items()}
-    >>> errors = measure_cameras(found, truth)
+    >>> errors = camera_deviations(found, truth)
     >>> errors.focal_pct.round(6).tolist(), errors.z[:, 0].round(6).tolist()
     ([1.0, 1.0, 1.0], [1.25, 1.25, 1.25])
     """
@@ -107,7 +107,7 @@ def measure_cameras(model: Any, truth: Any) -> CameraErrors:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(std > 0.0, values / std, np.nan)
     sizes = np.abs(values[:, 0]), found.rotation_error_deg, found.centre_error
-    return CameraErrors(found.names, found.only_b, *sizes, z, std)
+    return CameraDeviations(found.names, found.only_b, *sizes, z, std)
 
 
 def pose_errors(R: F64, C: F64, R_true: F64, C_true: F64, X: F64) -> F64:
@@ -140,13 +140,13 @@ def pose_errors(R: F64, C: F64, R_true: F64, C_true: F64, X: F64) -> F64:
     from scipy.spatial.transform import Rotation
 
     from thesisrecon.geometry.homogeneous import scene_frame
+    from thesisrecon.geometry.strata import nearest_rotation
     from thesisrecon.optimize.bundle.covariance import gauge_directions
 
     origin, scale = scene_frame(X if len(X) else C)
     t = -np.einsum("vab,vb->va", R, scale * (C - origin))
     centres = -np.einsum("vba,vb->va", R, t)
-    U, _, Vt = np.linalg.svd(np.einsum("vab,vac->bc", R_true, R))
-    Q = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    Q = nearest_rotation(np.einsum("vab,vac->bc", R_true, R))
     moved = C_true @ Q
     moved = moved - moved.mean(axis=0)
     middle = centres.mean(axis=0)
@@ -168,12 +168,12 @@ def assert_cameras(
     max_rotation_error_deg: float | None = None,
     max_centre_error: float | None = None,
     sees: Mapping[str, float] | None = None,
-) -> CameraErrors:
+) -> CameraDeviations:
     """Fail unless all cameras of the truth are there, within stated deviations and within given limits.
 
     Parameters
     ----------
-    model, truth : as in :func:`measure_cameras`
+    model, truth : as in :func:`camera_deviations`
     max_sigmas : float, optional
         Largest error of a focal length, principal point, rotation or centre in its stated standard deviation.
         None: stated deviations are not used. Without stated ones a limit of the next three is needed.
@@ -185,12 +185,12 @@ def assert_cameras(
 
     Returns
     -------
-    CameraErrors
+    CameraDeviations
 
     Raises
     ------
     AssertionError
-        What is off, by how much, against what; or that the gate cannot see what it is for.
+        Which error exceeds which limit; or that the gate would not see an error of ``sees``.
 
     Examples
     --------
@@ -209,7 +209,7 @@ def assert_cameras(
     """
     import numpy as np
 
-    errors, wrong, visible = measure_cameras(model, truth), list[str](), dict[str, float]()
+    errors, wrong, visible = camera_deviations(model, truth), list[str](), dict[str, float]()
     limits = {
         "focal_pct": max_focal_error_pct,
         "rotation_deg": max_rotation_error_deg,
@@ -404,7 +404,7 @@ def assert_cloud(
 def _judge(
     what: str, wrong: list[str], visible: Mapping[str, float], sees: Mapping[str, float] | None = None
 ) -> None:
-    """Note what an assertion sees, and raise it if something is wrong or it is blind to what it is for."""
+    """Note what an assertion sees; raise it if something is wrong or an error of ``sees`` would pass."""
     text = ", ".join(f"{value:.2g} of {name}" for name, value in visible.items())
     _SEEN.append(f"{what}: sees {text}")
     for name, wanted in (sees or {}).items():

@@ -37,7 +37,7 @@ def pytest_configure(config: Any) -> None:
 
 
 def pytest_collection_modifyitems(items: list[Any]) -> None:
-    """Refuse gates that cannot see what they are for."""
+    """Refuse gates that would let an error of `sees` pass."""
     blind = []
     for item in items:
         for mark in item.iter_markers("accuracy_gate"):
@@ -51,7 +51,7 @@ def pytest_collection_modifyitems(items: list[Any]) -> None:
                 seen = f"sees {limit + POWER * noise:.3g}, which is more than {wanted:g}"
                 blind.append(f"{item.nodeid} {seen}: lower its limit ({limit:g}) or its noise ({noise:g})")
     if blind:
-        raise pytest.UsageError("\n".join(["accuracy gates that cannot see what they are for:", *blind]))
+        raise pytest.UsageError("\n".join(["accuracy gates that let an error of their `sees` pass:", *blind]))
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

@@ -121,7 +121,7 @@ def analyse(rows: Rows) -> Analysis:
     compared, by_step = (
         tuple(c for m in plan.measures for c in _comparisons(table, m, pairs)) for pairs in (others, steps)
     )
-    return Analysis(plan, rows, cells, compared, by_step, tuple(_warnings(rows)))
+    return Analysis(plan, rows, cells, compared, by_step, tuple(_warnings(rows, table)))
 
 
 def compare_runs(before: Rows, after: Rows) -> Analysis:
@@ -168,10 +168,9 @@ class _Table:
             for scene in dict.fromkeys(map(scene_of, self.scenes))
         ]
         self.by_place = {(r.variant, r.condition, r.scene, r.seed): r for r in rows}
-        self.unavailable = {
-            (p.variant, p.condition, p.scene): frozenset(p.setting.task.unavailable(p.scene))
-            for p in rows.plan.rows
-        }
+        # Seeds have the same measures: a task may read files to answer.
+        places = {(p.variant, p.condition, p.scene): p for p in rows.plan.rows}
+        self.unavailable = {at: p.setting.task.unavailable(p.scene) for at, p in places.items()}
         self.known = {
             m.name: np.array(
                 [r.metrics[m.name] for r in rows if math.isfinite(r.metrics.get(m.name, np.nan))]
@@ -369,9 +368,8 @@ def _mean_ranks(losses: F64) -> list[float]:
     return [float(rank) for rank in rankdata(losses, axis=0).mean(axis=1)]
 
 
-def _warnings(rows: Rows) -> list[str]:
+def _warnings(rows: Rows, table: _Table) -> list[str]:
     plan, found = rows.plan, []
-    table = _Table(rows)
     if table.sample == "scenes" and len(table.groups) < MIN_SCENES:
         few = f"fewer than {MIN_SCENES} scenes are no sample"
         found.append(f"no intervals: {few}, and seeds and subsets of a scene add none")

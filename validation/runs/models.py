@@ -25,7 +25,7 @@ from validation.metrics.poses import (
     relative_pose_errors,
 )
 from validation.runs.page import plot_at, write_page
-from validation.runs.results import Row
+from validation.runs.results import row_of
 from validation.runs.tables import (
     Metric,
     Plot,
@@ -78,7 +78,7 @@ def report_models(models: Mapping[str, Path], reference: tuple[str, Path], out: 
                 "id": part,
                 "title": part.capitalize(),
                 "definition": PARTS[part],
-                "rows": [_row(m, first) for m in some],
+                "rows": [row_of("models", m, None) for m in some],
                 "references": [c.name for c in compared[1:]],
                 "plots": [
                     plot_at(f"{part}-{n}", p) for n, p in enumerate(plots if part == "cameras" else ())
@@ -285,26 +285,6 @@ def _verdict(compared: Sequence[Compared], reference: str) -> dict[str, Any]:
         "reasons": (),
         "sentence": f"AUC@5° of relative poses of {total} of {reference}: {areas}.",
     }
-
-
-def _row(metric: Metric, ours: str) -> Row:
-    others = {name: v for name, v in metric.values.items() if name != ours}
-    direction = "at most" if metric.at_most else "at least"
-    key = f"models/{metric.name}"
-    return Row(
-        key,
-        "",
-        metric.name,
-        metric.values.get(ours),
-        metric.unit,
-        direction,
-        None,
-        others,
-        metric.definition,
-        "reported",
-        "",
-        metric.ranked,
-    )
 
 
 def _text(metrics: Mapping[str, Sequence[Metric]], names: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from PIL import Image as PillowImage
 
 import thesisrecon
 from thesisrecon.arrays import B8, F64, U8
-from thesisrecon.io._files import shortened, write_atomically
+from thesisrecon.io._files import name_without_suffix, shortened, write_atomically
 from thesisrecon.io._models import read_model
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -126,7 +126,7 @@ def with_truth(scene: Scene, model: Path) -> Scene:
     """
     views = list(read_model(model).views)
     paths = scene.image_paths
-    for name_of in (str, _without_suffix):
+    for name_of in (str, name_without_suffix):
         place = {name_of(view.name): view for view in views}
         cameras = [place.get(name_of(path.name)) for path in paths]
         if any(cameras):
@@ -150,12 +150,6 @@ def with_truth(scene: Scene, model: Path) -> Scene:
     if not np.isfinite(K).any():
         raise ValueError(f"{model} gives no image a K; put one into K.txt (3 x 3) beside it")
     return replace(scene, K=K, R=R, C=C)
-
-
-def _without_suffix(name: str) -> str:
-    """The name without folder and suffix; a suffix of digits belongs to a time."""
-    path = Path(name)
-    return path.name if path.suffix[1:].isdigit() else path.stem
 
 
 def _calibration_beside(model: Path) -> F64 | None:

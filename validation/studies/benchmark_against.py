@@ -1,20 +1,18 @@
 """Our own times now and at an earlier commit, measured in turn on one machine, with intervals.
 
-Machines differ and are noisy: only times of one machine and one hour can be compared. Both versions run the
-benchmarks of this version, one after the other in alternate order, ``rounds`` times; a round gives the median
-time of each piece of work. The median ratio of all work, which a busy machine changes too, is a row of its
-own and taken off from the others. Intervals are Student's over the rounds, p is adjusted for all rows (Holm).
-``scripts/benchmark`` also stores each run in ``.benchmarks``, which ``pytest-benchmark compare`` reads;
-``--trend`` draws what is there.
+Machines differ and are noisy: only times of one machine and one hour can be compared. Each version runs its
+own benchmarks, one after the other in alternate order, ``rounds`` times; a round gives the median time of
+each piece of work, and work of one name is compared. The median ratio of all work, which a busy machine
+changes too, is a row of its own and taken off from the others. Intervals are Student's over the rounds, p is
+adjusted for all rows (Holm). ``scripts/benchmark`` also stores each run in ``.benchmarks``, which
+``pytest-benchmark compare`` reads; ``--trend`` draws what is there.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,9 +25,8 @@ from validation.ablation.statistics import holm, paired_interval
 from validation.runs.page import plot_at, write_page
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import number, plot, scatter, stamp, text_table
-from validation.studies.benchmark_table import OPTIONS, read_benchmarks
+from validation.studies.benchmark_table import ROOT, read_benchmarks, run_benchmarks
 
-ROOT = Path(__file__).parents[2]
 STORE = ROOT / ".benchmarks"
 SLOWER = 0.05
 """Largest adjusted p of a change that is named."""
@@ -98,34 +95,8 @@ def ratio_table(then: Sequence[Times], now: Sequence[Times]) -> str:
 
 
 def _measure(root: Path, file: Path, choose: str) -> Times:
-    """Run the benchmarks of ours with the package of a tree; their code is that of this tree."""
-    words = f"ours and ({choose})" if choose else "ours"
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        str(ROOT / "benchmarks"),
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-k",
-        words,
-    ]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(root), str(ROOT)]),
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    done = subprocess.run(
-        [*command, *OPTIONS, f"--benchmark-json={file}"],
-        cwd=root,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise UsageError(f"the benchmarks of {root} failed: {(done.stdout + done.stderr).strip()[-800:]}")
+    """Run the benchmarks of ours of a tree."""
+    run_benchmarks(file, root, f"ours and ({choose})" if choose else "ours")
     return {group: times["ours"] for group, times in read_benchmarks(file).items() if "ours" in times}
 
 

@@ -42,14 +42,17 @@ OPTIONS = [
 """Equal for all methods; the median does not depend on the number of rounds, as the least time does."""
 
 
-def run_benchmarks(file: Path) -> None:
-    """Run all benchmarks on one thread, with processor times, into a file."""
+ROOT = Path(__file__).parents[2]
+
+
+def run_benchmarks(file: Path, root: Path = ROOT, words: str = "") -> None:
+    """Run the benchmarks of a tree whose names match, on one thread, with processor times, into a file."""
     command = [sys.executable, "-m", "pytest", "benchmarks", "-q", *OPTIONS, f"--benchmark-json={file}"]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    command += ["-k", words] if words else []
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise UsageError(f"the benchmarks failed: {(done.stdout + done.stderr).strip()[-500:]}")
+        raise UsageError(f"the benchmarks of {root} failed: {(done.stdout + done.stderr).strip()[-800:]}")
 
 
 def read_benchmarks(file: Path) -> dict[str, dict[str, float]]:
