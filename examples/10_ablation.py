@@ -19,7 +19,6 @@ from tempfile import TemporaryDirectory
 import matplotlib.pyplot as plt
 
 import thesisrecon
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares
 from validation.ablation import Study, ablate, analyse
 from validation.ablation.analysis import as_reported
 from validation.ablation.tasks.synthetic import FundamentalOfCube
@@ -35,7 +34,6 @@ default = thesisrecon.PipelineConfig().epipolar
 variants = [
     replace(default, threshold_px=4.0),
     "thesis-ransac",
-    LeastMedianOfSquares(),
     EveryMatch(),
 ]
 task = FundamentalOfCube(pairs=4, noise_px=0.5, outliers=0.3)

@@ -10,7 +10,6 @@ from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.camera import decompose_camera
 from thesisrecon.epipolar.ransac import (
-    LeastMedianOfSquares,
     ThesisRansac,
     estimate_eight_point,
     estimate_seven_point,
@@ -75,7 +74,6 @@ def default_with_all_it_says(xy1, xy2):
 FUNCTIONS = {
     "default": default_with_all_it_says,
     "thesis": lambda a, b: ThesisRansac(samples=30).estimate(a, b, rng()),
-    "least median": lambda a, b: LeastMedianOfSquares(samples=30).estimate(a, b, rng()),
     "eight-point": estimate_eight_point,
     "seven-point": lambda a, b: estimate_seven_point(a[:7], b[:7]),
     "gradient": lambda a, b: refine_fundamental(PAIR.F, a, b),
@@ -119,7 +117,7 @@ def test_invalid_matches_are_value_errors(name):
         assert not isinstance(failure.value, np.linalg.LinAlgError), kind
 
 
-@pytest.mark.parametrize("name", ["default", "thesis", "least median", "eight-point", "gradient"])
+@pytest.mark.parametrize("name", ["default", "thesis", "eight-point", "gradient"])
 def test_storage_of_the_matches_does_not_matter(name):
     whole1, whole2 = GOOD1.round(), GOOD2.round()
     expected = FUNCTIONS[name](whole1, whole2)

@@ -26,7 +26,6 @@ from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEs
 from thesisrecon.records import INTRINSICS
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.cheirality import ModulusConstraint
-from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.stratified import Stratified
 
 
@@ -119,11 +118,10 @@ def test_a_nested_field_of_several_kinds_takes_a_word_or_a_table():
     modulus = apply_settings(kind, "selfcalibration.plane=modulus-constraint")
     assert modulus.selfcalibration.plane == ModulusConstraint()
     config = apply_settings(
-        kind, "selfcalibration.plane.kind=parallel-lines", "selfcalibration.plane.orthogonal_directions=true",
+        kind, "selfcalibration.plane.kind=modulus-constraint", "selfcalibration.refine=false",
         "selfcalibration.calibration=fixed-plane-quadric",
     )  # fmt: skip
-    plane = ParallelLines(orthogonal_directions=True)
-    assert config.selfcalibration == Stratified(plane, FixedPlaneQuadric())
+    assert config.selfcalibration == Stratified(ModulusConstraint(), FixedPlaneQuadric(), refine=False)
     assert config_from_toml(toml_from_config(config)) == config
     refuses(UsageError, "modulus-constraint", apply_settings, kind, "selfcalibration.plane=modulus")
     nothing = kind, "selfcalibration.plane.kind=cheirality-search", "selfcalibration.plane.starts=5"

@@ -18,7 +18,6 @@ from thesisrecon.epipolar.degeneracy import Method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import (
     INLIER_TESTS,
-    LeastMedianOfSquares,
     ThesisRansac,
     discard_outliers,
     estimate_eight_point,
@@ -43,7 +42,6 @@ ROBUST = [
     LocallyOptimisedRansac(),
     ThesisRansac(samples=300),
     ThesisRansac(samples=300, epipolar_distance=True),
-    LeastMedianOfSquares(samples=300),
 ]
 
 
@@ -158,7 +156,6 @@ def test_parts_and_settings_that_cannot_be_are_refused():
         (LocallyOptimisedRansac, {"starts": 0}), (LocallyOptimisedRansac, {"starts": 11}),
         (LocallyOptimisedRansac, {"inlier_sigmas": 0.0}), (ThesisRansac, {"threshold_px": np.nan}),
         (ThesisRansac, {"samples": 0}), (ThesisRansac, {"inlier_test": "both"}),
-        (LeastMedianOfSquares, {"samples": 0}),
     ):  # fmt: skip
         refuses(ValueError, next(iter(changed)), kind, **changed)
     plane = make_pair(30, np.random.default_rng(0), planar=True)

@@ -1,4 +1,4 @@
-"""Projective reconstruction: initial pair, growth, acceptance tests, and factorisation."""
+"""Projective reconstruction: initial pair, growth and acceptance tests."""
 
 from dataclasses import replace
 
@@ -28,14 +28,6 @@ from thesisrecon.projective._model import (
     select_tracks_with_parallax,
     update_inliers,
 )
-from thesisrecon.projective.factorization import (
-    Factorization,
-    _factorize_robustly,
-    _grow_core,
-    _is_planar,
-    depths_from_fundamentals,
-    factorize,
-)
 from thesisrecon.projective.incremental import (
     IncrementalProjective,
     SequentialProjective,
@@ -44,7 +36,7 @@ from thesisrecon.projective.incremental import (
 )
 from thesisrecon.records import DegeneracyReport, Tracks
 
-VARIANTS = [IncrementalProjective(), SequentialProjective(), Factorization()]
+VARIANTS = [IncrementalProjective(), SequentialProjective()]
 
 
 def residuals(found):
@@ -325,107 +317,3 @@ def test_points_all_over_a_view_count_more_than_a_crowd_in_a_corner():
     corner = np.flatnonzero(t.view_index == 0)[np.argsort(t.xy[t.view_index == 0].sum(axis=1))[:100]]
     spread = [coverage_of_views(cell, np.isin(np.arange(len(t.xy)), k), t.n_views)[0] for k in (few, corner)]
     assert spread[0] > 1.3 * spread[1]
-
-
-STAR = [(0, k) for k in range(1, 6)]
-CHAIN = [(k, k + 1) for k in range(5)]
-
-
-def complete_tracks(seed, sigma_px=0.0, points=80):
-    """A scene of six views and its images (6, N, 2) of every point."""
-    scene = make_scene(views=6, points=points, seed=seed)
-    xy = np.stack([project(P, scene.X) for P in scene.P])
-    return scene, xy + sigma_px * np.random.default_rng(seed).normal(size=xy.shape)
-
-
-def rms_px(factors):
-    return np.sqrt(np.mean(factors[2] ** 2))
-
-
-def fundamentals(scene):
-    return {(p.i, p.j): -2.0 * p.F for p in true_pairs(scene)}
-
-
-@pytest.mark.parametrize("tree", [STAR, CHAIN])
-@pytest.mark.parametrize("seed", range(3))
-def test_depths_from_fundamental_matrices_are_those_of_the_cameras_up_to_scales(tree, seed):
-    scene, xy = complete_tracks(seed)
-    depths = depths_from_fundamentals(xy, fundamentals(scene), tree)
-    true = np.einsum("vb,nb->vn", scene.P[:, 2], homogenize(scene.X))
-    # A rank of one: scales of views times scales of points.
-    s = np.linalg.svd(depths / true, compute_uv=False)
-    assert s[1] < 1e-6 * s[0]
-    assert rms_px(factorize(xy, depths)) < 1e-3
-
-
-def test_iterations_bring_the_factors_to_the_noise_and_any_depths_will_do_to_begin():
-    for seed in range(3):
-        scene, xy = complete_tracks(seed, sigma_px=1.0)
-        depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
-        once, often, affine = (
-            rms_px(factorize(xy, d, iterations=n)) for d, n in ((depths, 0), (depths, 50), (None, 100))
-        )
-        # 6 x 80 x 2 coordinates; the model has 6 x 11 + 80 x 3 - 15 parameters.
-        expected = np.sqrt(2.0 * (1.0 - (66 + 240 - 15) / 960))
-        assert often < 1.1 * expected
-        assert often <= once
-        assert affine == pytest.approx(often, rel=0.01)
-
-
-def test_the_core_grows_by_what_is_shared_without_points_that_disagree():
-    scene, xy = complete_tracks(1, sigma_px=0.5)
-    xy[3, :6] += 25.0
-    depths = depths_from_fundamentals(xy, fundamentals(scene), STAR)
-    factors = _factorize_robustly(xy, depths, 7.0, 50)
-    assert 0.95 * 74 < len(factors[1]) <= 74
-    assert rms_px(factors) < 0.8
-    seen = np.zeros((4, 100), dtype=bool)
-    seen[0], seen[1, :80], seen[2, :60], seen[3, :20] = True, True, True, True
-    pairs = [replace(p, homography_inlier_ratio=0.2) for p in true_pairs(make_scene(views=4, points=30))]
-    assert _grow_core(seen, pairs, pairs[0], min_tracks=50)[1][1] == 2
-    assert len(_grow_core(seen, pairs, pairs[0], min_tracks=50)) == 2
-    assert len(_grow_core(seen, pairs, pairs[0], min_tracks=10)) == 3
-    # Views that no accepted pair ties to the core stay out.
-    untied = [replace(p, accepted=2 not in (p.i, p.j)) for p in pairs]
-    assert [j for _, j in _grow_core(seen, untied, pairs[0], min_tracks=10)] == [1, 3]
-
-
-@pytest.mark.parametrize("iterations", [0, 50])
-def test_a_scene_is_reconstructed_from_its_core_despite_bad_views(iterations):
-    scene = make_scene(seed=4, sigma_px=0.5, points=600)
-    t = scene.tracks
-    wrong = np.random.default_rng(5).random(len(t.xy)) < 0.03
-    tracks = replace(t, xy=t.xy + np.where(wrong[:, None], 80.0, 0.0))
-    variant = with_constants(Factorization, core_points=60)(iterations)
-    found = variant.reconstruct(tracks, true_pairs(scene), scene.sizes, rng=np.random.default_rng(0))
-    assert found.registered.all()
-    assert found.sigma_px == pytest.approx(0.5, rel=0.25)
-    assert found.inlier[wrong].mean() < 0.05
-    assert np.sqrt(np.mean(residuals(found) ** 2)) < 0.5 * np.sqrt(2.0) * 1.1
-
-
-def test_tracks_of_a_plane_that_all_of_a_core_share_do_not_begin_alone():
-    scene = make_scene(views=4, points=300, seed=6, sigma_px=0.3)
-    flat = np.arange(300) < 120
-    scene.X[flat, 2] = 0.3 * scene.X[flat, 0] - 0.4
-    # Views 0 and 1 see everything, 2 and 3 the plane and half of the rest each.
-    sees = np.ones((4, 300), dtype=bool)
-    sees[2, 120::2] = sees[3, 121::2] = False
-    point, view = np.nonzero(sees.T)
-    images = np.stack([project(P, scene.X) for P in scene.P])
-    xy = images[view, point]
-    tracks = Tracks(view, point, xy + np.random.default_rng(0).normal(0, 0.3, xy.shape), 4, 300)
-    assert _is_planar(images[:, flat], STAR[:3], 1.0)
-    assert not _is_planar(images, STAR[:3], 1.0)
-    pairs = true_pairs(replace(scene, tracks=tracks))
-    found = Factorization().reconstruct(tracks, pairs, scene.sizes, rng=np.random.default_rng(0))
-    assert found.registered.all()
-    assert found.inlier.mean() > 0.98
-
-
-def test_too_few_common_tracks_and_a_negative_number_of_iterations_are_refused():
-    scene = make_scene(points=12)
-    given = scene.tracks, true_pairs(scene), scene.sizes
-    method = Factorization().reconstruct
-    refuses(StageFailure, "too few tracks", method, *given, rng=np.random.default_rng(0))
-    refuses(ValueError, "iterations", Factorization, iterations=-1)

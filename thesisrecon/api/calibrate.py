@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -15,25 +15,24 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, require_word, unknown_word
 from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
-from thesisrecon.records import Image, Reconstruction, SelfCalibration
+from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
-from thesisrecon.selfcalibration.parallel_lines import ParallelLines, plane_from_vanishing_points
-from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine, with_images
+from thesisrecon.selfcalibration.parallel_lines import plane_from_vanishing_points
+from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
 
 METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
     **KINDS["selfcalibration"],
     "cheirality-search": lambda: Stratified(CheiralitySearch()),
     "modulus-constraint": lambda: Stratified(ModulusConstraint()),
-    "parallel-lines": lambda: Stratified(ParallelLines()),
 }
-"""Methods by name; the last three are "stratified" with different methods for the plane at infinity."""
+"""Methods by name; the last two are "stratified" with different methods for the plane at infinity."""
 
 
 def self_calibrate(
     reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
     xy: F64 | None = None, method: str | SelfCalibrator | None = None, config: Config | None = None,
-    images: Sequence[Image] = (), seed: int = 0,
+    seed: int = 0,
 ) -> SelfCalibration:  # fmt: skip
     """Estimate the metric frame and the intrinsics of a projective reconstruction (chapter 7).
 
@@ -48,12 +47,12 @@ def self_calibrate(
         them the world may be mirrored, and noise is not considered.
     method : str or SelfCalibrator, optional
         "hypotheses-and-refinement", "nonlinear-quadric", "linear-quadric", "kruppa-equations", "stratified";
-        "cheirality-search", "modulus-constraint" or "parallel-lines", which are "stratified" with this method
-        for the plane at infinity; or a method object. None: ``config.selfcalibration``.
+        "cheirality-search" or "modulus-constraint", which are "stratified" with this method for the plane at
+        infinity; or a method object. None: ``config.selfcalibration``.
     config : PipelineConfig, str or path, optional
         ``config.intrinsics`` is the prior knowledge; by default images of the same size share one camera.
-    images, seed : sequence of Image, int
-        The images, one per view, for methods that detect parallel lines; and the random seed.
+    seed : int
+        Random seed.
 
     Returns
     -------
@@ -93,7 +92,7 @@ def self_calibrate(
     800
     """
     projective = _projective("self_calibrate", reconstruction, sizes, X, xy)
-    calibrator, settings = _method(projective, method, config, images)
+    calibrator, settings = _method(projective, method, config)
     prior = prior_for(projective, settings.intrinsics)
     return calibrator.calibrate(projective, prior=prior, rng=stream(seed, "selfcalibration"))
 
@@ -138,14 +137,14 @@ def absolute_dual_quadric(
 
 def plane_at_infinity(
     reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
-    xy: F64 | None = None, config: Config | None = None, images: Sequence[Image] = (), seed: int = 0,
+    xy: F64 | None = None, config: Config | None = None, seed: int = 0,
     vanishing_points: F64 | None = None, method: str | SelfCalibrator | None = None,
 ) -> F64:  # fmt: skip
     """Locate the plane at infinity of a projective frame (chapter 7, stratified; HZ 10.4.1 and 19.5).
 
     Parameters
     ----------
-    reconstruction, sizes, X, xy, config, images, seed
+    reconstruction, sizes, X, xy, config, seed
         As for :func:`self_calibrate`; two views are enough with vanishing points.
     vanishing_points : ndarray (V, D, 2) or (V, D, 3), optional
         Pixels of the vanishing points of D >= 3 directions, each seen in at least two views, NaN where not;
@@ -177,7 +176,7 @@ def plane_at_infinity(
     """
     projective = _projective("plane_at_infinity", reconstruction, sizes, X, xy)
     if vanishing_points is None:
-        calibrator, settings = _method(projective, method, config, images)
+        calibrator, settings = _method(projective, method, config)
         prior, rng = prior_for(projective, settings.intrinsics), stream(seed, "selfcalibration")
         if isinstance(calibrator, Stratified):
             return calibrator.locate(projective, prior=prior, rng=rng)
@@ -190,9 +189,8 @@ def plane_at_infinity(
 
 
 def upgrade_affine(
-    reconstruction: Reconstruction, plane: F64 | None = None, *, config: Config | None = None,
-    images: Sequence[Image] = (), seed: int = 0,
-) -> Reconstruction:  # fmt: skip
+    reconstruction: Reconstruction, plane: F64 | None = None, *, config: Config | None = None, seed: int = 0
+) -> Reconstruction:
     """Upgrade a projective reconstruction to an affine one: P G^-1, G X (3.4.3, chapter 7; HZ 10.4.1).
 
     Parallel lines and ratios of lengths along them are then those of the scene.
@@ -203,7 +201,7 @@ def upgrade_affine(
         Projective reconstruction.
     plane : ndarray (4,), optional
         Plane at infinity in the projective frame; None: located by :func:`plane_at_infinity`.
-    config, images, seed
+    config, seed
         As for :func:`self_calibrate`.
 
     Returns
@@ -232,7 +230,7 @@ def upgrade_affine(
     """
     projective = _projective("upgrade_affine", reconstruction, None, None, None)
     if plane is None:
-        plane = plane_at_infinity(projective, config=config, images=images, seed=seed)
+        plane = plane_at_infinity(projective, config=config, seed=seed)
     return upgrade_to_affine(projective, numbers("upgrade_affine", plane=plane)[0])
 
 
@@ -262,22 +260,17 @@ def _projective(
 
 
 def _method(
-    projective: Reconstruction, method: str | SelfCalibrator | None, config: Config | None,
-    images: Sequence[Image],
-) -> tuple[SelfCalibrator, PipelineConfig]:  # fmt: skip
+    projective: Reconstruction, method: str | SelfCalibrator | None, config: Config | None
+) -> tuple[SelfCalibrator, PipelineConfig]:
     settings = as_config(config)
     if isinstance(method, str):
         if method not in METHODS:
             raise UsageError(unknown_word("method", method, METHODS))
         method = METHODS[method]()
     method = method or settings.selfcalibration
-    if (
-        isinstance(method, Stratified)
-        and not isinstance(method.plane, ParallelLines)
-        and not projective.inlier.any()
-    ):
+    if isinstance(method, Stratified) and not projective.inlier.any():
         raise StageFailure.of("plane-without-points")
-    return with_images(method, images), settings
+    return method, settings
 
 
 def kruppa(F: F64, sizes: I64) -> F64:

@@ -278,11 +278,11 @@ def estimate_fundamental(
     method : str
         For matches with outliers: "locally-optimised"
         (:class:`~thesisrecon.epipolar.locally_optimised.LocallyOptimisedRansac`), "ransac" (Algorithm 2 of
-        the thesis) or "least-median". For matches without outliers: "gold-standard" (least reprojection
-        error, HZ 11.4.1), "eight-point" (normalised) or "seven-point" (up to three solutions).
+        the thesis). For matches without outliers: "gold-standard" (least reprojection error, HZ 11.4.1),
+        "eight-point" (normalised) or "seven-point" (up to three solutions).
     threshold_px : float or None
-        Largest Sampson distance of an inlier during the search of the first two methods. None: no outliers;
-        "gold-standard" is used instead of these two.
+        Largest Sampson distance of an inlier during the search of these two. None: no outliers;
+        "gold-standard" is used instead.
     confidence, max_samples : float, int
         Of "locally-optimised": probability of a sample without outliers at which the search ends, and the
         largest number of samples.
@@ -333,14 +333,12 @@ def estimate_fundamental(
         fit = search.estimate(xy1, xy2, rng)
     else:
         # Imported on use: the default method does not need it.
-        from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, fit_all, fit_seven
+        from thesisrecon.epipolar.ransac import ThesisRansac, fit_all, fit_seven
 
         if method == "seven-point":
             fit = fit_seven(xy1, xy2)
         elif method == "ransac":
             fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
-        elif method == "least-median":
-            fit = LeastMedianOfSquares().estimate(xy1, xy2, rng)
         else:
             fit = fit_all(xy1, xy2, refined=method == "gold-standard")
     # Copies: the test is made later.

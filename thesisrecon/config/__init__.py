@@ -31,7 +31,6 @@ from thesisrecon.matching.pair_selection import AllPairs, ListedPairs, OverlapEs
 from thesisrecon.matching.strength import StrengthOfMatch
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.projective.factorization import Factorization
 from thesisrecon.projective.incremental import IncrementalProjective, SequentialProjective
 from thesisrecon.records import (
     DepthMap,
@@ -68,7 +67,7 @@ _METHODS: Mapping[str, Sequence[type[Any]]] = {
     "epipolar": (LocallyOptimisedRansac, ThesisRansac),
     "verification": (PairVerification,),
     "tracks": (AlignedTracks, PlainTracks),
-    "projective": (IncrementalProjective, SequentialProjective, Factorization),
+    "projective": (IncrementalProjective, SequentialProjective),
     "selfcalibration": (
         HypothesesAndRefinement, Stratified, LinearQuadric, NonlinearQuadric, KruppaEquations,
     ),

@@ -26,9 +26,7 @@ from thesisrecon.optimize.least_squares import student_factor
 from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import DegeneracyReport, FundamentalFit
 
-Method = Literal[
-    "locally-optimised", "ransac", "least-median", "gold-standard", "eight-point", "seven-point"
-]  # fmt: skip
+Method = Literal["locally-optimised", "ransac", "gold-standard", "eight-point", "seven-point"]
 
 MINIMUM = 8
 # Standard errors by which a competing model must be worse: right models of facades reach 7, wrong ones 2.

@@ -1,9 +1,10 @@
-"""Sections 5.2 and 5.4: F from linear equations, RANSAC (Algorithm 2), least median of squares (LMedS)."""
+"""Sections 5.2 and 5.4: F from linear equations, and RANSAC (Algorithm 2)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -201,104 +202,53 @@ class ThesisRansac:
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""
-        return _search_and_refine(
-            xy1, xy2, rng, samples=self.samples, rounds=self.rounds, threshold_px=self.threshold_px,
-            enough=self.stop_inlier_ratio, test=self.inlier_test,
-            criterion="epipolar-distance" if self.epipolar_distance else "sampson",
-        )  # fmt: skip
+        xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
+        frame, test = PairFrame.of(xy1, xy2), INLIER_TESTS[self.inlier_test]
+        points = frame.points(xy1, xy2)
 
+        def distances(model: F64) -> F64:
+            if self.inlier_test == "sampson":
+                return np.asarray(sampson_distances(np.ascontiguousarray(model), points))
+            return test.distances(model.reshape(3, 3), points[:, :2], points[:, 2:])
 
-@dataclass(frozen=True)
-class LeastMedianOfSquares:
-    """F with the least median squared Sampson distance among random samples of seven (Zhang, IJCV 1998).
-
-    It is refined as in :class:`ThesisRansac`, with sigma from the matches within 2.5 sigma. No threshold is
-    needed, but at most half of the matches may be wrong: then 900 samples contain one without outliers with
-    probability 99.9 %.
-
-    Parameters
-    ----------
-    samples : int
-        Number of samples.
-    rounds : int
-        Rounds of refinement.
-    """
-
-    samples: int = 900
-    rounds: int = 2
-
-    def __post_init__(self) -> None:
-        if self.samples < 1 or self.rounds < 0:
-            raise ValueError(f"a search needs samples >= 1, rounds >= 0; got {self.samples}, {self.rounds}")
-
-    def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
-        """See `thesisrecon.config.FundamentalEstimator.estimate`."""
-        return _search_and_refine(xy1, xy2, rng, samples=self.samples, rounds=self.rounds)
+        gate, enough = test.ratio * self.threshold_px * frame.scale, self.stop_inlier_ratio * len(points)
+        f, inliers, drawn = _search(points, distances, gate, self.samples, enough, rng)
+        if f is None or inliers.sum() < MINIMUM:
+            found = f"none of {self.samples} samples has {MINIMUM} inliers among {len(xy1)} matches"
+            raise StageFailure.of("no-epipolar-geometry", found)
+        discard = partial(discard_outliers, limit_px=self.threshold_px, test=self.inlier_test)
+        F = frame.matrix_in_pixels(f)
+        sigma, inliers = discard(F, xy1, xy2)
+        criterion: Criterion = "epipolar-distance" if self.epipolar_distance else "sampson"
+        for _ in range(self.rounds):
+            F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
+            sigma, inliers = discard(F, xy1, xy2)
+        of_frame, noise = frame.matrix_in_frame(F), sigma * frame.scale
+        covariance = fundamental_covariance(frame, of_frame, points[inliers], noise)
+        return FundamentalFit(F, inliers, sigma, covariance, drawn)
 
 
 def _search(
-    points: F64, distances: Callable[[F64], F64], rng: Generator, *,
-    gate: float = np.inf, samples: int, enough: float = np.inf,
-) -> tuple[F64 | None, B8, int]:  # fmt: skip
+    points: F64, distances: Callable[[F64], F64], gate: float, samples: int, enough: float, rng: Generator
+) -> tuple[F64 | None, B8, int]:
     """Algorithm 2: F (9,) of seven points with the most of them within the gate, these, and the samples.
 
-    Of equal numbers the lower standard deviation decides (Fischler and Bolles, 1981), without a gate the
-    lowest median (Rousseeuw, 1984). More than ``enough`` inliers end the search. The thesis' text has n! / s!
-    samples of size s where n! / (s! (n - s)!) is meant.
+    Of equal numbers the lower standard deviation decides (Fischler and Bolles, 1981). More than ``enough``
+    inliers end the search. The thesis' text has n! / s! samples of size s where n! / (s! (n - s)!) is meant.
     """
     best, inliers, best_rank, drawn = None, np.zeros(len(points), dtype=bool), (-np.inf, 0.0), 0
-    middle = len(points) // 2
     while drawn < samples and best_rank[0] <= enough:
         if drawn % _BATCH == 0:
             solved = seven_point(points[draw_samples(rng, _BATCH, len(points), 7)])
         for model in solved[drawn % _BATCH]:
             r = np.abs(distances(model))
-            if np.isinf(gate):
-                median = float(np.partition(r, middle)[middle])
-                rank, inside = (-median, 0.0), r <= median
-            else:
-                inside = r < gate
-                rms = float(np.sqrt(np.mean(r[inside] ** 2))) if inside.any() else 0.0
-                rank = (float(inside.sum()), -rms)
+            inside = r < gate
+            rms = float(np.sqrt(np.mean(r[inside] ** 2))) if inside.any() else 0.0
+            rank = (float(inside.sum()), -rms)
             if rank > best_rank:
                 best, inliers, best_rank = model, inside, rank
         drawn += 1
     return best, inliers, drawn
-
-
-def _search_and_refine(
-    xy1: F64, xy2: F64, rng: Generator, *, samples: int, rounds: int,
-    threshold_px: float = np.inf, enough: float = np.inf,
-    test: InlierTest = "sampson", criterion: Criterion = "sampson",
-) -> FundamentalFit:  # fmt: skip
-    """Search, then refine and discard outliers; without ``threshold_px`` the limit follows from sigma."""
-    xy1, xy2 = check_matches(xy1, xy2, needed=MINIMUM)
-    frame = PairFrame.of(xy1, xy2)
-    points, known = frame.points(xy1, xy2), np.isfinite(threshold_px)
-
-    def distances(model: F64) -> F64:
-        if test == "sampson":
-            return np.asarray(sampson_distances(np.ascontiguousarray(model), points))
-        return INLIER_TESTS[test].distances(model.reshape(3, 3), points[:, :2], points[:, 2:])
-
-    gate = INLIER_TESTS[test].ratio * threshold_px * frame.scale
-    f, inliers, drawn = _search(
-        points, distances, rng, gate=gate, samples=samples, enough=enough * len(points)
-    )
-    needed = MINIMUM if known else 1
-    if f is None or inliers.sum() < needed:
-        raise StageFailure.of(
-            "no-epipolar-geometry", f"none of {samples} samples has {needed} inliers among {len(xy1)} matches"
-        )
-    F = frame.matrix_in_pixels(f)
-    sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=threshold_px, test=test)
-    for _ in range(rounds):
-        F = refine_fundamental(F, xy1[inliers], xy2[inliers], criterion)
-        # The median of all matches is biased by the wrong ones: later rounds take those within 2.5 sigma.
-        limit_px = threshold_px if known else 2.5 * sigma
-        sigma, inliers = discard_outliers(F, xy1, xy2, limit_px=limit_px, test=test)
-    covariance = fundamental_covariance(frame, frame.matrix_in_frame(F), points[inliers], sigma * frame.scale)
-    return FundamentalFit(F, inliers, sigma, covariance, drawn)
 
 
 def fit_all(xy1: F64, xy2: F64, *, refined: bool) -> FundamentalFit:

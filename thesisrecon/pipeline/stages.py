@@ -44,7 +44,6 @@ from thesisrecon.records import (
     TwoView,
 )
 from thesisrecon.results import RunResult
-from thesisrecon.selfcalibration.stratified import with_images
 from thesisrecon.stereo.depth import MultiViewScene
 from thesisrecon.views.render import covered_pixels, match_exposure, psnr_db, render_mesh, ssim
 
@@ -80,11 +79,10 @@ def reconstruct_projective(
 def self_calibrate(job: Job, projective: Reconstruction, attempt: int) -> SelfCalibration:
     """Calibrate all views of a projective reconstruction, or a core of them (chapter 7)."""
     prior, upstream = job.prior, job.run.logs["projective"].keys[f"attempt-{attempt}"]
-    method, images = job.config.selfcalibration, job.images
-    pixels = images if all(image.has_pixels for image in images) else ()
+    method = job.config.selfcalibration
     return _cached(
         job, "selfcalibration", attempt, [upstream, prior.shared, prior.mean, prior.std, prior.kind],
-        lambda rng: calibrate_with_core(with_images(method, pixels), projective, prior=prior, rng=rng),
+        lambda rng: calibrate_with_core(method, projective, prior=prior, rng=rng),
     )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -277,20 +276,12 @@ def square_pixel_constraints(frame: ReferenceFrame) -> ConicConstraints:
 
 @dataclass(frozen=True)
 class ProjectiveScene:
-    """A projective reconstruction in a frame, its prior, and vanishing points of orthogonal pairs."""
+    """A projective reconstruction in a frame, and its prior."""
 
     reconstruction: Reconstruction
     frame: ReferenceFrame
     constraints: ConicConstraints
     unknown: SolverUnknowns
-    orthogonal: F64 | None = None
-
-
-class PlaneCandidates(NamedTuple):
-    """Candidate planes at infinity (B, 3), best first, with orthogonal directions as in the scene."""
-
-    planes: F64
-    orthogonal: F64 | None = None
 
 
 def projective_scene(reconstruction: Reconstruction, prior: IntrinsicsPrior) -> ProjectiveScene:

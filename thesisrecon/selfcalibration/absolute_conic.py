@@ -109,17 +109,13 @@ class ImageConic:
         return bool(s[4] > 1e-7 * max(s[0], 1e-3) and s[4] > 2.0 * s[5])
 
 
-def solve_conic(H: F64, constraints: _frame.ConicConstraints, *, orthogonal: F64 | None = None) -> ImageConic:
-    """Solve for the conic by SVD, reweighted by the estimated focals; x' w y = 0 for ``orthogonal`` pairs."""
+def solve_conic(H: F64, constraints: _frame.ConicConstraints) -> ImageConic:
+    """Solve for the conic by SVD, reweighted by the estimated focals."""
     focals = np.ones((1, len(H)))
     conic = ImageConic(np.eye(3), np.zeros(6))
     for _ in range(_REWEIGHTINGS):
         rows = _conic_equations(H[None], constraints, focals)[0]
         back = np.array([focals[0, constraints.first[constraints.reference]]] * 2 + [1.0])
-        if orthogonal is not None:
-            pairs = orthogonal / back
-            x, y = np.swapaxes(pairs / np.linalg.norm(pairs, axis=-1, keepdims=True), 0, 1)
-            rows = np.concatenate([rows, quadratic_rows(x, y)])
         _, s, Vt = np.linalg.svd(rows, full_matrices=False)
         w = Vt[5][_PLACE]
         w = (w if np.trace(w) > 0 else -w) / np.outer(back, back)
@@ -160,12 +156,12 @@ class LinearAbsoluteConic:
         frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
         one_camera = bool((constraints.first == constraints.first[0]).all())
-        if one_camera and np.isinf(constraints.std).all() and scene.orthogonal is None:
+        if one_camera and np.isinf(constraints.std).all():
             dual, s = dual_conic_of_constant_camera(H)
             definite = (np.linalg.eigvalsh(dual) > 0).all()
             conic = ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
         else:
-            conic = solve_conic(H, constraints, orthogonal=scene.orthogonal)
+            conic = solve_conic(H, constraints)
         if not conic.determined:
             raise _undetermined_failure(frame, H, conic)
         if not conic.definite:

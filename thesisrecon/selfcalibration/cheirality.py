@@ -185,12 +185,12 @@ class CheiralitySearch:
     max_candidates = 10  # maximum number of local minima
     refine_iterations = 15  # descent steps from each of them
 
-    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> _frame.PlaneCandidates:
-        """Candidate planes at infinity, best first; ``StageFailure`` if there is none."""
+    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> F64:
+        """Candidate planes at infinity (B, 3), best first; ``StageFailure`` if there is none."""
         planes, _ = self.search(scene.frame, scene.reconstruction, scene.constraints, rng)
         if not len(planes):
             raise StageFailure.of("no-cheiral-plane")
-        return _frame.PlaneCandidates(planes)
+        return planes
 
     def search(
         self, frame: _frame.ReferenceFrame, reconstruction: Reconstruction,
@@ -280,7 +280,7 @@ class ModulusConstraint:
     max_candidates = 21  # maximum number of solutions: three views have up to 21, four or more have one
     max_wrong_side_ratio = 0.02  # largest accepted share of points and cameras on the wrong side of a plane
 
-    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> _frame.PlaneCandidates:
+    def locate(self, scene: _frame.ProjectiveScene, rng: np.random.Generator) -> F64:
         """See `thesisrecon.selfcalibration.cheirality.CheiralitySearch.locate`; ``rng`` draws the starts."""
         frame = scene.frame
         pairs = _pairs_of_constant_cameras(scene.constraints.first)
@@ -298,7 +298,7 @@ class ModulusConstraint:
         kept = distinct_planes(planes, cost)[: self.max_candidates]
         if not len(planes):
             raise StageFailure.of("no-modulus-solution", len(starts), len(pairs))
-        return _frame.PlaneCandidates(planes[kept])
+        return planes[kept]
 
 
 def _pairs_of_constant_cameras(first: I64) -> I64:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar, cast
 
 import numpy as np
 
@@ -12,16 +10,13 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
-from thesisrecon.records import Image, IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration._frame import PlaneCandidates, ProjectiveScene, projective_scene
+from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
+from thesisrecon.selfcalibration._frame import ProjectiveScene, projective_scene
 from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
 from thesisrecon.selfcalibration._upgrade import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
-from thesisrecon.selfcalibration.parallel_lines import ParallelLines
 from thesisrecon.selfcalibration.quadric import minimize_quadric
-
-M = TypeVar("M")
 
 _MAX_REFINED = 3  # number of closed-form candidates to refine
 _NEAR_INFINITY = 1e-9
@@ -33,7 +28,7 @@ class Stratified:
 
     Parameters
     ----------
-    plane : CheiralitySearch, ModulusConstraint or ParallelLines
+    plane : CheiralitySearch or ModulusConstraint
         Method for the plane at infinity.
     calibration : LinearAbsoluteConic or FixedPlaneQuadric
         Method for K.
@@ -41,19 +36,13 @@ class Stratified:
         Refine plane and intrinsics together by the nonlinear quadric.
     """
 
-    plane: CheiralitySearch | ModulusConstraint | ParallelLines = field(default_factory=CheiralitySearch)
+    plane: CheiralitySearch | ModulusConstraint = field(default_factory=CheiralitySearch)
     calibration: LinearAbsoluteConic | FixedPlaneQuadric = field(default_factory=LinearAbsoluteConic)
     refine: bool = True
 
     max_candidates = 1  # maximum number of candidates to return
     min_in_front_ratio = 0.5  # required share of observations with positive depth
     criterion = RotationCriterion()  # criterion for the standard deviations of the focal lengths
-
-    def with_images(self, images: Iterable[Image]) -> Stratified:
-        """The same method with one image per view, if the plane is estimated from them."""
-        if not isinstance(self.plane, ParallelLines):
-            return self
-        return replace(self, plane=replace(self.plane, images=tuple(images)))
 
     @as_stage_failure
     def calibrate(
@@ -72,22 +61,20 @@ class Stratified:
     ) -> F64:
         """Estimate the plane at infinity alone: (4,), unit norm, in the projective frame."""
         scene = projective_scene(reconstruction, prior)
-        p = self.plane.locate(scene, rng).planes[0]
-        plane = np.append(p, 1.0) @ scene.frame.reference_from_projective
+        plane = np.append(self.plane.locate(scene, rng)[0], 1.0) @ scene.frame.reference_from_projective
         return np.asarray(plane / np.linalg.norm(plane))
 
-    def _candidates(self, scene: ProjectiveScene, found: PlaneCandidates) -> list[Candidate]:
-        frame, scene = scene.frame, replace(scene, orthogonal=found.orthogonal)
+    def _candidates(self, scene: ProjectiveScene, planes: F64) -> list[Candidate]:
         method = f"{type(self.plane).__name__}, {type(self.calibration).__name__}"
         candidates: list[Candidate] = []
         failures: list[StageFailure] = []
-        for plane in found.planes:
+        for plane in planes:
             try:
                 K = self.calibration.calibrations(scene, plane)
             except StageFailure as failure:
                 failures.append(failure)
                 continue
-            r = dual_image_residuals(frame, K[None], plane[None])
+            r = dual_image_residuals(scene.frame, K[None], plane[None])
             candidates.append(Candidate(plane, K, float(np.mean(np.sum(r**2, axis=-1))), method))
         if not candidates:
             raise failures[0]
@@ -96,7 +83,7 @@ class Stratified:
         best = sorted(candidates, key=lambda candidate: candidate.cost)
         return [
             minimize_quadric(
-                frame, scene.unknown, candidate.plane,
+                scene.frame, scene.unknown, candidate.plane,
                 0.5 * np.log(candidate.K[:, 0, 0] * candidate.K[:, 1, 1]), method=f"{method}, refined",
             )
             for candidate in best[: max(self.max_candidates, _MAX_REFINED)]
@@ -148,9 +135,3 @@ def _facing(affine: Reconstruction) -> F64:
     depth = np.einsum("kj,kj->k", affine.P[view, 2], affine.X[point])
     balance = np.bincount(view, np.sign(depth), minlength=len(affine.P))
     return affine.P * np.where(balance < 0.0, -1.0, 1.0)[:, None, None]
-
-
-def with_images(method: M, images: Sequence[Image]) -> M:
-    """Give the images, one per view, to a self-calibration method that detects parallel lines in them."""
-    given = getattr(method, "with_images", None)
-    return method if given is None or not images else cast(M, given(images))

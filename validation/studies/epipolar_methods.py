@@ -21,7 +21,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.config import FundamentalEstimator
 from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.ransac import LeastMedianOfSquares, ThesisRansac, estimate_eight_point
+from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point
 from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure
@@ -107,7 +107,6 @@ OWN = (
             ("Sampson, test of the sum", {"inlier_test": "symmetric-distance"}),
         )
     ),
-    Method("least median of squares", _robust(lambda **_: LeastMedianOfSquares()), robust=True),
     Method(DEFAULT, _robust(LocallyOptimisedRansac), robust=True, thresholded=True),
 )
 LIBRARIES = (
