@@ -1,7 +1,8 @@
-"""Command line of the validation: ``python -m validation report|check|ablate|study``.
+"""Command line of the validation: ``python -m validation report|check|limits|ablate|study``.
 
-``report`` and ``check`` run every stage and the references on the same inputs, ``ablate`` compares variants
-and parameters, ``study`` runs one of the measurements of :mod:`validation.studies`.
+``report`` and ``check`` run every stage and the references on the same inputs, ``limits`` moves the gates to
+what they measured, ``ablate`` compares variants and parameters, ``study`` runs one of the measurements of
+:mod:`validation.studies`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import argparse
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -23,12 +24,13 @@ from validation.ablation.analysis import analyse, compare_runs, failures_of
 from validation.ablation.page import write_analysis
 from validation.ablation.plan import STUDIES, Plan, plan_study, read_study
 from validation.ablation.run import Rows, ablate, parts_of, read_earlier_rows, read_rows
+from validation.runs.limits import move_limits, read_runs
 from validation.runs.models import report_models
 from validation.runs.page import write_pages
 from validation.runs.processes import own_cores
 from validation.runs.records import ReportOptions, load_images
 from validation.runs.report import run_tasks
-from validation.runs.results import Results, collect, read_gates, write_results
+from validation.runs.results import Gate, Results, collect, read_gates, write_results
 from validation.runs.study import (
     MODULES,
     OF_PAGES,
@@ -54,6 +56,8 @@ def main(arguments: list[str] | None = None) -> int:
         return run_ablation(parsed)
     if parsed.command == "study":
         return run_all(parsed.out)
+    if parsed.command == "limits":
+        return _move_limits(parsed)
     if parsed.command == "report" and (parsed.model or parsed.reference):
         return _report_models(parsed)
     try:
@@ -70,13 +74,15 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"validation: {error}", file=sys.stderr)
         return 2
     if parsed.command == "check":
-        _print_gates(results)
+        _print_gates(results, gates)
     broken = counted(len(results.broken) + len(results.missing), "gate")
     print(f"{broken} broken; the page is {page}")
     if parsed.command != "check":
         return 0
     tested = sum(row.limit is not None for row in results.rows) + len(results.missing)
     print(f"{tested} of {len(gates)} gates were judged" + ("" if tested else ": that is no check"))
+    if parsed.update:
+        move_limits(read_runs([options.out]), write=True)
     return int(not tested or bool(results.broken or results.missing))
 
 
@@ -104,9 +110,16 @@ def _parser() -> argparse.ArgumentParser:
             command.add_argument("--model", action="append", metavar="NAME=PATH", default=[], help=text)
             text = "what the models are compared with: true cameras, or one more model"
             command.add_argument("--reference", metavar="[NAME=]PATH", help=text)
+        if name == "check":
+            text = "show and write the measured values and limits that this run moves"
+            command.add_argument("--update", action="store_true", help=text)
         command.add_argument(
             "--max-side", type=int, default=0, metavar="PX", help="long side of depth maps (default: small)"
         )
+    words = "Show how results of check and report (other seeds, processors, commits) move the limits."
+    command = commands.add_parser("limits", help=words, description=words)
+    command.add_argument("runs", nargs="+", type=Path, metavar="OUT", help="their folders")
+    command.add_argument("--write", action="store_true", help="change validation/gates.toml")
     _add_ablate(commands)
     # One study has its own parser.
     help_text = "Run one study, or all; --list shows them."
@@ -164,13 +177,23 @@ def _report_models(parsed: argparse.Namespace) -> int:
     return 0
 
 
+def _move_limits(parsed: argparse.Namespace) -> int:
+    """Show, and with --write change, the limits of gates; exit code 2 for a folder without results."""
+    try:
+        move_limits(read_runs(parsed.runs), write=parsed.write)
+    except ValueError as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 def _named(word: str) -> tuple[str, Path]:
     """Name and path of NAME=PATH, or of a path with its own name."""
     name, equals, path = word.partition("=")
     return (name, Path(path)) if equals and name else (Path(word).name, Path(word))
 
 
-def _print_gates(results: Results) -> None:
+def _print_gates(results: Results, gates: Mapping[str, Gate]) -> None:
     for row in results.rows:
         if row.limit is not None:
             sign = "<=" if row.direction == "at most" else ">="
@@ -181,6 +204,13 @@ def _print_gates(results: Results) -> None:
         print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")
     for key in results.not_run:
         print(f"not run  {key}: --quick leaves its method out")
+    judged = {*(row.key for row in results.rows), *results.missing, *results.not_run}
+    left = Counter(key.rpartition("/")[0] for key in gates if key not in judged)
+    here = available_scenes(quick=False)
+    for place, count in left.items():
+        scene = place.partition("/")[2]
+        why = "this run leaves it out" if scene in here else "its images are not on this machine"
+        print(f"not run  {place}, {counted(count, 'gate')}: {why}")
 
 
 def _add_ablate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

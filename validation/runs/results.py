@@ -6,7 +6,7 @@ import json
 import platform
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,12 +24,24 @@ GATES_FILE = Path(__file__).resolve().parents[1] / "gates.toml"
 
 @dataclass(frozen=True)
 class Gate:
-    """``key`` of the number ("stage/scene/name"), ``limit``, its direction and the ``reason``."""
+    """``key`` of the number ("stage/scene/name"), ``limit``, its direction, and the reason: a ``template``
+    with {measured}, {noise} and names of ``references``. ``fixed``: the limit does not follow ``measured``.
+    """
 
     key: str
     limit: float
     at_most: bool
-    reason: str
+    template: str
+    measured: float | None = None
+    noise: float | None = None
+    fixed: bool = True
+    references: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def reason(self) -> str:
+        """The reason with the measured values; ``KeyError`` for a name that the gate does not have."""
+        known = {"measured": self.measured, "noise": self.noise, **self.references}
+        return self.template.format_map({name: f"{v:.3g}" for name, v in known.items() if v is not None})
 
     def holds(self, value: float | None) -> bool:
         """Return whether a number meets the limit; a missing number does not."""
@@ -50,12 +62,21 @@ def read_gates(path: Path = GATES_FILE) -> dict[str, Gate]:
     gates = {}
     for key, entry in tomllib.loads(path.read_text(encoding="utf-8")).items():
         limits = [name for name in ("at_most", "at_least") if name in entry]
-        unknown = sorted(set(entry) - {"at_most", "at_least", "reason"})
+        unknown = sorted(set(entry) - {*limits, "reason", "measured", "noise", "fixed", "references"})
         if len(limits) != 1 or unknown or not str(entry.get("reason", "")).strip():
             raise ValueError(f"a gate has one of at_most and at_least, and a reason; {key} has {entry}")
+        if ("measured" in entry) != ("noise" in entry) or not (entry.get("fixed") or "measured" in entry):
+            raise ValueError(f"a gate has measured and noise, or a fixed limit; {key} has {entry}")
         if key.count("/") != 2:
             raise ValueError(f"a gate is called stage/scene/number; got {key!r}")
-        gates[key] = Gate(key, float(entry[limits[0]]), limits[0] == "at_most", str(entry["reason"]))
+        more = {name: entry[name] for name in ("measured", "noise", "references") if name in entry}
+        limit, fixed = float(entry[limits[0]]), bool(entry.get("fixed", False))
+        gate = Gate(key, limit, limits[0] == "at_most", str(entry["reason"]), fixed=fixed, **more)
+        try:
+            assert gate.reason
+        except KeyError as name:
+            raise ValueError(f"the reason of {key} names {name}, which the gate does not have") from None
+        gates[key] = gate
     return gates
 
 

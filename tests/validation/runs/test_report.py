@@ -190,6 +190,8 @@ def test_report_and_check_run_without_any(stub, tmp_path):
     assert done.returncode == int(bool(promised))
     for key in promised:
         assert f"missed   {key}: no method reported this number ({not_installed('pycolmap')})" in done.stdout
+    assert "not run  cameras/courtyard, " in done.stdout
+    assert f"{len(promised)} of {len(read_gates())} gates were judged" in done.stdout
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "bundle/street/Ceres" in page
     assert not_installed("pycolmap") in page
