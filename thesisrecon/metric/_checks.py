@@ -8,6 +8,7 @@ which the pipeline replaces by the file name.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -294,6 +295,12 @@ def _named(views: I64) -> str:
     if len(numbers) == 1:
         return f"Image {numbers[0]}"
     return f"Images {', '.join(numbers[:-1])} and {numbers[-1]}"
+
+
+def doubtful_views(sentence: str) -> list[int]:
+    """The views that a failed check names as the smaller of two parts whose join is doubtful."""
+    named = getattr(sentence, "code", "") == "doubtful-join"
+    return [int(number) for number in re.findall(r"#(\d+)", sentence)] if named else []
 
 
 def _range(shares: F64) -> str:

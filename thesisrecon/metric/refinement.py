@@ -16,7 +16,7 @@ from thesisrecon import records
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
-from thesisrecon.metric._checks import check_returned, returned_cameras, self_check
+from thesisrecon.metric._checks import check_returned, doubtful_views, returned_cameras, self_check
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
@@ -62,7 +62,35 @@ class MetricRefinement:
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
-        return _assess(settled, reconstruction.tracks, calibration, reasons)
+        result = _assess(settled, reconstruction.tracks, calibration, reasons)
+        if result.trusted:
+            return result
+        return _trusted_part(result, model, adjustment, reconstruction.tracks, calibration) or result
+
+
+def _trusted_part(
+    result: records.MetricResult, model: MetricEstimate, adjustment: MetricAdjustment,
+    tracks: records.Tracks, calibration: records.SelfCalibration,
+) -> records.MetricResult | None:  # fmt: skip
+    """The model without the views whose join is doubtful, adjusted again; None if that is not trusted."""
+    joins, reasons, before = list[str](), list(result.reconstruction.reasons), model.registered.sum()
+    while not result.trusted:
+        doubtful = [sentence for sentence in result.failed_checks if doubtful_views(sentence)]
+        views = [view for sentence in doubtful for view in doubtful_views(sentence)]
+        registered = model.registered.copy()
+        registered[views] = False
+        for view in views:
+            reasons[view] = Notice("doubtful-side")
+        joins += doubtful
+        if not views or registered.sum() < 3:
+            return None
+        model = _model.retriangulate_tracks(replace(model, registered=registered), sigmas=LATE_SIGMAS)
+        if model.inlier.sum() < _adjustment.MIN_OBSERVATIONS:
+            return None
+        settled = settle_camera_model(finish_metric(model, adjustment))
+        result = _assess(settled, tracks, calibration, tuple(reasons))
+    check = {**result.self_check, "views_left_out": float(before - model.registered.sum())}
+    return replace(result, self_check=check, warnings=(*result.warnings, *joins))
 
 
 def _assess(
