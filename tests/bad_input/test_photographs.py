@@ -136,6 +136,7 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_
     (folder / "sub" / "up").symlink_to(folder)
     said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
     assert "2 images" in said
+    assert "subfolders are not searched: the images in sub are left out" in said
     only = tmp_path / "folders only"
     only.mkdir()
     (only / "sub").symlink_to(folder)

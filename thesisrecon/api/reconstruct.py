@@ -105,6 +105,8 @@ def reconstruct(
             raise UsageError(message)
         if frames is None and not _images.list_images(Path(images)):
             raise UsageError(f"there are no images in {images} (subfolders are not searched)")
+        if frames is None and (left := _images.image_subfolders(Path(images), run.directory.path, masks)):
+            run.warnings.append(Notice("subfolders", left))
         run.title = _images.scene_name(Path(images)) or run.title
     else:
         images = _images.list_of_images("reconstruct", images)

@@ -121,6 +121,14 @@ def list_images(folder: Path) -> list[Path]:
     return [p for p in entries if not p.name.startswith(".") and not p.is_dir() and _is_listed(p)]
 
 
+def image_subfolders(folder: Path, *others: Path | str | None) -> str:
+    """Names of the subfolders with images, which are not read, but for ``others`` such as the masks."""
+    known = {Path(other).resolve() for other in (folder, *others) if other is not None}
+    inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
+    inside = (path for path in inside if path.resolve() not in known and os.access(path, os.R_OK))
+    return printable(", ".join(path.name for path in inside if list_images(path)))
+
+
 def _is_listed(path: Path) -> bool:
     suffix = path.suffix.lower()
     # Cameras write thumbnails (.thm) beside their images and videos.
