@@ -31,6 +31,7 @@ extensions = [
     "_ext.mathml",
     "_ext.failures",
     "_ext.interface",
+    "_ext.ablations",
     "_ext.modules",
     "_ext.theory_tables",
     "_ext.pictures",

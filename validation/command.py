@@ -1,8 +1,8 @@
-"""Command line of the validation: ``python -m validation report|check|limits|ablate|study``.
+"""Command line of the validation: ``python -m validation report|check|limits|ablate|study|layout``.
 
 ``report`` and ``check`` run every stage and the references on the same inputs, ``limits`` moves the gates to
 what they measured, ``ablate`` compares variants and parameters, ``study`` runs one of the measurements of
-:mod:`validation.studies`.
+:mod:`validation.studies`, and ``layout`` brings public data sets into the form that all of them read.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from validation.runs.study import (
     run_studies,
     run_study,
 )
+from validation.scenes.layout import SETS, lay_out
 from validation.stages import STAGES, available_scenes
 
 KEPT = "run the same command to continue from the finished rows in {}"
@@ -54,6 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
     parsed = _parser().parse_args(given)
     if parsed.command == "ablate":
         return run_ablation(parsed)
+    if parsed.command == "layout":
+        return _lay_out(parsed)
     if parsed.command == "study":
         return run_all(parsed.out)
     if parsed.command == "limits":
@@ -121,6 +124,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("runs", nargs="+", type=Path, metavar="OUT", help="their folders")
     command.add_argument("--write", action="store_true", help="change validation/gates.toml")
     _add_ablate(commands)
+    text = "Lay out a public data set as it was downloaded, for every command that takes a folder of images."
+    sets = "; ".join(f"{name}: {one.about}" for name, one in SETS.items())
+    layout = commands.add_parser("layout", help=text, description=f"{text} {sets}.")
+    layout.add_argument("name", choices=list(SETS), metavar="SET", help=", ".join(SETS))
+    layout.add_argument("folder", type=Path, help="folder of a scene of the download")
+    layout.add_argument("-o", "--out", type=Path, required=True, help="new folder of images and true cameras")
     # One study has its own parser.
     help_text = "Run one study, or all; --list shows them."
     study = commands.add_parser("study", help=help_text, description=run_all.__doc__)
@@ -184,6 +193,17 @@ def _move_limits(parsed: argparse.Namespace) -> int:
     except ValueError as error:
         print(f"validation: {error}", file=sys.stderr)
         return 2
+    return 0
+
+
+def _lay_out(parsed: argparse.Namespace) -> int:
+    """Lay out a download; exit code 2 if it lacks a part."""
+    try:
+        scene = lay_out(parsed.name, parsed.folder, parsed.out)
+    except (UsageError, ValueError) as error:
+        print(f"validation: {error}", file=sys.stderr)
+        return 2
+    print(f"{counted(len(scene.image_paths), 'image')}, {int(scene.known.sum())} with a camera: {parsed.out}")
     return 0
 
 

@@ -60,6 +60,21 @@ def test_the_pages_of_commands_and_settings_name_all_of_them(site):
     assert [row for row in rows if row.rstrip().endswith("|  |")] == []
 
 
+def test_the_page_of_ablations_names_tasks_metrics_and_what_can_be_imported(site):
+    pytest.importorskip("validation.ablation.tasks")
+    from validation import metrics, scenes
+    from validation.ablation.tasks import TASKS
+
+    page = site("ablations").page()
+    for word, task in TASKS.items():
+        assert f"## {word}\n" in page
+        assert all(f"| `{m.name}`" in page and m.definition for m in task.measures)
+        assert all(f"`task.{name}`" in page for name in vars(task()))
+    names = re.findall(r"^\| `(\w+)[`(].*?\| (.*) \|$", page.split("## validation.scenes")[1], re.M)
+    assert {name for name, _ in names} == {*scenes.__all__, *metrics.__all__}
+    assert all(meaning for _, meaning in names)
+
+
 def test_every_message_of_the_code_has_a_remedy_on_the_page_of_failures(site):
     failures = site("failures")
     known = {code: message for table in failures.TABLES.values() for code, message in table.items()}
@@ -132,7 +147,8 @@ def test_commands_of_the_pages_exist(site):
                 else:
                     assert words[1:2] in ([], ["all"], ["NAME"], ["--list"]), where
             elif words:
-                parsed = _parser().parse_args(words if {"-o", "--out"} & {*words} else [*words, "-o", "OUT"])
+                complete = words[0] == "limits" or {"-o", "--out"} & {*words}
+                parsed = _parser().parse_args(words if complete else [*words, "-o", "OUT"])
                 if parsed.command == "ablate":
                     assert parsed.study in ("NAME", "STUDY.toml", *shipped), where
     assert tried > 60

@@ -9,7 +9,7 @@ import pytest
 from tests.pipeline.fake_stages import fake_config, kept_bytes, photographs
 from tests.synthetic import texture
 from thesisrecon.api.reconstruct import reconstruct
-from validation.ablation.tasks.synthetic import focal_bound
+from validation.metrics import focal_bound
 from validation.metrics.cameras import holding_std
 from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.rigs import cube_rig, make_cloud, noisy_tracks, projective_from_truth

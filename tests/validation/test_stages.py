@@ -1,5 +1,6 @@
 """What the stages of a report compute: depth, views, points of two models, F without an answer."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from tests.validation.test_metrics import N, _reconstruction, _truth
 from thesisrecon.records import Image
 from validation.runs.records import Outcome
+from validation.runs.tables import log_ticks
 from validation.scenes.real import Scene
 from validation.scenes.real_pairs import RealPair
+from validation.stages.cameras import COLMAP, MATCHES, _costs
 from validation.stages.clouds import Clouds, _icp_metrics, _same_points, common_frame, same_points
 from validation.stages.features import in_original_pixels
 from validation.stages.fundamental import MINIMAL, OURS, VARIANTS, _metrics
@@ -55,6 +58,33 @@ def test_the_motion_of_icp_depends_on_its_matrix_alone(tmp_path):
     assert shift.values["ours"] == pytest.approx(100.0 * np.linalg.norm(moved) / 10.0)
     assert share.values["ours"] == pytest.approx(75.0, abs=1.0)
     assert _icp_metrics("made up", "COLMAP", clouds, Outcome(tmp_path, "Open3D is missing")) == []
+    other[:120] += 0.5
+    (alone,) = _icp_metrics("made up", "COLMAP", clouds, Outcome(tmp_path))
+    assert alone.name == "ICP to COLMAP: inliers", "the motion of a part says nothing of the cloud"
+
+
+def test_memory_and_time_of_a_mapper_are_from_images_to_cameras(tmp_path):
+    outcomes = {
+        MATCHES: Outcome(tmp_path, cpu_s=30.0, peak_mb=900.0),
+        "ours": Outcome(tmp_path, cpu_s=20.0, peak_mb=300.0),
+        COLMAP: Outcome(tmp_path, cpu_s=5.0, peak_mb=100.0),
+    }
+    time, memory = _costs("made up", outcomes)
+    assert time.values == {"ours": 20.0, COLMAP: 35.0}
+    assert memory.values == {"ours": 300.0, COLMAP: 900.0}
+
+
+@pytest.mark.parametrize("values", [(0.97, 1.02), (0.4, 1.3), (3.0, 40.0), (1e-6, 2.0), (5.0,)])
+def test_a_logarithmic_axis_has_three_round_ticks(values):
+    ticks = log_ticks([*values, 0.0, math.inf])
+    if "tickvals" in ticks:
+        shown = np.array(ticks["tickvals"])
+        reach = 0.1 * max(values)
+        assert np.sum((shown >= min(values) - reach) & (shown <= max(values) + reach)) >= 3
+        assert shown.min() > 0.0
+    else:
+        per_decade = {"D2": 3, 1: 1}[ticks["dtick"]]
+        assert per_decade * np.log10(max(values) / min(values)) >= 1.8
 
 
 def test_a_method_without_any_fundamental_matrix_has_the_largest_errors_and_no_rank():

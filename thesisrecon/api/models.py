@@ -23,7 +23,7 @@ from thesisrecon.errors import UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import as_path, name_without_suffix, read_json
-from thesisrecon.io._models import read_model, read_positions
+from thesisrecon.io._models import read_calibration, read_model, read_positions
 from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
 from thesisrecon.results import (
@@ -401,7 +401,8 @@ def compare_models(
     ----------
     a, b : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
         Models (also of pycolmap); b is the reference. A path is the folder of a run, a COLMAP model, a
-        ``cameras.json``, or a trajectory in TUM or KITTI format.
+        ``cameras.json``, or a trajectory in TUM or KITTI format. b may also be a text file of the nine
+        numbers of K: then only intrinsics are compared.
     max_time_difference, time_offset : float
         Largest difference in seconds of cameras that are paired by time, and what is added to the times of b.
 
@@ -439,18 +440,24 @@ def compare_models(
     >>> bool(comparison.summary["centre_error"]["max"] < 1e-12)
     True
     """
-    first, second, notes = _model(a, "first"), _model(b, "second"), list[str]()
+    first, notes = _model(a, "first"), list[str]()
+    K = read_calibration(Path(b)) if isinstance(b, str | PathLike) else None
+    second = _model(b, "second") if K is None else _of_calibration(K, first)
     tolerance = number("compare_models", "max_time_difference", max_time_difference)
     offset = number("compare_models", "time_offset", time_offset)
     if not (tolerance >= 0.0 and np.isfinite(offset)):
         rule = "max_time_difference of at least 0 and a finite time_offset"
         raise ValueError(f"compare_models needs {rule}; got {tolerance:g} and {offset:g}")
-    pairs = _pairs_by_time(first, second, tolerance, offset, notes) or _pairs(first, second, notes)
+    pairs = paired_cameras(first, second, notes, tolerance, offset)
     left, right = [first.views[i] for i, _ in pairs], [second.views[j] for _, j in pairs]
     R, R_b = (np.array([view.R for view in views]) for views in (left, right))
+    turned = unknown = np.full(len(pairs), np.nan)
+    if K is None and len(pairs) > 1:
+        turned = rotation_errors_deg(R, R_b)
     centres, centres_b = (np.array([view.centre for view in views]) for views in (left, right))
-    unknown = np.full(len(pairs), np.nan)
-    similarity = _similarity(centres, centres_b, notes)
+    if K is not None:
+        notes.append("the reference is K alone: only intrinsics are compared")
+    similarity = _similarity(centres, centres_b, notes) if K is None else None
     points = None
     if similarity is not None:
         first = first.transformed(similarity)
@@ -460,7 +467,7 @@ def compare_models(
     paired, paired_b = ({pair[k] for pair in pairs} for k in (0, 1))
     return ModelComparison(
         names=tuple(view.name for view in left), names_b=tuple(view.name for view in right),
-        centre_error=moved, rotation_error_deg=rotation_errors_deg(R, R_b) if len(pairs) > 1 else unknown,
+        centre_error=moved, rotation_error_deg=turned,
         focal_error_rel=intrinsics[:, 0], principal_point_error_px=intrinsics[:, 1], similarity=similarity,
         points=points, only_a=tuple(name for i, name in enumerate(first.names) if i not in paired),
         only_b=tuple(name for j, name in enumerate(second.names) if j not in paired_b), notes=tuple(notes),
@@ -474,6 +481,12 @@ def _model(model: Model, which: str) -> SparseModel:
         rule = "a path or a model in memory with at least one camera"
         raise UsageError(f"the {which} model of a comparison must be {rule}; it has none")
     return found
+
+
+def _of_calibration(K: F64, like: SparseModel) -> SparseModel:
+    """The views of a model with this K and unknown poses (NaN)."""
+    R, t = np.full((3, 3), np.nan), np.full(3, np.nan)
+    return SparseModel([SparseView(view.name, R, t, K, view.size) for view in like.views])
 
 
 def _pairs_by_time(
@@ -526,9 +539,13 @@ def _times(model: SparseModel) -> F64 | None:
     return times
 
 
-def _pairs(a: SparseModel, b: SparseModel, notes: list[str]) -> list[tuple[int, int]]:
-    """Pairs of cameras with the same name, in the order of a."""
-    for key in (str, name_without_suffix):
+def paired_cameras(
+    a: SparseModel, b: SparseModel, notes: list[str], tolerance: float = 0.01, offset: float = 0.0
+) -> list[tuple[int, int]]:
+    """Pairs of cameras of the same time or name in the order of a, as :func:`compare_models` pairs them."""
+    if pairs := _pairs_by_time(a, b, tolerance, offset, notes):
+        return pairs
+    for key in (str, name_without_suffix, _number_of_dtu):
         keys, keys_b = ([key(view.name) for view in model.views] for model in (a, b))
         counts, counts_b = Counter(keys), Counter(keys_b)
         place = {name: j for j, name in enumerate(keys_b) if counts_b[name] == 1}
@@ -541,6 +558,12 @@ def _pairs(a: SparseModel, b: SparseModel, notes: list[str]) -> list[tuple[int, 
     names = (f"{_few(model.names)} in the {which}" for which, model in (("first", a), ("second", b)))
     advice = "give models of the same images, or a trajectory of as many cameras"
     raise UsageError(f"the models have no common camera: {' and '.join(names)}; {advice}")
+
+
+def _number_of_dtu(name: str) -> str:
+    """The position in a name of DTU, such as rect_001_3_r5000.png and pos_001.txt, or else the name."""
+    found = re.match(r"(?:rect|clean|pos)_(\d+)", name_without_suffix(name))
+    return found[1] if found else name
 
 
 def _few(names: Sequence[str]) -> str:

@@ -13,6 +13,7 @@ from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental
 from thesisrecon.epipolar.refinement import SAMPSON, fundamental_covariance, refine
 from thesisrecon.errors import StageFailure
 from thesisrecon.optimize.least_squares import best_huber_width, effective_noise
+from thesisrecon.optimize.ransac import watched
 from thesisrecon.records import FundamentalFit
 
 MINIMUM = 8
@@ -138,7 +139,8 @@ class LocallyOptimisedRansac:
             refine(f, points[:500], SAMPSON, width * gate, 0.25 * width * gate, 5)
         width = self.gates[-1]
         refine(f, points, SAMPSON, width * gate, 0.25 * width * gate, 20)
-        score, _, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
+        score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
+        watched(0, score, inliers / len(points), f)
         return score * len(points), f
 
     def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
@@ -215,8 +217,10 @@ def _score_samples(
         uniforms = uniforms[drawn - before :]
         if state[0] < score:
             _refine_best(points, columns, gate, state, f)
+            watched(drawn, state[0], state[1], f)
         elif len(uniforms):
             break
+    watched(drawn, state[0], state[1], f, ends=True)
     return drawn
 
 

@@ -22,7 +22,7 @@ from thesisrecon.geometry.two_view import (
     sampson_residuals,
     symmetric_residuals,
 )
-from thesisrecon.optimize.ransac import draw_samples
+from thesisrecon.optimize.ransac import draw_samples, watched
 from thesisrecon.records import FundamentalFit
 
 
@@ -247,7 +247,9 @@ def _search(
             rank = (float(inside.sum()), -rms)
             if rank > best_rank:
                 best, inliers, best_rank = model, inside, rank
+                watched(drawn + 1, 1.0 - inside.mean(), inside.mean(), model)
         drawn += 1
+    watched(drawn, 0.0, 0.0, best, ends=True)
     return best, inliers, drawn
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, require_calibration
 from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._colmap import MAX_SIDE_PX, is_colmap_model, read_colmap_model
@@ -53,6 +53,17 @@ _KNOWN = (
     "transforms.json, bundle.out, scene.mvs, camchain.yaml or par.txt, a folder with NAME_cam.txt or a "
     "matrix P of each image, or a trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
 )
+
+
+def read_calibration(path: Path) -> F64 | None:
+    """The calibration matrix K (3, 3) of a text file of its nine numbers; None for any other file."""
+    words = read_text(path).split() if path.is_file() and path.suffix == ".txt" else []
+    try:
+        K = np.array(words, dtype=np.float64).reshape(3, 3)
+        require_calibration(str(path), K)
+    except ValueError:
+        return None
+    return K
 
 
 def colmap_model_in(folder: Path) -> Path | None:

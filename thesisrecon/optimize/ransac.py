@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -31,6 +32,17 @@ CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
 REACHES = 1.0, 3.0
 """Thresholds at which chance is tested: right data whose noise is the threshold lie within three."""
+
+
+WATCH: ContextVar[Callable[[int, float, float, F64, bool], None] | None] = ContextVar("watch", default=None)
+"""Called by every robust search, if set, with its samples so far, the cost and the share of inliers of its
+best model, this model in the frame of the search, and whether the search ends there."""
+
+
+def watched(samples: int, cost: float, share: float, model: F64 | None, *, ends: bool = False) -> None:
+    """Report a better model to :data:`WATCH`."""
+    if (watch := WATCH.get()) is not None and model is not None:
+        watch(samples, float(cost), float(share), model.copy(), ends)
 
 
 class Budget(NamedTuple):
@@ -91,11 +103,13 @@ def search_models(
                 if min(lowest, trial[1]) < least:
                     best, least, inliers = trial
                     share = len(inliers) / len(scored)
+                    watched(drawn, least, share, best)
         good = (1.0 - LOST) * min(share**size, 1.0 - 1e-9)
         missing = np.log1p(-budget.confidence) / np.log1p(-max(good, 1e-300)) - drawn
         if missing < 0.0 or (best is None and drawn >= WITHOUT):
             break
         batch = int(min(2 * batch, most, missing + 1.0))
+    watched(drawn, least, share, best, ends=True)
     return None if best is None else Found(best, drawn, inliers)
 
 

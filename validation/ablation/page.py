@@ -126,7 +126,7 @@ def _over_conditions(measure: Measure, curves: Curves) -> Plot:
         y = [_finite(c.mean) for c in cells]
         traces.append(scatter(name, curves.x, y, "lines+markers", line=line, error_y=errors))
     title = f"{measure.name} over {curves.title}"
-    layout: dict[str, Any] = {"legend": {"orientation": "h", "y": -0.25}, "height": 420}
+    layout: dict[str, Any] = {"height": 420}
     yaxis = LOGARITHMIC if curves.log else {}
     return plot(title, traces, curves.axis, with_unit(measure.name, measure.unit), yaxis=yaxis, **layout)
 
@@ -180,7 +180,6 @@ def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     layout: dict[str, Any] = {
         "xaxis": {"rangemode": "tozero"},
         "yaxis": LOGARITHMIC if measure.ratio and all(c.mean > 0 for c in known) else {},
-        "legend": {"orientation": "h", "y": -0.2},
         "height": 420 + 10 * len(known),
     }
     caption = "Filled: Pareto-optimal (no variant is both better and cheaper)."

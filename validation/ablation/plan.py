@@ -132,7 +132,7 @@ def _task_of(study: Study) -> Task:
 
 def _measures(study: Study, task: Task) -> tuple[Measure, ...]:
     known = {m.name: m for m in task.measures}
-    asked: Sequence[str | Measure] = study.metrics or tuple(known.values())
+    asked: Sequence[str | Measure] = study.metrics or tuple(m for m in known.values() if not m.extra)
     if isinstance(asked, str):
         raise UsageError(f"metrics are a list of names; got {asked!r}")
     for metric in asked:
@@ -156,16 +156,19 @@ def _scenes(study: Study, task: Task) -> tuple[str, ...]:
     scenes = study.scenes
     if isinstance(scenes, str) or not scenes or not all(isinstance(s, str) for s in scenes):
         raise UsageError(f"scenes are a list of at least one name; got {scenes!r}")
+    found = dict[str, None]()
     for scene in scenes:
         try:
-            task.check(scene)
+            for one in task.expand(scene):
+                task.check(one)
+                found[one] = None
         except UsageError as error:
             names = ", ".join(task.names_of_scenes())
             raise UsageError(f"{error} (scenes are {names})" if names else str(error)) from None
     count = study.subsets
     if type(count) is not int or count < 0:
         raise UsageError(f"subsets is the number of subsets of each scene, 0 for none; got {count!r}")
-    parts = [[scene, *(task.subsets(scene, count) if count else ())] for scene in dict.fromkeys(scenes)]
+    parts = [[scene, *(task.subsets(scene, count) if count else ())] for scene in found]
     return tuple(itertools.chain.from_iterable(parts))
 
 

@@ -23,7 +23,7 @@ Axis = Sequence[Any] | Mapping[str, Changes]
 class Measure:
     """A number that rows report. ``better`` is "less" or "more". With ``ratio`` values are compared by
     quotients, for errors of different magnitude above zero; a quotient within ``negligible`` of 1 is called
-    negligible.
+    negligible. One that is ``extra`` is analysed only if a study names it.
     """
 
     name: str
@@ -32,6 +32,7 @@ class Measure:
     ratio: bool = False
     definition: str = ""
     negligible: float = 0.005
+    extra: bool = False
 
 
 class Task:
@@ -48,6 +49,10 @@ class Task:
     scenes: ClassVar[Sequence[str]] = ()
     sample: ClassVar[Sample] = "scenes"
     """What is sampled: "draws" if the seed draws the data (noise, points, cameras), else the scenes."""
+
+    def expand(self, scene: str) -> Sequence[str]:
+        """The scenes that a word of a study means, such as all pairs of a list."""
+        return [scene]
 
     def scene_of(self, scene: str) -> str:
         """The scene that a subset belongs to."""

@@ -61,6 +61,12 @@ def area_under_recall(errors: F64, threshold: float) -> float:
     return float(np.maximum(1.0 - errors / threshold, 0.0).mean()) if len(errors) else float("nan")
 
 
+def pose_scores_pct(errors: F64) -> dict[str, float]:
+    """AUC at every threshold and mAA(10 degrees), in percent, by the names of the ablations."""
+    areas = {f"auc{at:g}_pct": 100.0 * area_under_recall(errors, at) for at in AUC_DEG}
+    return {**areas, "maa_pct": 100.0 * mean_accuracy(errors)}
+
+
 def mean_accuracy(errors: F64, up_to: int = 10) -> float:
     """Mean of the recalls at 1, 2, ... ``up_to`` degrees (mAA)."""
     return float(recall(errors, np.arange(1.0, up_to + 1.0)).mean())

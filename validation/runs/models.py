@@ -170,9 +170,8 @@ def _of_cameras(compared: Sequence[Compared]) -> list[Metric]:
 
 
 def _of_models(compared: Sequence[Compared]) -> list[Metric]:
-    numbers = [_of_model(c.found.a) for c in compared]
-    rows = []
-    for name, (unit, definition, more) in {
+    numbers, first, rows = [_of_model(c.found.a) for c in compared], compared[0].name, list[Metric]()
+    for name, (unit, about, more) in {
         "points": ("", "points of the model", True),
         "observations": ("", "pixels of points", True),
         "track length, mean": ("images", "observations of a point", True),
@@ -180,25 +179,14 @@ def _of_models(compared: Sequence[Compared]) -> list[Metric]:
         "reprojection, RMS": ("px", "of the same distances", False),
     }.items():
         table = {c.name: _finite(n.get(name)) for c, n in zip(compared, numbers, strict=True)}
-        rows.append(
-            row("models", name, unit, table, definition, more=more, ranked=False, judged=compared[0].name)
-        )
+        rows.append(row("models", name, unit, table, about, more=more, ranked=False, judged=first))
     for name, attribute in (("to the reference", "a_to_b"), ("from the reference", "b_to_a")):
-        table = {
+        apart = {
             c.name: None if c.found.points is None else getattr(c.found.points, attribute) for c in compared
         }
-        about = "median distance to the nearest point of the other model"
-        rows.append(
-            row(
-                "models",
-                f"points {name}, median",
-                "units of the reference",
-                table,
-                about,
-                judged=compared[0].name,
-            )
-        )
-    return rows
+        about, unit = "median distance to the nearest point of the other model", "units of the reference"
+        rows.append(row("models", f"points {name}, median", unit, apart, about, judged=first))
+    return [found for found in rows if any(value is not None for value in found.values.values())]
 
 
 def _of_model(model: SparseModel) -> dict[str, float]:
@@ -228,21 +216,14 @@ def _of_model(model: SparseModel) -> dict[str, float]:
 
 def _plots(compared: Sequence[Compared]) -> list[Plot]:
     at = np.linspace(0.0, max(AUC_DEG), STEPS + 1)[1:] ** 2 / max(AUC_DEG)
-    legend: dict[str, Any] = {"legend": {"orientation": "h", "y": 1.12}, "height": 380}
+    size: dict[str, Any] = {"height": 400}
     curves = [
         scatter(c.name, at, (100.0 * recall(c.pairs, at)).round(2), "lines", line={"color": colour})
         for c, colour in zip(compared, _colours(compared), strict=True)
+        if len(c.pairs)
     ]
-    found = [
-        plot(
-            "Recall of relative poses",
-            curves,
-            "largest error (degrees)",
-            "pairs (%)",
-            xaxis={"type": "log"},
-            **legend,
-        )
-    ]
+    log, title = {"type": "log"}, "Recall of relative poses"
+    found = [plot(title, curves, "largest error (degrees)", "pairs (%)", xaxis=log, **size)] if curves else []
     order = {view.name: k for k, view in enumerate(compared[0].found.b.views)}
     for title, attribute, unit, factor in (
         ("Centre error by image", "centre_error", "units of the reference", 1.0),
@@ -267,7 +248,7 @@ def _plots(compared: Sequence[Compared]) -> list[Plot]:
             else ""
         )
         if traces:
-            found.append(plot(title, traces, "image", unit, caption, **legend))
+            found.append(plot(title, traces, "image", unit, caption, **size))
     return found
 
 
@@ -279,12 +260,12 @@ def _verdict(compared: Sequence[Compared], reference: str) -> dict[str, Any]:
     order = sorted(compared, key=lambda c: -area_under_recall(c.pairs, 5.0))
     areas = "; ".join(f"{c.name} {number(100.0 * area_under_recall(c.pairs, 5.0))} %" for c in order)
     total = counted(len(compared[0].found.b.views), "camera")
-    return {
-        "level": "open",
-        "word": "Compared",
-        "reasons": (),
-        "sentence": f"AUC@5° of relative poses of {total} of {reference}: {areas}.",
-    }
+    sentence = f"AUC@5° of relative poses of {total} of {reference}: {areas}."
+    if not any(len(c.pairs) for c in compared):
+        errors = {c.name: _median(100.0 * np.abs(c.found.focal_error_rel)) for c in compared}
+        areas = "; ".join(f"{name} {number(error)} %" for name, error in errors.items())
+        sentence = f"Median focal error against {reference}: {areas}."
+    return {"level": "open", "word": "Compared", "reasons": (), "sentence": sentence}
 
 
 def _text(metrics: Mapping[str, Sequence[Metric]], names: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ from thesisrecon.report._page import plotly_script, render_page
 from validation.runs.records import Picture, ReportOptions, Stage
 from validation.runs.report import Judged
 from validation.runs.results import Results, Row
-from validation.runs.tables import Plot, number, scatter, slug
+from validation.runs.tables import Plot, log_ticks, number, scatter, slug
 
 HERE = Path(__file__).parent
 TEMPLATE = HERE / "report.html.j2"
@@ -118,11 +118,12 @@ def _picture(folder: Path, picture: Picture) -> dict[str, Any]:
 
 ROW_PX, FRAME_PX = 17, 90
 BETTER, WORSE = "#2166ac", "#c2571a"
-COSTS = ("ms", "s", "MB")
+KINDS = {"ms": ", time", "s": ", time", "MB": ", memory", "": ", counts", "%": ", shares"}
+"""Numbers of other kinds than lengths and angles have means of their own."""
 DEFINITION = (
     "Each dot is a number of ours over that of the best reference, inverted where more is better: left of "
-    "the line we are better. Diamonds are geometric means of a stage on a scene, of times and memory apart "
-    "from the rest; the worst are on top."
+    "the line we are better. Diamonds are geometric means of a stage on a scene, of errors, shares, counts, "
+    "times and memory each by itself; the worst are on top."
 )
 
 
@@ -132,15 +133,15 @@ def overview(results: Results) -> dict[str, Any]:
     for row in results.rows:
         if row.ratio is not None:
             where, name = row.key.rsplit("/", 1)
-            cost = ", cost" if row.unit in COSTS else ""
-            ratios.setdefault(f"{where}{cost}", []).append((row.ratio, name))
+            ratios.setdefault(f"{where}{KINDS.get(row.unit, '')}", []).append((row.ratio, name))
     means = {key: float(np.exp(np.mean(np.log([r for r, _ in found])))) for key, found in ratios.items()}
     # Plotly draws the first row at the bottom.
     order = sorted(means, key=lambda key: (means[key], key))
     dots = [(key, ratio, name) for key in order for ratio, name in ratios[key]]
     mean_dots = [(key, means[key], "geometric mean") for key in order]
     traces = [_trace(dots, 6, "circle", 0.45), _trace(mean_dots, 10, "diamond", 1.0)]
-    worst = Plot("Worst first", {"data": traces, "layout": _layout(len(order))})
+    layout = _layout(len(order), [ratio for _, ratio, _ in dots])
+    worst = Plot("Worst first", {"data": traces, "layout": layout})
     better = sum(mean < 1.0 for mean in means.values())
     where = f"{better} of {len(means)} combinations of stage and scene"
     notes = [f"In {where} we are better than the best reference (geometric mean)."]
@@ -159,14 +160,14 @@ def _trace(dots: Sequence[tuple[str, float, str]], size: int, symbol: str, opaci
     return scatter("", x, y, text=text, hoverinfo="text+y", showlegend=False, marker=marker)
 
 
-def _layout(rows: int) -> dict[str, Any]:
+def _layout(rows: int, ratios: Sequence[float]) -> dict[str, Any]:
     stroke = {"color": "#444", "width": 1}
     line = {"type": "line", "x0": 1, "x1": 1, "y0": 0, "y1": 1, "yref": "paper", "line": stroke}
     y = {"automargin": True, "tickfont": {"size": 10}, "gridcolor": "#f0f3f5", "dtick": 1}
     return {
         "height": ROW_PX * rows + FRAME_PX,
         "margin": {"l": 10, "r": 10, "t": 30, "b": 40},
-        "xaxis": {"type": "log", "side": "top", "dtick": 1, "gridcolor": "#e3e8ec"},
+        "xaxis": {"type": "log", "side": "top", "gridcolor": "#e3e8ec"} | log_ticks(ratios),
         "yaxis": y | {"range": [-1, rows]},
         "shapes": [line],
     }

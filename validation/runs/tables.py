@@ -153,11 +153,45 @@ def scatter(
 
 
 def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, caption: str = "", **layout: Any) -> Plot:
-    """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js."""
+    """Return a plot with axis titles ``x`` and ``y``; ``layout`` adds to that of plotly.js. The legend is
+    below the plot, the buttons are above it.
+    """
     for axis, text in (("xaxis", x), ("yaxis", y)):
-        layout[axis] = {"title": {"text": text}} | layout.get(axis, {})
-    layout["margin"] = {"l": 70, "r": 10, "t": 10, "b": 50}
+        usual = {"title": {"text": text}, "automargin": True, "zeroline": axis == "yaxis"}
+        layout[axis] = usual | layout.get(axis, {})
+        if layout[axis].get("type") == "log":
+            layout[axis] |= log_ticks([v for trace in traces for v in _reach(trace, axis[0])])
+    layout["margin"] = {"l": 70, "r": 10, "t": 36, "b": 50}
+    layout.setdefault("legend", {"orientation": "h", "yanchor": "top", "y": -0.2})
     return Plot(title, {"data": traces, "layout": layout}, caption)
+
+
+def _reach(trace: Mapping[str, Any], axis: str) -> list[float]:
+    """The numbers of a trace along an axis, and the ends of their error bars."""
+    values, bars = trace[axis], trace.get(f"error_{axis}", {})
+    known = [(k, v) for k, v in enumerate(values) if isinstance(v, int | float)]
+    ends = [
+        v + sign * (bars[name][k] or 0.0)
+        for name, sign in (("array", 1.0), ("arrayminus", -1.0))
+        if name in bars
+        for k, v in known
+    ]
+    return [*(v for _, v in known), *ends]
+
+
+def log_ticks(values: Iterable[float]) -> dict[str, Any]:
+    """Ticks of a logarithmic axis: round numbers, three at least; plotly's own are powers of ten."""
+    positive = [v for v in values if 0.0 < v < math.inf]
+    if not positive or max(positive) > 300.0 * min(positive):
+        return {"dtick": 1}
+    low, high = min(positive), max(positive)
+    if high > 4.0 * low:
+        return {"dtick": "D2"}
+    fourth = max(high - low, 0.05 * high) / 4.0
+    unit = 10.0 ** math.floor(math.log10(fourth))
+    step = min((unit, 2.0 * unit, 5.0 * unit, 10.0 * unit), key=lambda size: abs(size - fourth))
+    first, last = math.floor(low / step) - 1, math.ceil(high / step) + 1
+    return {"tickvals": [float(f"{k * step:.12g}") for k in range(max(first, 1), last + 1)]}
 
 
 def text_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,9 +16,12 @@ import numpy as np
 from PIL import Image as PillowImage
 
 import thesisrecon
+from thesisrecon.api.models import paired_cameras
 from thesisrecon.arrays import B8, F64, U8
-from thesisrecon.io._files import name_without_suffix, shortened, write_atomically
-from thesisrecon.io._models import read_model
+from thesisrecon.errors import UsageError
+from thesisrecon.io._files import shortened, write_atomically
+from thesisrecon.io._models import read_calibration, read_model
+from thesisrecon.results import SparseModel, SparseView
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL_SCENES = {
@@ -62,6 +65,14 @@ class Scene:
         """Return K, R and C, None if they are not known."""
         known = self.K is not None and self.R is not None and self.C is not None
         return (self.K, self.R, self.C) if known else None  # type: ignore[return-value]
+
+    def cameras_of(self, views: Sequence[int]) -> tuple[F64, F64, F64]:
+        """K, R and C of some images of a scene with K, NaN where one is not known."""
+        assert self.K is not None
+        K, chosen = self.K, list(views)
+        R = np.full_like(K, np.nan) if self.R is None else self.R
+        C = np.full_like(K[..., 0], np.nan) if self.C is None else self.C
+        return K[chosen], R[chosen], C[chosen]
 
     @property
     def cameras(self) -> tuple[F64, F64, F64]:
@@ -108,7 +119,8 @@ def with_known_cameras(scene: Scene, folder: Path) -> Scene:
 
 TRUTHS = (
     *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "bundle.out", "scene.mvs", "camchain.yaml"),
-    *("sparse/0", "sparse", "cams", "cameras", "groundtruth.txt", "poses.txt"),
+    *("sparse/0", "sparse", "dslr_calibration_undistorted", "cams", "cameras", "cal18"),
+    *("groundtruth.txt", "poses.txt"),
 )
 
 
@@ -119,34 +131,27 @@ def truth_beside(folder: Path) -> Path | None:
 
 
 def with_truth(scene: Scene, model: Path) -> Scene:
-    """The scene with the cameras of a model as its truth, found by name, or by name without suffix.
+    """The scene with the cameras of a model as its truth, paired as :func:`thesisrecon.compare_models` does.
 
     A file K.txt (3 x 3) beside it gives K to poses. Raises ``ValueError`` if the model has no image of the
     scene, or no K.
     """
-    views = list(read_model(model).views)
-    paths = scene.image_paths
-    for name_of in (str, name_without_suffix):
-        place = {name_of(view.name): view for view in views}
-        cameras = [place.get(name_of(path.name)) for path in paths]
-        if any(cameras):
-            break
-    if not any(cameras):
-        named, other = (
-            shortened(", ".join(names[:3])) for names in ([p.name for p in paths], [v.name for v in views])
-        )
-        raise ValueError(f"{model} has a camera of no image of {scene.name}: {other} there, {named} here")
-    K, R, C = (
-        np.full((len(paths), 3, 3), np.nan),
-        np.full((len(paths), 3, 3), np.nan),
-        np.full((len(paths), 3), np.nan),
-    )
-    common = _calibration_beside(model)
-    for n, view in enumerate(cameras):
-        if view is not None:
-            R[n], C[n] = view.R, view.centre
-            if (own := view.K if view.K is not None else common) is not None:
-                K[n] = own
+    found, paths = read_model(model), scene.image_paths
+    # Images have K, so that only trajectories are paired by time or order.
+    images = SparseModel([SparseView(path.name, np.eye(3), np.zeros(3), np.eye(3)) for path in paths])
+    try:
+        pairs = paired_cameras(images, found, [])
+    except UsageError as error:
+        few, other = (shortened(", ".join(m.names[:3])) for m in (images, found))
+        text = f"{model} has a camera of no image of {scene.name}: {other} there, {few} here"
+        raise ValueError(text) from error
+    K, R = (np.full((len(paths), 3, 3), np.nan) for _ in range(2))
+    C, common = R[..., 0].copy(), _calibration_beside(model)
+    for n, k in pairs:
+        view = found.views[k]
+        R[n], C[n] = view.R, view.centre
+        if (own := view.K if view.K is not None else common) is not None:
+            K[n] = own
     if not np.isfinite(K).any():
         raise ValueError(f"{model} gives no image a K; put one into K.txt (3 x 3) beside it")
     return replace(scene, K=K, R=R, C=C)
@@ -155,12 +160,9 @@ def with_truth(scene: Scene, model: Path) -> Scene:
 def _calibration_beside(model: Path) -> F64 | None:
     """K of a file K.txt in the folder of a model."""
     file = model.parent / "K.txt"
-    if not file.is_file():
-        return None
-    try:
-        return np.loadtxt(file).reshape(3, 3)
-    except ValueError:
-        raise ValueError(f"{file} must hold the 3 x 3 numbers of K") from None
+    if (K := read_calibration(file)) is None and file.is_file():
+        raise ValueError(f"{file} must hold the 3 x 3 numbers of K")
+    return K
 
 
 def with_calibration(scene: Scene, file: Path) -> Scene:

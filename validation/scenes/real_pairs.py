@@ -81,14 +81,18 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
     """Pairs (i, i + gap) of a scene with known cameras; ``truth`` is free of noise."""
     if scene is None or not scene.has_truth:
         return
-    cameras = [compose_camera(K, R, -R @ C) for K, R, C in zip(*scene.cameras, strict=True)]
     for gap in gaps:
-        for i in range(len(cameras) - gap):
-            paths = (scene.image_paths[i], scene.image_paths[i + gap])
-            xy1, xy2 = match_images(paths, cache, ratio=CAMERA_RATIO, mutual=True)
-            F = fundamental_from_cameras(cameras[i], cameras[i + gap])
-            truth = exact_correspondences(cameras[i], cameras[i + gap], xy1, xy2)
-            yield RealPair(f"{scene.name} {i}-{i + gap}", xy1, xy2, truth=truth, F=F)
+        for i in range(len(scene.image_paths) - gap):
+            yield camera_pair(scene, i, i + gap, cache)
+
+
+def camera_pair(scene: Scene, i: int, j: int, cache: Path = CACHE) -> RealPair:
+    """A pair of images whose cameras are known; ``truth`` is free of noise."""
+    P1, P2 = (compose_camera(K, R, -R @ C) for K, R, C in zip(*scene.cameras_of((i, j)), strict=True))
+    paths = scene.image_paths[i], scene.image_paths[j]
+    xy1, xy2 = match_images(paths, cache, ratio=CAMERA_RATIO, mutual=True)
+    truth = exact_correspondences(P1, P2, xy1, xy2)
+    return RealPair(f"{scene.name} {i}-{j}", xy1, xy2, truth=truth, F=fundamental_from_cameras(P1, P2))
 
 
 def exact_correspondences(P1: F64, P2: F64, xy1: F64, xy2: F64) -> F64:

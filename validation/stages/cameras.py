@@ -205,13 +205,18 @@ def _last_record(outcome: Outcome, stage: str) -> Any:
 
 
 def _costs(scene: str, outcomes: Mapping[str, Outcome]) -> list[Metric]:
-    """Return processor seconds and memory; COLMAP's mappers include the shared matching."""
+    """Return processor seconds and memory; both of COLMAP's mappers include the shared matching."""
     done = {n: o if o.ok else None for n, o in outcomes.items() if n not in (MATCHES, PER_IMAGE)}
-    shared = outcomes[MATCHES].cpu_s if MATCHES in outcomes else 0.0
-    times: Values = {n: None if o is None else o.cpu_s + shared * (n in MAPPERS) for n, o in done.items()}
+    shared = outcomes.get(MATCHES, Outcome(Path()))
+    times: Values = {
+        n: None if o is None else o.cpu_s + shared.cpu_s * (n in MAPPERS) for n, o in done.items()
+    }
+    memory: Values = {
+        n: None if o is None else max(o.peak_mb, shared.peak_mb * (n in MAPPERS)) for n, o in done.items()
+    }
     return [
         row(scene, "time", "s", times, "processor seconds from images to cameras"),
-        row(scene, "peak memory", "MB", each(done, lambda o: o.peak_mb), "of the process"),
+        row(scene, "peak memory", "MB", memory, "largest of the processes from images to cameras"),
     ]
 
 
@@ -244,7 +249,7 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
         focals = [c["focal_px"] for c in cameras if c.get("focal_px")]
         widest = max((100.0 * f["std"] / f["value"] for f in focals), default=None)
         rows.append(row(scene.name, f"intervals that hold{where}", "%", held, SHARE_HELD, more=True))
-        rows.append(row(scene.name, f"widest focal interval{where}", "%", widest, text))
+        rows.append(row(scene.name, f"largest focal deviation{where}", "%", widest, text))
     return rows
 
 

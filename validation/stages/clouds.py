@@ -27,11 +27,12 @@ from validation.runs.records import (
     load_images,
     read_arrays,
 )
-from validation.runs.tables import OURS, Metric, Plot, row, slug
+from validation.runs.tables import OURS, Metric, Plot, number, row, slug
 from validation.scenes.real import Scene
 from validation.stages.cameras import COLMAP, COLMAP_PP, read_model
 
 ICP = "Open3D, ICP"
+FEW_PCT = 50.0  # Share of points with a partner below which the motion of ICP is that of a part
 NEAR_PCT = 0.5  # A point has a partner if the other cloud has a point within this share of its depth (%)
 
 
@@ -194,11 +195,14 @@ def _icp_metrics(scene: str, name: str, clouds: Clouds, outcome: Outcome | None)
     shift = 100.0 * float(np.linalg.norm(R @ middle + t - middle)) / clouds.unit
     share = 100.0 * float(np.mean(clouds._replace(mine=clouds.mine @ R.T + t).distances_pct() <= NEAR_PCT))
     turned = "rotation by which ICP still turns our cloud after the similarity"
-    near = "share of our points with a partner after ICP"
+    near = f"share of our points with a partner after ICP; below {FEW_PCT:g} % its motion says nothing"
+    inliers = row(scene, f"ICP to {name}: inliers", "%", share, near, more=True)
+    if share < FEW_PCT:
+        return [inliers]
     return [
         row(scene, f"ICP to {name}: turn", "deg", turn, turned),
         _distance(scene, f"ICP to {name}: shift", shift, "shift of the cloud centre"),
-        row(scene, f"ICP to {name}: inliers", "%", share, near, more=True),
+        inliers,
     ]
 
 
@@ -210,8 +214,10 @@ def _plot(name: str, clouds: Clouds) -> Plot:
     """Plot both clouds: ours coloured by the distance to theirs, theirs grey."""
     low, high = np.quantile(clouds.mine, [0.02, 0.98], axis=0)
     margin = 0.3 * (high - low).max()
-    shades = _thinned(clouds.distances_pct()).round(3).tolist()
-    scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "showscale": True}
+    apart = clouds.distances_pct()
+    most = float(np.quantile(apart, 0.9))
+    shades = _thinned(apart).round(3).tolist()
+    scale = {"colorscale": "Viridis", "cmin": 0.0, "cmax": most, "showscale": True}
     bar = {"colorbar": {"title": {"text": "% of distance"}}}
     traces = [
         _trace("ours", clouds.mine, {"size": 2, "color": shades, **scale, **bar}),
@@ -221,8 +227,13 @@ def _plot(name: str, clouds: Clouds) -> Plot:
         f"{axis}axis": {"range": [float(low[k] - margin), float(high[k] + margin)], "visible": False}
         for k, axis in enumerate("xyz")
     }
-    layout = {"scene": {"aspectmode": "data", **axes}, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}}
-    text = "Ours is coloured by the distance of each point to the nearest of theirs; drag to turn."
+    # The legend below, apart from the colour bar and the buttons.
+    places = {"legend": {"orientation": "h", "y": 0}, "margin": {"l": 0, "r": 0, "t": 36, "b": 30}}
+    layout = {"scene": {"aspectmode": "data", **axes}, **places}
+    text = (
+        "Ours is coloured by the distance of each point to the nearest of theirs, "
+        f"up to {number(most)} % for the farthest tenth; drag to turn."
+    )
     return Plot(f"Ours and {name}", {"data": traces, "layout": layout}, text)
 
 

@@ -13,8 +13,9 @@ from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.errors import UsageError
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.records import FundamentalFit
-from validation.ablation import Measure, Study, ablate, analyse
+from validation.ablation import Measure, Study, ablate, analyse, read_rows
 from validation.ablation.plan import STUDIES, plan_study, read_study, study_from_table, versions
+from validation.command import main
 
 
 def darts(axes, **more):
@@ -150,7 +151,14 @@ def write_examples(folder):
 
 
 def test_the_example_of_the_documentation_runs(tmp_path):
-    rows = ablate(read_study(write_examples(tmp_path)), tmp_path / "out", executor="local", threads=1)
+    """25 lines of one's own lead to a table in LaTeX and a figure as PDF."""
+    study = write_examples(tmp_path)
+    lines = [line for path in tmp_path.iterdir() for line in path.read_text("utf-8").splitlines() if line]
+    assert len(lines) + len(["the command"]) <= 25
+    assert main(["ablate", str(study), "-o", str(tmp_path / "out"), "--executor", "local"]) == 0
+    assert r"\toprule" in (tmp_path / "out" / "tables.tex").read_text(encoding="utf-8")
+    assert (tmp_path / "out" / "figures" / "distance-px-over-outliers.pdf").is_file()
+    rows = read_rows(read_study(study), tmp_path / "out")
     assert not [r.failure for r in rows if r.failure]
     verdicts = {(c.variant, c.condition): c.verdict for c in analyse(rows).comparisons}
     assert [v.name for v in rows.plan.variants] == ["default", "EveryMatch", "EveryMatch, normalized = no"]

@@ -11,9 +11,11 @@ import pytest
 import thesisrecon
 from tests.conftest import refuses
 from thesisrecon.config import PipelineConfig, preset
+from thesisrecon.epipolar.ransac import ThesisRansac
+from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure, UsageError
 from validation.ablation import Place, Study, ablate
-from validation.ablation.plan import plan_study
+from validation.ablation.plan import plan_study, study_from_table
 from validation.ablation.tasks import Reconstruction
 from validation.ablation.tasks.images import (
     ImagePairs,
@@ -22,12 +24,28 @@ from validation.ablation.tasks.images import (
     numbers_of_pair,
     read_pair,
 )
+from validation.ablation.tasks.searches import ESTIMATORS, RobustSearch
 from validation.ablation.tasks.synthetic import FundamentalOfCube, TriangulationOverNoise
+from validation.metrics.searches import traced
 from validation.scenes import stereo as stereo_scenes
 from validation.scenes.real import ROOT, write_png
+from validation.scenes.two_views import make_two_views
 
 CONFIG = PipelineConfig()
 NOWHERE = Place(Path(), Path())
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory):
+    """Three photographs of the courtyard, with their cameras."""
+    folder, source = tmp_path_factory.mktemp("yard"), ROOT / "fixtures" / "courtyard"
+    (folder / "images").mkdir()
+    reported = json.loads((source / "cameras.json").read_text(encoding="utf-8"))
+    cameras = {"cameras": reported["cameras"][4:7]}
+    for camera in cameras["cameras"]:
+        shutil.copy(source / "images" / camera["name"], folder / "images" / camera["name"])
+    (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
+    return folder
 
 
 def test_exact_points_have_an_exact_fundamental_matrix():
@@ -87,26 +105,79 @@ def test_a_yard_is_matched_whole_and_in_windows_of_its_rows(tmp_path, monkeypatc
 def test_pairs_of_a_scene_are_one_value_and_a_wrong_F_is_a_failure():
     task = ImagePairs(gap=2)
     assert {task.scene_of(f"courtyard/{i}") for i in (0, 4)} == {"courtyard"}
-    images, truth = read_pair("courtyard", 4, 2)
-    views = [CONFIG.matching.prepare(image, CONFIG.features.detect(image)) for image in images]
-    found = numbers_of_pair(CONFIG, views, (4, 6), 0, truth)
-    assert [image.name for image in images] == ["0004.jpg", "0006.jpg"]
+    pair = read_pair("courtyard/4", 2)
+    views = [CONFIG.matching.prepare(image, CONFIG.features.detect(image)) for image in pair.images]
+    found = numbers_of_pair(CONFIG, views, pair, 0)
+    assert [image.name for image in pair.images] == ["0004.jpg", "0006.jpg"]
     assert found["verified"] > 500
     assert found["error_px"] < 0.1
-    refuses(StageFailure, "F is wrong", numbers_of_pair, CONFIG, views, (4, 6), 0, truth[:, [0, 1, 2, 0]])
+    assert found["precision_pct"] > 95.0
+    fewest = min(len(v.features.xy) for v in views)
+    right = found["precision_pct"] * found["verified"]
+    assert found["matching_score_pct"] == pytest.approx(right / fewest)
+    assert found["auc5_pct"] > 95.0
+    spoiled = pair._replace(truth=pair.truth[:, [0, 1, 2, 0]])
+    refuses(StageFailure, "F is wrong", numbers_of_pair, CONFIG, views, spoiled, 0)
+    # Without F: the pose counts as wrong, the distance as the largest.
+    few = replace(CONFIG, epipolar=replace(CONFIG.epipolar, threshold_px=1e-9))
+    none = numbers_of_pair(few, views, pair, 0, strict=False)
+    assert (none["error_px"], none["auc20_pct"], none["precision_pct"]) == (99.0, 0.0, 0.0)
 
 
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory):
-    """Three photographs of the courtyard, with their cameras."""
-    folder, source = tmp_path_factory.mktemp("yard"), ROOT / "fixtures" / "courtyard"
-    (folder / "images").mkdir()
-    reported = json.loads((source / "cameras.json").read_text(encoding="utf-8"))
-    cameras = {"cameras": reported["cameras"][4:7]}
-    for camera in cameras["cameras"]:
-        shutil.copy(source / "images" / camera["name"], folder / "images" / camera["name"])
-    (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
-    return folder
+def test_pairs_of_a_folder_are_listed_and_judged_at_any_size(yard, tmp_path):
+    (yard / "pairs.txt").write_text("0004.jpg 0006.jpg\n0005.jpg 0004.jpg\n", encoding="utf-8")
+    task = ImagePairs(gap=1)
+    assert task.expand(f"{yard}/*") == [f"{yard}/0", f"{yard}/1"]
+    study = Study({}, [f"{yard}/pairs.txt", f"{yard}/0"], task=task)
+    scenes = [row.scene for row in plan_study(study).rows]
+    assert scenes == [f"{yard}/0004.jpg+0006.jpg", f"{yard}/0005.jpg+0004.jpg", f"{yard}/0"]
+    whole, half = (read_pair(scenes[0], 1, size) for size in (1536, 300))
+    assert half.images[0].size[0] == 300
+    scale = half.images[0].scale / whole.images[0].scale
+    np.testing.assert_allclose(half.truth + 0.5, scale * (whole.truth + 0.5), rtol=1e-12)
+    found = replace(task, max_size_px=300).run(CONFIG, scenes[0], 0, NOWHERE)
+    assert found["error_px"] < 0.3
+    before = task.scene_key(scenes[0])
+    moved = json.loads((yard / "cameras.json").read_text(encoding="utf-8"))
+    other = tmp_path / "moved"
+    shutil.copytree(yard, other)
+    moved["cameras"][0]["t"][0] += 0.01
+    (other / "cameras.json").write_text(json.dumps(moved), encoding="utf-8")
+    assert task.scene_key(f"{other}/0004.jpg+0006.jpg") != before, "the truth is part of the content"
+    refuses(UsageError, "unknown image of .* '0004.png'", task.check, f"{yard}/0004.png+0006.jpg")
+    refuses(UsageError, "or a list of pairs", task.check, f"{yard}/none.txt")
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_search_is_judged_by_samples_and_by_time(estimator):
+    """The trace ends at the estimator's result, and its cost falls."""
+    task = RobustSearch(estimator=estimator, outliers=0.5, matches=300)
+    end = task.run(CONFIG, "two views", 0, NOWHERE)
+    assert end["error_px"] < 1.0
+    costs = []
+    for samples in (70, 10**9):
+        found = replace(task, after_samples=samples).run(CONFIG, "two views", 0, NOWHERE)
+        assert found["samples"] <= samples
+        costs.append(found["cost"])
+    assert costs[0] >= costs[1] == end["cost"]
+    assert found["error_px"] == end["error_px"]
+    late = replace(task, after_ms=1e6).run(CONFIG, "two views", 0, NOWHERE)
+    assert late["error_px"] == end["error_px"]
+    refuses(StageFailure, "no model yet", replace(task, after_samples=1).run, CONFIG, "two views", 0, NOWHERE)
+
+
+def test_the_trace_of_the_thesis_falls_and_nothing_is_watched_outside():
+    rng = np.random.default_rng(0)
+    views = make_two_views(Configuration.GENERAL, 100, rng)
+    method = ThesisRansac(samples=50)
+    with traced() as trace:
+        method.estimate(views.xy1, views.xy2, np.random.default_rng(1))
+    assert [s.samples for s in trace.steps] == sorted(s.samples for s in trace.steps)
+    costs = [s.cost for s in trace.steps]
+    assert costs
+    assert costs == sorted(costs, reverse=True)
+    method.estimate(views.xy1, views.xy2, np.random.default_rng(1))
+    assert len(trace.steps) == len(costs)
 
 
 def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path):
@@ -124,6 +195,14 @@ def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path
         str(yard): ["focal_error_pct", "points"],
         str(bare): ["points"],
     }
+
+
+def test_sizes_and_lists_of_pairs_of_a_reconstruction_are_settings(yard):
+    listed = {"kind": "listed-pairs", "listed": [["0004.jpg", "0005.jpg"]]}
+    axes = {"images.max_size_px": [300], "pairs": ["all-pairs", listed]}
+    rows = plan_study(study_from_table({"scenes": [str(yard)], "axes": axes})).rows
+    assert rows[1].setting.config.images.max_size_px == 300
+    assert rows[3].setting.config.pairs.listed == (("0004.jpg", "0005.jpg"),)
 
 
 def test_a_reconstruction_in_a_study_is_the_one_outside(yard, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from validation.ablation.tasks.images import ImagePairs, RectifiedPairs
 from validation.ablation.tasks.reconstruction import Reconstruction
+from validation.ablation.tasks.searches import RobustSearch
 from validation.ablation.tasks.synthetic import (
     CalibrationOverNoise,
     FundamentalOfCube,
@@ -16,6 +17,7 @@ __all__ = ["TASKS", "Reconstruction"]
 TASKS: dict[str, type] = {
     "reconstruction": Reconstruction,
     "pairs": ImagePairs,
+    "search": RobustSearch,
     "fundamental": FundamentalOfCube,
     "triangulation": TriangulationOverNoise,
     "self-calibration": CalibrationOverNoise,

@@ -2,108 +2,189 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, resizing_transform
+from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.relative_pose import pose_in_front
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
+from thesisrecon.io._files import read_pairs
 from thesisrecon.io._images import read_images
 from thesisrecon.pipeline.matching import match_views
-from thesisrecon.records import Image
+from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
+from validation.ablation.tasks.reconstruction import POSE_MEASURES, content_key, scene_or_folder
 from validation.metrics.depth import bad_pixels
 from validation.metrics.fundamental_precision import RIGHT_PX, rms_epipolar_distance
-from validation.scenes.many_views import load_yard, yard_number
-from validation.scenes.real import Scene, load_scene
-from validation.scenes.real_pairs import CACHE, SCENES_WITH_CAMERAS, camera_pairs
+from validation.metrics.poses import pose_scores_pct, relative_pose_errors
+from validation.scenes.many_views import yard_number
+from validation.scenes.real import Scene
+from validation.scenes.real_pairs import CONSISTENT_PX, SCENES_WITH_CAMERAS, camera_pair
 from validation.scenes.stereo import STEREO_PAIRS, StereoPair, load_stereo_pair
 
-MAX_SIZE_PX = 1536
 _SCENES = (*SCENES_WITH_CAMERAS, "courtyard")
 
 
 @dataclass(frozen=True)
 class ImagePairs(Task):
-    """Images ``i`` and ``i + gap`` of the scene "NAME/i" (fountain-P11/3), long side at most 1536: corners,
-    matches, F and verification of the configuration, judged by correspondences of the true cameras. A row
-    whose F is wrong (error of 1 px and more) fails. The pairs of a scene are subsets of it. A yard (yard-1/0)
-    has its images in the order of their cameras.
+    """Two images of a scene, a yard (yard-1) or a folder with true cameras: "NAME/3", which is image 3 with
+    image 3 + ``gap`` in the order of their names (of a yard, of its cameras), or "NAME/a.jpg+b.jpg". "NAME/*"
+    means all pairs of this gap, "NAME/LIST" those of a text file of the folder, two names a line. The long
+    side is at most ``max_size_px``. Corners, matches, F and verification of the configuration are judged by
+    correspondences of the true cameras. A row whose F is wrong (error of 1 px and more) fails; if not
+    ``strict`` it counts with its error, 99 px at most, and without F as a wrong pose. The pairs of a scene
+    are subsets of it.
     """
 
     gap: int = 2
+    max_size_px: int = 1536
+    strict: bool = True
 
     measures: ClassVar[Sequence[Measure]] = (
         Measure("verified", "", "more", True, "inliers of F"),
         Measure("error_px", "px", "less", True, "RMS distance of true correspondences to their lines"),
         Measure("sigma_px", "px", "less", True, "noise of the inliers"),
-    )
+        Measure(
+            "precision_pct", "%", "more", False,
+            f"verified matches within {CONSISTENT_PX:g} px of the true epipolar geometry", extra=True,
+        ),
+        Measure(
+            "matching_score_pct", "%", "more", False,
+            "the same matches over the features of the image with fewer of them", extra=True,
+        ),
+        *POSE_MEASURES,
+    )  # fmt: skip
 
     def names_of_scenes(self) -> Sequence[str]:
-        return [f"{name}/0" for name in (*_SCENES, "yard-1")]
+        return [*(f"{name}/0" for name in (*_SCENES, "yard-1")), "FOLDER/*", "FOLDER/a.jpg+b.jpg"]
 
     def scene_of(self, scene: str) -> str:
         return scene.rpartition("/")[0]
 
+    def expand(self, scene: str) -> Sequence[str]:
+        name, _, which = scene.rpartition("/")
+        if which == "*":
+            return [f"{name}/{i}" for i in range(len(_scene_of_pairs(name).image_paths) - self.gap)]
+        if Path(scene).is_file():
+            return [f"{name}/{'+'.join(pair)}" for pair in read_pairs(Path(scene))]
+        return [scene]
+
     def check(self, scene: str) -> None:
-        name, _, first = scene.rpartition("/")
-        if not (name in _SCENES or yard_number(name) is not None) or not first.isdecimal():
-            raise UsageError(unknown_word("pair", scene, [f"{s}/0" for s in _SCENES]))
-        found = _load(name)
-        if found is None:
-            raise UsageError(f"the images of {name} are not on this machine (THESISRECON_DATA)")
-        if int(first) + self.gap >= len(found.image_paths):
-            raise UsageError(f"{name} has {len(found.image_paths)} images: there is no pair {scene}")
+        pair_of(scene, self.gap)
+
+    def scene_key(self, scene: str) -> str:
+        return content_key(*pair_of(scene, self.gap))
+
+    def unavailable(self, scene: str) -> Collection[str]:
+        return () if self.strict else ("sigma_px",)
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
-        name, _, first = scene.rpartition("/")
-        i = int(first)
-        images, truth = read_pair(name, i, self.gap)
-        views = [config.matching.prepare(image, config.features.detect(image)) for image in images]
-        return numbers_of_pair(config, views, (i, i + self.gap), seed, truth)
+        pair = read_pair(scene, self.gap, self.max_size_px)
+        views = [config.matching.prepare(image, config.features.detect(image)) for image in pair.images]
+        return numbers_of_pair(config, views, pair, seed, strict=self.strict)
+
+
+class TruePair(NamedTuple):
+    """Two images at working size, their numbers, true correspondences (M, 4) px, and the true cameras K, R
+    (2, 3, 3) and centres C (2, 3).
+    """
+
+    images: tuple[Image, ...]
+    numbers: tuple[int, int]
+    truth: F64
+    K: F64
+    R: F64
+    C: F64
 
 
 def numbers_of_pair(
-    config: PipelineConfig, views: Sequence[Any], pair: tuple[int, int], seed: int, truth: F64
+    config: PipelineConfig, views: Sequence[Any], pair: TruePair, seed: int, *, strict: bool = True
 ) -> dict[str, float]:
-    """Measure two prepared views against true correspondences (M, 4) px."""
-    view = match_views(config, views[0], views[1], pair, seed)
-    if not view.F.any():
+    """Measure two prepared views against the truth."""
+    view = match_views(config, views[0], views[1], pair.numbers, seed)
+    error_px = rms_epipolar_distance(view.F, pair.truth)
+    if strict and not view.F.any():
         raise StageFailure("the pair has no F", view.reason)
-    error_px = rms_epipolar_distance(view.F, truth)
-    if error_px >= RIGHT_PX:
+    if strict and error_px >= RIGHT_PX:
         raise StageFailure("F is wrong", f"its error is {error_px:.1f} px, with {view.inliers} inliers")
-    return {"verified": float(view.inliers), "error_px": error_px, "sigma_px": float(view.sigma_px)}
+    P1, P2 = compose_camera(pair.K, pair.R, -np.einsum("vab,vb->va", pair.R, pair.C))
+    distance = np.abs(sampson_residuals(fundamental_from_cameras(P1, P2), view.xy1, view.xy2))
+    right = float(np.sum(distance < CONSISTENT_PX))
+    fewest = min(len(prepared.features.xy) for prepared in views)
+    return {
+        "verified": float(view.inliers),
+        "error_px": error_px,
+        "sigma_px": float(view.sigma_px),
+        "precision_pct": 100.0 * right / max(view.inliers, 1),
+        "matching_score_pct": 100.0 * right / max(fewest, 1),
+        **pose_scores_pct(_pose_error(view, pair)),
+    }
+
+
+def _pose_error(view: TwoView, pair: TruePair) -> F64:
+    """Error (1,) of the relative pose of F and the true K, degrees; infinite without F."""
+    R, C = np.full((2, 3, 3), np.nan), np.full((2, 3), np.nan)
+    if view.F.any():
+        rays = [
+            homogenize(xy) @ np.linalg.inv(K).T for xy, K in zip((view.xy1, view.xy2), pair.K, strict=True)
+        ]
+        turn, t, _ = pose_in_front(pair.K[1].T @ view.F @ pair.K[0], *rays)
+        R[:], C[:] = [np.eye(3), turn], [np.zeros(3), -turn.T @ t]
+    return relative_pose_errors(R, C, pair.R, pair.C)
+
+
+def pair_of(scene: str, gap: int) -> tuple[Scene, tuple[int, int]]:
+    """The scene of a pair and the numbers of its images; :class:`UsageError` if one is not there."""
+    name, _, which = scene.rpartition("/")
+    found = _scene_of_pairs(name)
+    count, number = len(found.image_paths), {path.name: n for n, path in enumerate(found.image_paths)}
+    if which.isdecimal():
+        i, j = int(which), int(which) + gap
+        if j >= count:
+            raise UsageError(f"{name} has {count} images: there is no pair {scene}")
+    else:
+        names = which.split("+")
+        if len(names) != 2:
+            raise UsageError(f"a pair is {name}/0, {name}/a.jpg+b.jpg or a list of pairs; got {scene}")
+        if unknown := [one for one in names if one not in number]:
+            raise UsageError(unknown_word(f"image of {name}", unknown[0], number))
+        i, j = (number[one] for one in names)
+    if not found.known[[i, j]].all() or not np.isfinite(found.cameras_of((i, j))[0]).all():
+        raise UsageError(f"the true cameras of the pair {scene} are not known")
+    return found, (i, j)
 
 
 @lru_cache(maxsize=8)
-def _load(name: str) -> Scene | None:
-    yard = yard_number(name)
-    if yard is None:
-        return load_scene(name)
-    scene = load_yard(yard)
-    K, R, C = scene.cameras
-    order = np.argsort(C[:, 0])
-    return Scene(name, tuple(scene.image_paths[k] for k in order), K[order], R[order], C[order])
+def _scene_of_pairs(name: str) -> Scene:
+    scene = scene_or_folder(name)
+    if yard_number(name) is None:
+        return scene
+    order = np.argsort(scene.cameras[2][:, 0])
+    return Scene(name, tuple(scene.image_paths[k] for k in order), *(part[order] for part in scene.cameras))
 
 
 @lru_cache(maxsize=16)
-def read_pair(name: str, i: int, gap: int) -> tuple[tuple[Image, ...], F64]:
-    """Both images and correspondences (M, 4) px of the true cameras."""
-    scene = _load(name)
-    assert scene is not None
+def read_pair(scene: str, gap: int, max_size_px: int = 1536) -> TruePair:
+    """Both images of a pair with their truth at working size."""
+    whole, (i, j) = pair_of(scene, gap)
     # One by one: several are sorted by name.
-    paths = scene.image_paths[i], scene.image_paths[i + gap]
-    images = tuple(read_images([path], max_size_px=MAX_SIZE_PX).images[0] for path in paths)
-    truths = [pair.truth for pair in camera_pairs(scene, CACHE, (gap,))]
-    truth = truths[i]
+    images = tuple(read_images([whole.image_paths[k]], max_size_px=max_size_px).images[0] for k in (i, j))
+    truth = camera_pair(whole, i, j).truth
     assert truth is not None
-    return images, np.asarray(truth)
+    scale = np.repeat([image.scale for image in images], 2)
+    K, R, C = whole.cameras_of((i, j))
+    smaller = np.stack([resizing_transform(image.scale) for image in images])
+    return TruePair(images, (i, j), (truth + 0.5) * scale - 0.5, smaller @ K, R, C)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 import thesisrecon
 from thesisrecon._numba import code_digest
+from thesisrecon.arrays import resizing_transform
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import UsageError, unknown_word
@@ -19,7 +20,14 @@ from thesisrecon.pipeline.run import Until
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
-from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
+from validation.metrics.cameras import (
+    TrueCameras,
+    measure_cameras,
+    measure_intrinsics,
+    measure_reprojection,
+    pose_pair_errors,
+)
+from validation.metrics.poses import AUC_DEG, pose_scores_pct
 from validation.runs.records import IMAGE_SCENES, ReportOptions, load_images
 from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene
@@ -32,18 +40,25 @@ SETTINGS_OF: Mapping[str, tuple[str, ...]] = {
     "dense": ("dense",),
     "model": ("model",),
 }  # The settings that each step adds to those before it
-NEED_TRUTH = ("focal_error_pct", "centre_error_mm", "rotation_error_deg")
+POSE_MEASURES = tuple(
+    Measure(name, "%", "more", False, about, extra=True)
+    for name, about in {
+        **{f"auc{at:g}_pct": f"AUC of relative poses up to {at:g} degrees" for at in AUC_DEG},
+        "maa_pct": "mean recall of relative poses at 1, 2 ... 10 degrees",
+    }.items()
+)
+NEED_POSES = ("centre_error_mm", "rotation_error_deg", *(m.name for m in POSE_MEASURES))
 AVAILABLE_FROM: Mapping[str, tuple[str, ...]] = {
     "matches": ("verified", "sigma_px"),
     "projective": ("registered_pct", "points"),
-    "metric": ("reprojection_px", "trusted", *NEED_TRUTH),
+    "metric": ("reprojection_px", "trusted", "focal_error_pct", *NEED_POSES),
 }  # The first step after which a number is known
 
 
 @dataclass(frozen=True)
 class Reconstruction(Task):
     """:func:`thesisrecon.reconstruct` up to and with ``until``, on one thread. A scene is one with a name, or
-    a folder of images with ``cameras.json`` or ``sparse/0`` as its truth if there is one. "NAME#k/n" is a
+    a folder of images with true cameras of any format, or K.txt, if there are any. "NAME#k/n" is a
     subset: the k-th of n windows of two thirds of the images, in the order of their names. "yard-N" is a
     rendered yard with true cameras, another one for each number.
     """
@@ -60,6 +75,7 @@ class Reconstruction(Task):
         Measure("verified", "", "more", True, "verified matches of all accepted pairs"),
         Measure("sigma_px", "px", "less", True, "median noise of the accepted pairs"),
         Measure("trusted", "", "more", False, "1: the result passed its own check"),
+        *POSE_MEASURES,
     )
 
     def __post_init__(self) -> None:
@@ -76,13 +92,11 @@ class Reconstruction(Task):
         return window_names(scene, count)
 
     def check(self, scene: str) -> None:
-        _load(scene)
+        scene_or_folder(scene)
 
     def scene_key(self, scene: str) -> str:
-        content = hashlib.sha256()
-        for path in _images(scene):
-            content.update(path.name.encode() + path.read_bytes())
-        return content.hexdigest()[:32]
+        whole = scene_or_folder(scene)
+        return content_key(whole, range(len(whole.image_paths))[window_slice(scene, len(whole.image_paths))])
 
     def unavailable(self, scene: str) -> set[str]:
         """Return the measures that need missing true cameras or a later step."""
@@ -91,7 +105,9 @@ class Reconstruction(Task):
         found = {
             name for step, names in AVAILABLE_FROM.items() if reached < steps.index(step) for name in names
         }
-        return found | set(NEED_TRUTH) if _load(scene).truth is None else found
+        whole = scene_or_folder(scene)
+        unknown = {"focal_error_pct"} if whole.K is None else set()
+        return found | (unknown if whole.truth is not None else {*unknown, *NEED_POSES})
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
         """A step is named by all settings up to it; corners alone do not depend on the seed."""
@@ -112,7 +128,7 @@ class Reconstruction(Task):
 
     def run(self, config: PipelineConfig, scene: str, seed: int, place: Place) -> Mapping[str, float]:
         result = _reconstruct(config, scene, seed, place, self.until)
-        return _measured(result, _load(scene), len(_images(scene)))
+        return _measured(result, scene_or_folder(scene), len(_images(scene)))
 
 
 def _reconstruct(config: PipelineConfig, scene: str, seed: int, place: Place, until: str) -> RunResult:
@@ -120,12 +136,22 @@ def _reconstruct(config: PipelineConfig, scene: str, seed: int, place: Place, un
     return thesisrecon.reconstruct(_images(scene), place.own, **given)
 
 
+def content_key(scene: Scene, views: Sequence[int]) -> str:
+    """Digest of some images of a scene and of their truth."""
+    content = hashlib.sha256()
+    for path in (scene.image_paths[k] for k in views):
+        content.update(path.name.encode() + path.read_bytes())
+    for part in () if scene.K is None else scene.cameras_of(views):
+        content.update(np.ascontiguousarray(part).tobytes())
+    return content.hexdigest()[:32]
+
+
 def _images(scene: str) -> tuple[Path, ...]:
-    paths = _load(scene).image_paths
+    paths = scene_or_folder(scene).image_paths
     return paths[window_slice(scene, len(paths))]
 
 
-def _load(scene: str) -> Scene:
+def scene_or_folder(scene: str) -> Scene:
     """The images of a whole scene by its name or its folder; :class:`UsageError` if there are none."""
     scene = window_parts(scene)[0]
     yard = yard_number(scene)
@@ -158,22 +184,20 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
     found["reprojection_px"] = measure_reprojection(model).median_px
     if truth is None:
         return found
+    found["focal_error_pct"] = measure_intrinsics(model, truth[0])[0]
+    if scene.truth is None:
+        return found
+    found |= pose_scores_pct(pose_pair_errors(model, truth))
     errors = measure_cameras(model, truth)
-    found["focal_error_pct"] = errors.focal_error_pct
     found["rotation_error_deg"] = errors.rotation_error_deg
     found["centre_error_mm"] = np.nan if errors.centre_error_mm is None else errors.centre_error_mm
     return found
 
 
 def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
-    if scene.truth is None:
+    if scene.K is None:
         return None
     number = {path.name: n for n, path in enumerate(scene.image_paths)}
     chosen = [number[image.name] for image in result.images]
-    K, R, C = (part[chosen] for part in scene.truth)
-    scale = np.array([image.scale for image in result.images])[:, None, None]
-    # Pixel centres are whole numbers: (x + 0.5) s - 0.5.
-    K[:, :2, 2] += 0.5
-    K[:, :2] *= scale
-    K[:, :2, 2] -= 0.5
-    return K, R, C
+    K, R, C = scene.cameras_of(chosen)
+    return np.stack([resizing_transform(image.scale) for image in result.images]) @ K, R, C
