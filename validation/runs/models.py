@@ -65,7 +65,10 @@ def report_models(models: Mapping[str, Path], reference: tuple[str, Path], out: 
     if one cannot be read or has no camera in common with the reference.
     """
     compared = [_compared(name, path, reference) for name, path in models.items()]
-    metrics = {part: [*make(compared)] for part, make in (("cameras", _of_cameras), ("model", _of_models))}
+    metrics = {
+        part: [m for m in make(compared) if any(value is not None for value in m.values.values())]
+        for part, make in (("cameras", _of_cameras), ("model", _of_models))
+    }
     plots = _plots(compared)
     first = compared[0].name
     with join_claim(out):
@@ -186,7 +189,7 @@ def _of_models(compared: Sequence[Compared]) -> list[Metric]:
         }
         about, unit = "median distance to the nearest point of the other model", "units of the reference"
         rows.append(row("models", f"points {name}, median", unit, apart, about, judged=first))
-    return [found for found in rows if any(value is not None for value in found.values.values())]
+    return rows
 
 
 def _of_model(model: SparseModel) -> dict[str, float]:
