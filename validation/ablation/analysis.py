@@ -405,6 +405,11 @@ class Curves(NamedTuple):
     lines: Mapping[str, tuple[Cell, ...]]
     log: bool
 
+    @property
+    def wide(self) -> bool:
+        """Whether the numbers of the condition want a logarithmic axis."""
+        return 0.0 < 20.0 * min(self.x) <= max(self.x)
+
 
 def curves_of(analysis: Analysis, measure: Measure) -> list[Curves]:
     """Curves over the condition with the most numbers, one set for each combination of the other ones."""

@@ -126,7 +126,7 @@ def _over_conditions(measure: Measure, curves: Curves) -> Plot:
         y = [_finite(c.mean) for c in cells]
         traces.append(scatter(name, curves.x, y, "lines+markers", line=line, error_y=errors))
     title = f"{measure.name} over {curves.title}"
-    layout: dict[str, Any] = {"height": 420}
+    layout: dict[str, Any] = {"height": 420, "xaxis": LOGARITHMIC if curves.wide else {}}
     yaxis = LOGARITHMIC if curves.log else {}
     return plot(title, traces, curves.axis, with_unit(measure.name, measure.unit), yaxis=yaxis, **layout)
 

@@ -155,6 +155,8 @@ def _curves(make: Any, measure: Measure, curves: Curves) -> Any:
         axes.errorbar(x, y, spread, fmt="o", linestyle=style, label=name, color=f"C{k % 8}", capsize=1.5)
     if curves.log:
         axes.set_yscale("log")
+    if curves.wide:
+        axes.set_xscale("log")
     axes.set_xlabel(curves.axis)
     axes.set_ylabel(with_unit(measure.name, measure.unit))
     figure.legend(loc="outside lower center", ncols=2, frameon=False)

@@ -10,6 +10,7 @@ import os
 import platform
 import re
 import subprocess
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -157,7 +158,8 @@ def plot(title: str, traces: list[dict[str, Any]], x: str, y: str, caption: str 
     below the plot, the buttons are above it.
     """
     for axis, text in (("xaxis", x), ("yaxis", y)):
-        usual = {"title": {"text": text}, "automargin": True, "zeroline": axis == "yaxis"}
+        name = {"text": "<br>".join(textwrap.wrap(text, 34)), "font": {"size": 12}}
+        usual = {"title": name, "automargin": True, "zeroline": axis == "yaxis"}
         layout[axis] = usual | layout.get(axis, {})
         if layout[axis].get("type") == "log":
             layout[axis] |= log_ticks([v for trace in traces for v in _reach(trace, axis[0])])
