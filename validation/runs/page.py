@@ -80,13 +80,13 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> dict[str, Any]:
     numbers = counted(len(rows), "number")
     if not judged and not missing:
         sentence = f"{numbers} reported, none with a limit."
-        return {"level": "open", "word": "Nothing promised here", "sentence": sentence}
+        return {"level": "open", "word": "Nothing promised here", "sentence": sentence, "reasons": ()}
     summary = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
     reasons = [f"{r.key}: {number(r.value)} {r.unit}, {r.direction} {number(r.limit)}" for r in broken]
     reasons += [f"{key}: no method reported this number" for key in missing]
     if reasons:
         return {"level": "bad", "word": "Broken", "sentence": f"{summary}.", "reasons": reasons}
-    return {"level": "good", "word": "Reached", "sentence": f"{summary}; {numbers} in all."}
+    return {"level": "good", "word": "Reached", "sentence": f"{summary}; {numbers} in all.", "reasons": ()}
 
 
 EMPTY: dict[str, Any] = {"rows": (), "references": (), "plots": (), "pictures": (), "notes": ()}

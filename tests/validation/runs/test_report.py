@@ -18,9 +18,9 @@ from thesisrecon.errors import STRICT_VARIABLE
 from validation.command import main
 from validation.references.libraries import NAMES, PACKAGES, NoReference, load
 from validation.runs.page import write_pages
-from validation.runs.records import ReportOptions
+from validation.runs.records import Judgement, ReportOptions
 from validation.runs.report import run_tasks
-from validation.runs.results import Gate, Row, collect, read_gates, write_results
+from validation.runs.results import Gate, Results, Row, collect, read_gates, write_results
 from validation.scenes.real import ROOT
 from validation.studies.robustness import stopped
 
@@ -159,6 +159,19 @@ def test_a_ratio_above_one_is_always_worse(value, reference, direction, expected
     one = Row("a/b/c", "b", "c", value, "px", direction, None, reference, "", "reported")
     assert one.ratio == expected
     assert dataclasses.replace(one, ranked=False).ratio is None
+
+
+@pytest.mark.parametrize("limit", [None, 3.0])
+def test_pages_without_limits_and_with_all_reached_are_written(limit, tmp_path):
+    """Such a verdict has no reasons."""
+    verdict = "reported" if limit is None else "reached"
+    one = Row("toy/yard/c", "yard", "c", 2.0, "px", "at most", limit, {"COLMAP": 4.0}, "", verdict)
+    options = toy_options(tmp_path, quick=True)
+    results = Results([one], [], {}, {"commit": "none"}, options.to_json())
+    page = write_pages(options, STAGES, {("toy", "yard"): (Judgement([]), {})}, results)
+    word = "Nothing promised here" if limit is None else "Reached"
+    for path in (page, tmp_path / "scene-yard.html"):
+        assert f'<p class="word">{word}</p>' in path.read_text(encoding="utf-8")
 
 
 MISSING = "raise ModuleNotFoundError(\"No module named '{0}'\", name='{0}')"
