@@ -3,7 +3,8 @@
 Draws random faults from all single changes in the functions of a package: an operator, comparison, condition,
 number, opposite function, or removed statement. Each is planted in a copy of the tree. The tests of its
 package run first, then those of modules that import it. OUT gets ``mutants.md`` and ``mutants.json``; the
-exit code is 1 if fewer than 85 % are caught. ``--again`` repeats the uncaught faults of OUT.
+exit code is 1 if fewer than 85 % are caught. ``--again`` repeats the uncaught faults of OUT. ``--list FILE``
+plants the named faults of a TOML file instead, each judged by the tests and then the gates that it names.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 import re
 import shutil
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -32,7 +34,9 @@ from validation.runs.processes import own_cores, run_process
 from validation.runs.tables import text_table
 from validation.scenes.real import ROOT
 
+READ_CAMERAS = {"bundle", "clouds", "depth", "surface", "views"}  # Stages of models
 PACKAGES = ("geometry", "epipolar", "selfcalibration", "optimize")
+_FAILURES = ("FAILED", "ERROR", "missed")  # First words of pytest and of a check
 LIMIT_S, COLD_S = 420.0, 3600.0
 """Time limits of a test run (s), and of the one without a fault, when all kernels are compiled."""
 OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
@@ -58,16 +62,24 @@ OPPOSITES = {
 
 @dataclass(frozen=True)
 class Mutant:
-    """The fault ``number`` of ``file``: in ``line``, the code ``old`` becomes ``new``."""
+    """The fault ``number`` of ``file``: in ``line``, the code ``old`` becomes ``new``. A fault of a list has
+    a ``name`` and ``judges``: test files, and stage/scene of gates.
+    """
 
     file: str
     line: int
     old: str
     new: str
     number: int
+    name: str = ""
+    judges: tuple[str, ...] = ()
 
     def apply(self, text: str) -> str:
-        """Return the text with the fault, without comments."""
+        """Return the text with the fault, one drawn without comments."""
+        if self.name:
+            if text.count(self.old) != 1:
+                raise ValueError(f"the fault {self.name} replaces a text that {self.file} does not have once")
+            return text.replace(self.old, self.new)
         tree = ast.parse(text)
         next(itertools.islice(_faults(tree), self.number, None))
         return ast.unparse(tree)
@@ -179,6 +191,20 @@ def draw(root: Path, package: str, count: int, seed: int) -> list[Mutant]:
     return [everything[k] for k in sorted(chosen)]
 
 
+def read_faults(path: Path, names: Sequence[str] = ()) -> list[Mutant]:
+    """Read the faults of a list, or those of some ``names``."""
+    faults = []
+    for name, entry in tomllib.loads(path.read_text(encoding="utf-8")).items():
+        if not names or name in names:
+            file = f"thesisrecon/{entry['file']}"
+            line = (ROOT / file).read_text(encoding="utf-8").partition(entry["old"])[0].count("\n") + 1
+            given = file, line, entry["old"], entry["new"], 0, name, tuple(entry["judges"])
+            faults.append(Mutant(*given))
+    if unknown := sorted(set(names) - {fault.name for fault in faults}):
+        raise ValueError(f"{path} has no fault called {unknown[0]!r}")
+    return faults
+
+
 @dataclass(frozen=True)
 class Bench:
     """A copy of the library with its tests in the folder ``out``; one fault at a time is planted."""
@@ -229,18 +255,35 @@ class Bench:
     def run_tests(
         self, files: Sequence[str], name: str, *, limit_s: float = LIMIT_S
     ) -> tuple[int, float, str]:
-        """Return the exit code of pytest (99 on time-out), seconds and the first failed test."""
+        """Return the exit code of pytest (99 on time-out), seconds and the first failed test.
+
+        Of gates, stage/scene instead of files, those of ``check --quick``.
+        """
         log = self.out / "logs" / f"{name}.log"
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--tb=no"]
         command += ["-m", "not slow and not browser and not real", *files]
+        if not files[0].endswith(".py"):
+            # The gates of a stage alone may read the cameras.
+            stages, scenes = (sorted(set(part)) for part in zip(*(f.split("/") for f in files), strict=True))
+            stages += [s for s in ("cameras",) if {*stages} & READ_CAMERAS and s not in stages]
+            command = [sys.executable, "-m", "validation", "check", "--quick", "-o", str(self.out / "gates")]
+            command += ["--threads", "1", "--stages", *stages, "--scenes", *scenes]
         # The kernels outlive the copy.
         environment = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(self.out / "kernels")}
         environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         where: Any = {"cores": own_cores(), "environment": environment, "cwd": self.tree}
         process = run_process(command, log=log, limit_s=limit_s, **where)
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-        failed = [line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR")) and " " in line]
-        return 99 if process.timed_out else process.code, process.wall_s, failed[0] if failed else ""
+        failed = [
+            line.split()[1]
+            for line in lines
+            if line.startswith(("FAILED", "ERROR", "missed ")) and " " in line
+        ]
+        return (
+            99 if process.timed_out else process.code,
+            process.wall_s,
+            failed[0].rstrip(":") if failed else "",
+        )
 
 
 def _module(file: str) -> str:
@@ -250,8 +293,10 @@ def _module(file: str) -> str:
 def judge_all(bench: Bench, mutants: Sequence[Mutant]) -> Iterator[Verdict]:
     """Yield the verdict of each fault in order."""
     bench.set_up()
-    judges = {file: bench.judges(file) for file in dict.fromkeys(m.file for m in mutants)}
-    everything = sorted({test for lists in judges.values() for files in lists for test in files})
+    judges = {m: _named_judges(m) or bench.judges(m.file) for m in mutants}
+    everything = sorted(
+        {test for lists in judges.values() for files in lists for test in files if test.endswith(".py")}
+    )
     code, _, failed = bench.run_tests(everything, "sound", limit_s=COLD_S)
     if code:
         raise ValueError(f"{failed or 'a test'} fails or takes too long without any fault")
@@ -259,8 +304,8 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant]) -> Iterator[Verdict]:
         text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
         by, seconds = "", 0.0
         with bench.planted(mutant.file, text):
-            for files in judges[mutant.file]:
-                code, spent, failed = bench.run_tests(files, f"{number:03d}")
+            for files in judges[mutant]:
+                code, spent, failed = bench.run_tests(files, mutant.name or f"{number:03d}")
                 seconds += spent
                 if code not in (0, 5):
                     by = failed or ("time-out" if code == 99 else f"pytest ended with {code}")
@@ -268,10 +313,16 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant]) -> Iterator[Verdict]:
         yield Verdict(mutant, by, seconds)
 
 
+def _named_judges(mutant: Mutant) -> list[list[str]]:
+    tests = [judge for judge in mutant.judges if judge.endswith(".py")]
+    gates = [judge for judge in mutant.judges if judge not in tests]
+    return [files for files in (tests, gates) if files]
+
+
 def table(verdicts: Sequence[Verdict]) -> str:
     """Return Markdown: the score of each package, then every fault."""
     scores, faults = list[list[object]](), list[list[object]]()
-    for package in PACKAGES:
+    for package in sorted({Path(v.mutant.file).parts[1] for v in verdicts}):
         own = [bool(v.by) for v in verdicts if Path(v.mutant.file).parts[1] == package]
         if own:
             scores.append([package, len(own), sum(own), f"{100.0 * sum(own) / len(own):.0f} %"])
@@ -286,7 +337,9 @@ def table(verdicts: Sequence[Verdict]) -> str:
 def read_verdicts(path: Path) -> list[Verdict]:
     """Read the verdicts written by :func:`main`."""
     found = json.loads(path.read_text(encoding="utf-8"))
-    return [Verdict(Mutant(**one.pop("mutant")), **one) for one in found]
+    mutants = [one.pop("mutant") for one in found]
+    mutants = [Mutant(**m | {"judges": tuple(m.get("judges", ()))}) for m in mutants]
+    return [Verdict(mutant, **one) for mutant, one in zip(mutants, found, strict=True)]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -296,13 +349,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=PACKAGES)
     parser.add_argument("--sample", type=int, default=25, help="number of faults of each package")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--list", type=Path, metavar="FILE", help="own faults, as validation/faults.toml")
+    parser.add_argument("--names", nargs="+", default=(), help="some faults of the list (default: all)")
     parser.add_argument("--again", action="store_true", help="repeat the uncaught faults of OUT")
     parsed = parser.parse_args(arguments)
     results: dict[Mutant, Verdict] = {}
     if parsed.again:
         results = {v.mutant: v for v in read_verdicts(parsed.out / "mutants.json")}
         everything = {m for package in PACKAGES for m in mutants_of(ROOT, package)}
+        everything |= set(read_faults(parsed.list)) if parsed.list else set()
         mutants = [m for m, verdict in results.items() if not verdict.by and m in everything]
+    elif parsed.list:
+        mutants = read_faults(parsed.list, parsed.names)
     else:
         mutants = [m for package in parsed.packages for m in draw(ROOT, package, parsed.sample, parsed.seed)]
     try:

@@ -5,6 +5,7 @@ import pytest
 
 from tests.metric.metric_stage import refine, scatter, with_few_points, with_xy
 from tests.synthetic import make_scene
+from thesisrecon.metric import refinement
 from thesisrecon.metric._adjustment import tail_width
 from thesisrecon.metric._uncertainty import (
     FocalShrinkage,
@@ -16,14 +17,38 @@ from thesisrecon.metric._uncertainty import (
 )
 
 
-def test_deviations_are_of_the_stated_size_on_normal_noise():
-    deviations = []
-    for seed in range(8):
+def test_deviations_and_noise_are_of_the_stated_size_on_normal_noise():
+    deviations, noise = [], []
+    for seed in range(16):
         scene = make_scene(sigma_px=0.5, points=300, seed=seed, principal_shift=(5.0, -3.0))
-        found, K = refine(scene).intrinsics[0], scene.K[0]
+        result, K = refine(scene), scene.K[0]
         names = {"focal_px": K[0, 0], "principal_x_px": K[0, 2], "principal_y_px": K[1, 2]}
+        found = result.intrinsics[0]
         deviations += [(found[name].value - truth) / found[name].std for name, truth in names.items()]
-    assert 0.6 < np.sqrt(np.mean(np.square(deviations))) < 1.5
+        # Three unknowns of each point and six of each pose take their share of the residuals.
+        left = 1.0 - (3 * scene.tracks.n_points + 6 * scene.tracks.n_views) / (2 * len(scene.tracks.xy))
+        noise.append(result.reconstruction.sigma_px / 0.5 / np.sqrt(left))
+    # 48 squares of normal numbers: a standard error of 0.1.
+    assert 0.7 < np.sqrt(np.mean(np.square(deviations))) < 1.32
+    assert np.mean(noise) == pytest.approx(1.0, abs=0.04)
+
+
+def test_the_last_model_is_at_the_minimum_of_its_inliers_which_have_no_wrong_pixel(monkeypatch):
+    """The distance to the minimum is computed again, from what is returned."""
+    ends, finish, accepted = [], refinement.finish_metric, []
+    monkeypatch.setattr(refinement, "finish_metric", lambda *given: ends.append(finish(*given)) or ends[-1])
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        scene = make_scene(sigma_px=0.5, points=300, seed=seed)
+        xy, wrong = scene.tracks.xy.copy(), rng.random(len(scene.tracks.xy)) < 0.02
+        angle, off = rng.uniform(0.0, 2.0 * np.pi, wrong.sum()), 0.5 * rng.uniform(9.0, 13.0, wrong.sum())
+        xy[wrong] += off[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        inlier = refine(with_xy(scene, xy)).reconstruction.inlier
+        accepted.append(inlier[wrong].mean())
+        assert inlier[~wrong].mean() > 0.998
+        model, adjustment = ends[-1][:2]
+        assert adjustment.run(model, iterations=0, keep_noise=True)[1].sigmas_to_minimum < 0.02
+    assert np.mean(accepted) < 0.15
 
 
 def test_less_noise_is_a_narrower_interval_and_heavy_tails_bring_the_floor():

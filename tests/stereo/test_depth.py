@@ -47,6 +47,7 @@ def require_accurate(walled, maps, *, median=0.002, known=0.75):
     apart = np.concatenate([(maps[i].depth / walled.depth[i] - 1.0).ravel() for i in maps])
     error = np.abs(apart[np.isfinite(apart)])
     assert np.median(error) < median
+    assert abs(np.nanmedian(apart)) < 0.1 * median, "depths are biased"
     assert np.mean(error < 0.01) > 0.95
     assert len(error) > known * len(apart)
 

@@ -3,9 +3,14 @@
 import ast
 from pathlib import Path
 
+import pytest
+
 from validation import mutants
-from validation.mutants import Bench, Verdict, imports_of, mutants_of
+from validation.mutants import Bench, Verdict, imports_of, mutants_of, read_faults
+from validation.runs.results import read_gates
 from validation.scenes.real import ROOT
+
+LIST = ROOT / "validation" / "faults.toml"
 
 SOURCE = '''
 LIMIT = 3.0
@@ -77,3 +82,35 @@ def test_surviving_faults_are_tested_again_and_the_rest_is_kept(monkeypatch, tmp
     assert judged == [4, 1]
     assert "4 faults, 100 % caught" in capsys.readouterr().out
     assert len(mutants.read_verdicts(tmp_path / "mutants.json")) == 4
+
+
+def test_every_listed_fault_changes_code_and_names_tests_or_gates_that_exist():
+    gates = {key.rpartition("/")[0] for key in read_gates()}
+    for fault in read_faults(LIST):
+        sound = (ROOT / fault.file).read_text(encoding="utf-8")
+        assert ast.dump(ast.parse(fault.apply(sound))) != ast.dump(ast.parse(sound)), fault.name
+        assert fault.old in "\n".join(sound.splitlines()[fault.line - 1 :]), fault.name
+        assert fault.judges
+        assert all((ROOT / judge).is_file() or judge in gates for judge in fault.judges), fault.name
+    with pytest.raises(ValueError, match="has no fault called 'none'"):
+        read_faults(LIST, ["none"])
+
+
+def test_tests_judge_a_listed_fault_before_gates(monkeypatch, tmp_path, capsys):
+    judged = []
+
+    def run_tests(_, files, name, **__):
+        judged.append((name, files))
+        return (0, 1.0, "") if name == "sound" or files[0].endswith(".py") else (1, 1.0, "depth/courtyard/x")
+
+    monkeypatch.setattr(Bench, "run_tests", run_tests)
+    monkeypatch.setattr(Bench, "set_up", lambda _: None)
+    monkeypatch.setattr(Bench, "tree", ROOT)
+    monkeypatch.setattr(Bench, "planted", lambda *_: pytest.MonkeyPatch.context())
+    options = ["-o", str(tmp_path), "--list", str(LIST), "--names", "depth-maps-too-deep"]
+    assert mutants.main(options) == 0
+    tests, gates = ["tests/stereo/test_depth.py"], ["depth/courtyard"]
+    assert judged == [("sound", tests), ("depth-maps-too-deep", tests), ("depth-maps-too-deep", gates)]
+    assert "depth/courtyard/x" in capsys.readouterr().out
+    (verdict,) = mutants.read_verdicts(tmp_path / "mutants.json")
+    assert verdict.mutant == read_faults(LIST, ["depth-maps-too-deep"])[0]

@@ -34,6 +34,7 @@ def test_a_depth_that_is_too_far_is_measured():
     one = depth.judge_against_truth(maps[5], truth, align.scale)
     measured = depth.together([one])
     assert measured["depth error, median"] == pytest.approx(0.2, rel=0.05)
+    assert measured["depth error, bias"] == pytest.approx(0.2, rel=0.05)
     assert measured["within 1 %"] == pytest.approx(measured["known"])
     assert measured["known"] > 99.0
     expected = 0.002 * np.nanmedian(truth[0]) / 0.02 / 0.6745
@@ -56,7 +57,7 @@ def test_depth_is_read_where_sparse_points_are_seen():
     cameras, sizes = np.stack([P, P]), np.full((2, 2), 20)
     model = Reconstruction("metric", cameras, X, seen[:2], seen, seen, tracks, sizes, 1.0, ("", ""))
     one = depth.judge_against_points(found, model)
-    np.testing.assert_allclose(one.error, [0.0, 1.0 - 4.0 / 4.2], atol=1e-6)
+    np.testing.assert_allclose(one.error, [0.0, 4.0 / 4.2 - 1.0], atol=1e-6)
     np.testing.assert_allclose(one.deviations, [0.0, 2.0], atol=1e-4)
     assert one.known == pytest.approx(2 / 3)
     assert one.right == pytest.approx(1 / 3)

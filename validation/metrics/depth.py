@@ -17,7 +17,9 @@ SAME = 0.01  # Maximum relative depth error of a correct depth, and between view
 
 
 class Judged(NamedTuple):
-    """Relative ``error`` (N,) of known depths, and in ``deviations``; shares ``known`` and ``right``."""
+    """Relative ``error`` (N,) of known depths, above 0 if too deep, and its size in ``deviations``; shares
+    ``known`` and ``right``.
+    """
 
     error: F64
     deviations: F64
@@ -33,11 +35,13 @@ def together(judged: Sequence[Judged]) -> Scores:
     """Combine the scores of the maps of a scene; ``ValueError`` without maps."""
     if not judged:
         raise ValueError("there is no depth map to judge")
-    error, right = np.concatenate([one.error for one in judged]), [one.right for one in judged]
+    signed, right = np.concatenate([one.error for one in judged]), [one.right for one in judged]
+    error = np.abs(signed)
     # Median absolute value of a standard normal variable.
     off = [float(np.median(one.deviations)) / 0.6745 for one in judged if len(one.deviations)]
     return {
         "depth error, median": 100.0 * float(np.median(error)) if len(error) else float("nan"),
+        "depth error, bias": 100.0 * abs(float(np.median(signed))) if len(signed) else float("nan"),
         "within 1 %": 100.0 * float(np.mean(right)),
         "within 1 %, worst view": 100.0 * min(right),
         "known": 100.0 * float(np.mean([one.known for one in judged])),
@@ -97,7 +101,7 @@ def judge_against_truth(found: DepthMap, truth: TrueDepth, scale: float) -> Judg
     own, std = at_true_places(found, depth.shape, stride, stride * depth.shape[1])
     ours, std = scale * own, scale * std
     known = seen & np.isfinite(ours)
-    error = np.abs(ours / depth - 1.0)[known]
+    error = (ours / depth - 1.0)[known]
     return _judged(error, (np.abs(ours - depth) / std)[known], int(seen.sum()))
 
 
@@ -112,13 +116,13 @@ def judge_against_points(found: DepthMap, model: Reconstruction) -> Judged:
     (x, y), z = at[inside].T, q[inside, 2]
     ours = found.depth[y, x].astype(np.float64)
     known = np.isfinite(ours)
-    error = np.abs(ours / z - 1.0)[known]
+    error = (ours / z - 1.0)[known]
     return _judged(error, (np.abs(ours - z) / found.std[y, x])[known], len(z))
 
 
 def _judged(error: F64, deviations: F64, total: int) -> Judged:
     total = max(total, 1)
-    return Judged(error, deviations, len(error) / total, float(np.sum(error < SAME)) / total)
+    return Judged(error, deviations, len(error) / total, float(np.sum(np.abs(error) < SAME)) / total)
 
 
 def depth_range(depths: Sequence[F32 | F64]) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from thesisrecon.arrays import F64
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
@@ -60,6 +61,18 @@ def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
     valid, inlier = np.ones(N, dtype=np.bool_), np.ones(len(order), dtype=np.bool_)
     given = (P, X, registered, valid, inlier, tracks, sizes, sigma_px, reasons)
     return Reconstruction("metric", *given, K=K, distortion=distortion)
+
+
+def principal_points_by_pycolmap(folder: Path, names: Sequence[str]) -> F64:
+    """Return the principal points (V, 2) of a model as pycolmap reads them, NaN without a camera; (0, 0) is
+    the centre of the top-left pixel, which COLMAP puts at (0.5, 0.5). It shares no code with our files.
+    """
+    model = pycolmap.Reconstruction(str(folder))
+    xy = np.full((len(names), 2), np.nan)
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        xy[list(names).index(image.name)] = camera.principal_point_x, camera.principal_point_y
+    return xy - 0.5
 
 
 def match_with_pycolmap(

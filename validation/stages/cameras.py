@@ -26,7 +26,13 @@ from validation.metrics.cameras import (
     pose_pair_errors,
 )
 from validation.metrics.poses import area_under_recall
-from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_colmap_model
+from validation.references.colmap import (
+    map_with_pycolmap,
+    match_with_pycolmap,
+    principal_points_by_pycolmap,
+    read_colmap_model,
+)
+from validation.references.libraries import NoReference
 from validation.runs.records import IMAGE_SCENES, Judgement, Outcome, ReportOptions, Stage, Task, load_images
 from validation.runs.tables import OURS, Metric, Plot, Values, each, plot, row, scatter
 from validation.scenes.real import Scene
@@ -87,7 +93,7 @@ class CamerasStage(Stage):
         images = load_images(scene, options)
         models = {m: read_model(images, m, o) for m, o in outcomes.items() if m != MATCHES}
         metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
-        metrics += _before_adjustment(images, outcomes.get(OURS))
+        metrics += [*_before_adjustment(images, outcomes.get(OURS)), *_as_colmap_reads(images, outcomes)]
         metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
         known, total = int(images.known.sum()), len(images.image_paths)
         partly = 0 < known < total
@@ -196,6 +202,21 @@ def _before_adjustment(scene: Scene, outcome: Outcome | None) -> list[Metric]:
     error = float(np.nanmedian(focal_errors_pct(K[known], scene.K[known])))
     text = f"{FOCAL}, as self-calibration leaves it"
     return [*rows, row(scene.name, "self-calibrated focal error", "%", error, text)]
+
+
+def _as_colmap_reads(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """Evaluate the principal point that pycolmap reads: another centre of the pixels would not cancel."""
+    outcome = outcomes.get(OURS)
+    if scene.K is None or outcome is None or not outcome.ok:
+        return []
+    names = [path.name for path in scene.image_paths]
+    try:
+        found = principal_points_by_pycolmap(outcome.folder / "run" / "sparse" / "0", names)
+        error = float(np.nanmedian(np.linalg.norm(found - scene.K[:, :2, 2], axis=1)))
+    except NoReference:
+        return []
+    text = f"{PRINCIPAL_POINT}, in the files that pycolmap reads"
+    return [row(scene.name, "principal point error, read by pycolmap", "px", error, text)]
 
 
 def _last_record(outcome: Outcome, stage: str) -> Any:

@@ -149,10 +149,12 @@ def _metrics(scene: str, judged: Mapping[str, Scores | None]) -> list[Metric]:
         else ("sparse points of the view", "depth of the sparse points")
     )
     error = f"median |z / z_true - 1| of all known depths against the {against}"
+    bias = f"|median of z / z_true - 1| against the {against}: 0 without systematic error"
     right = f"share of the {of} whose depth is known and right to 1 %, mean of the views"
     ideal = "median error over the stated standard deviation, over 0.6745: 1 is ideal"
     rows = {
         "depth error, median": ("%", error),
+        "depth error, bias": ("%", bias),
         "within 1 %": ("%", right),
         "within 1 %, worst view": ("%", "the least of these shares"),
         "known": ("%", f"share of the {of} that have a depth"),
