@@ -19,12 +19,13 @@ from benchmarks.references import (
     poselib_three_points,
 )
 from thesisrecon.api.cameras import triangulate
-from thesisrecon.camera import distort, project_camera, undistort
+from thesisrecon.camera import project_camera
 from thesisrecon.epipolar.ransac import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.geometry.two_view import homography_linear
+from thesisrecon.lens import distort, undistort
 from validation.references.fundamental import colmap_points, opencv_eight_point
 from validation.scenes.rigs import beside, cameras_of
 from validation.scenes.two_views import make_two_views

@@ -1,4 +1,4 @@
-"""The camera: calibration, pose, image size and radial distortion; projection with and without the record."""
+"""The camera: calibration, pose, image size and lens; projection with and without the record."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from thesisrecon import arrays
 from thesisrecon.arrays import B8, F64, Record
+from thesisrecon.lens import Lens, directions_of_image, has_distortion, image_of_directions, lens_row
 
 
 @dataclass(frozen=True, eq=False)
 class Camera(Record):
-    """Metric camera x ~ K [R t] X with radial distortion (3.21).
+    """Metric camera x ~ K [R t] X with lens distortion (3.21).
 
     It holds read-only copies of its arrays.
 
@@ -28,22 +29,27 @@ class Camera(Record):
     size : tuple of int, or image
         Image (width, height) in pixels, or the image.
     distortion : ndarray (C,), optional
-        Radial coefficients k1, k2, k3: a normalised point (x, y) is imaged at (x, y) (1 + k1 r^2 + k2 r^4 +
-        k3 r^6). None: no distortion. More than three numbers are refused unless the others are 0: four and
-        more mean k1, k2, p1, p2, k3 in OpenCV and k1, k2, k3, k4, k5 elsewhere.
+        Coefficients of the lens. None: no distortion. Of a radial lens, k1, k2, k3: a normalised point (x, y)
+        is imaged at (x, y) (1 + k1 r^2 + k2 r^4 + k3 r^6); more numbers that are not 0 are refused, since
+        they mean k1, k2, p1, p2, k3 in OpenCV and k1, k2, k3, k4, k5 elsewhere.
     std : mapping of str to float, optional
         Standard deviations of estimated values: "focal_px", "aspect", "skew_px", "principal_x_px",
         "principal_y_px", "k1", "k2", "k3" (0: as assumed), and of poses of a run "rotation_x_deg" and y, z
         about the axes of the camera, "centre_x" and y, z along those of the model. None: unknown.
     as_stored : bool
         Whether the pixels are those of the image file as stored, as in COLMAP, and not after EXIF rotation.
+    lens : {"radial", "division", "fisheye", "brown", "rational", "thin-prism-fisheye"}
+        Model of the lens: "division" k1 (Fitzgibbon, 2001: r = r_d / (1 + k1 r_d^2)); "fisheye" k1 to k4 of
+        the angle from the axis (Kannala and Brandt, 2006), as in OpenCV, also beyond 90 degrees; "brown" k1,
+        k2, p1, p2, k3 and "rational" further k4, k5, k6, as in OpenCV; "thin-prism-fisheye" k1, k2, p1, p2,
+        k3, k4, s1, s2, as in COLMAP.
 
     Raises
     ------
     ValueError
         If a shape is wrong, a number is not finite or masked, K is not upper triangular with positive focal
         lengths and K33 = 1, R is not a rotation, the size is not whole numbers of at least 1, or distortion
-        has more than three numbers that are not 0.
+        has more numbers that are not 0 than the lens has.
 
     Examples
     --------
@@ -65,6 +71,7 @@ class Camera(Record):
     distortion: F64 | None = None
     std: Mapping[str, float] | None = None
     as_stored: bool = False
+    lens: Lens = "radial"
 
     def __post_init__(self) -> None:
         given = {name: getattr(self, name) for name in ("K", "R", "t", "distortion")}
@@ -77,8 +84,13 @@ class Camera(Record):
         arrays.require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
         if "distortion" in fields:
             arrays.require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
-            _require_radial(fields["distortion"])
+            if self.lens == "radial":
+                _require_radial(fields["distortion"])
         arrays.require_finite("Camera", *fields.values())
+        try:
+            lens_row(self.lens, self._coefficients)
+        except ValueError as error:
+            raise ValueError(f"Camera: {error}") from None
         arrays.require_calibration("Camera", K)
         arrays.require_rotations("Camera", R)
         try:
@@ -124,7 +136,7 @@ class Camera(Record):
     @property
     def is_pinhole(self) -> bool:
         """Whether the camera has no distortion."""
-        return self.distortion is None or not np.any(self.distortion)
+        return not has_distortion(self.lens_row)
 
     def project(self, X: F64) -> F64:
         """Project points to pixels, distortion included.
@@ -141,7 +153,7 @@ class Camera(Record):
         """
         (X,) = arrays.numbers("Camera.project", missing=("X",), X=X)
         arrays.require_shapes("Camera.project", X=(X, ("N", 3)))
-        return project_camera(self.K, self.R, self.t, X, distortion=self._coefficients)
+        return project_camera(self.K, self.R, self.t, X, distortion=self.lens_row)
 
     def unproject(self, xy: F64, depth: F64 | None = None) -> F64:
         """Return the points or viewing directions of pixels.
@@ -162,18 +174,10 @@ class Camera(Record):
         given = {} if z is None else {"depth": (z, ("N",))}
         arrays.require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
         xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
-        places = xh[:, :2] / xh[:, 2:]
-        plane = undistort(places, self._coefficients)
-        # Beyond the radius up to which the distortion grows, its inverse does not exist.
-        largest = growing_radius(self._coefficients)
-        returned = np.linalg.norm(distort(plane, self._coefficients) - places, axis=1)
-        outside = np.linalg.norm(plane, axis=1) > largest * (1.0 + 1e-9)
-        outside |= returned > 1e-6 * np.maximum(1.0, np.linalg.norm(places, axis=1))
-        plane[outside] = np.nan
-        rays = np.column_stack([plane, np.ones(len(xy))])
+        rays = directions_of_image(xh[:, :2] / xh[:, 2:], self.lens_row)
         if z is None:
-            return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True) @ self.R)
-        return np.asarray((rays * z[:, None] - self.t) @ self.R)
+            return np.asarray(rays @ self.R)
+        return np.asarray((rays * (z / rays[:, 2])[:, None] - self.t) @ self.R)
 
     def scaled(self, factor: float) -> Camera:
         """Return the camera of the resized image: x goes to (x + 0.5) s - 0.5 along each side.
@@ -193,6 +197,11 @@ class Camera(Record):
         width, height = (max(1, round(side * factor)) for side in self.size)
         S = arrays.resizing_transform(np.divide((width, height), self.size))
         return replace(self, K=S @ self.K, size=(width, height), std=None)
+
+    @property
+    def lens_row(self) -> F64:
+        """The lens as a row of `thesisrecon.lens`: the coefficients of a radial lens, else twelve numbers."""
+        return lens_row(self.lens, self._coefficients)
 
     @property
     def _coefficients(self) -> F64:
@@ -237,57 +246,14 @@ def rq(M: F64) -> tuple[F64, F64]:
     return K * signs, signs[:, None] * R
 
 
-def distort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """Apply radial distortion k (C,) or (N, C) to points (N, 2): (x, y) (1 + k1 r^2 + k2 r^4 + ...)."""
-    r2 = np.sum(xy_normalized**2, axis=-1, keepdims=True)
-    return np.asarray(xy_normalized * _radial_factor(distortion, r2))
-
-
-def undistort(xy_normalized: F64, distortion: float | F64) -> F64:
-    """Invert :func:`distort` by Newton's method; points without an inverse, far outside, are not changed."""
-    distorted = np.sum(xy_normalized**2, axis=-1, keepdims=True)
-    k = np.atleast_1d(distortion)
-    slopes = k * np.arange(1, k.shape[-1] + 1)
-    r2 = distorted
-    with np.errstate(all="ignore"):
-        for _ in range(20):
-            factor = _radial_factor(k, r2)
-            slope = factor * (factor + 2.0 * (_radial_factor(slopes, r2) - 1.0))
-            step = (r2 * factor**2 - distorted) / slope
-            r2 = r2 - step
-            # Converged to rounding: the next error is the square of the relative step.
-            if np.all(np.abs(step) <= 1e-9 * np.abs(r2)):
-                break
-        factor = _radial_factor(k, r2)
-        reached = np.abs(r2 * factor**2 - distorted) <= 1e-9 * distorted
-    return np.asarray(xy_normalized / np.where(reached & (factor > 0.0), factor, 1.0))
-
-
-def growing_radius(distortion: F64) -> float:
-    """Normalised radius up to which r (1 + k1 r^2 + k2 r^4 + ...) grows, infinity if everywhere."""
-    slopes = distortion * np.arange(3, 2 * len(distortion) + 2, 2)
-    roots = np.roots([*slopes[::-1], 1.0])
-    squares = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
-    return float(np.sqrt(squares.min())) if len(squares) else np.inf
-
-
 def _require_radial(distortion: F64) -> None:
     """Refuse numbers after k3: their meaning is not that of OpenCV's calibration files."""
     if np.any(distortion[3:]) or (len(distortion) > 3 and np.any(distortion[2:])):
         both = "they are k1, k2, p1, p2, k3 in OpenCV, and k1, k2, k3, k4, k5 of a radial lens elsewhere"
-        advice = "give radial k1, k2, k3; for tangential p1, p2 undistort the images first"
+        advice = 'give radial k1, k2, k3, or lens="brown" and k1, k2, p1, p2, k3'
         raise ValueError(f"Camera got {len(distortion)} distortion numbers, and {both}; {advice}")
 
 
-def _radial_factor(distortion: float | F64, r2: F64) -> F64:
-    k = np.atleast_1d(distortion)
-    factor = np.zeros_like(r2)
-    for n in reversed(range(k.shape[-1])):
-        factor = (factor + k[..., n : n + 1]) * r2
-    return 1.0 + factor
-
-
 def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 0.0) -> F64:
-    """Project points (N, 3) with a metric camera and radial distortion as of :func:`distort`."""
-    X = X @ R.T + t
-    return distort(X[:, :2] / X[:, 2:], distortion) @ K[:2, :2].T + K[:2, 2]
+    """Project points (N, 3) with a metric camera and a lens as of :func:`thesisrecon.lens.distort`."""
+    return image_of_directions(X @ R.T + t, distortion) @ K[:2, :2].T + K[:2, 2]

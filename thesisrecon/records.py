@@ -270,6 +270,8 @@ class IntrinsicsPrior(Record):
     #: (C,) or (V, C) hierarchical prior: standard deviation of a kind's values about their unknown mean (of
     #: its first row; relative for the focal; inf: no such prior); None: not yet estimated
     spread: F64 | None = None
+    #: (V, 3) lenses in half diagonals found in pairs: k1, k2 and the base; None: straight but for k1
+    lens: F64 | None = None
 
     @classmethod
     def unshared(

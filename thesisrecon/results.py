@@ -14,6 +14,7 @@ import scipy
 from thesisrecon import records
 from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
 from thesisrecon.camera import Camera
+from thesisrecon.lens import named_lens
 
 SUMMARY = "summary.json"
 
@@ -76,8 +77,9 @@ class Cameras(Mapping[str, Camera]):
         std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
         std |= pose_deviations(self._metric, i)
         K = one.original_from_working @ r.K[i]
-        lens = r.distortion[i]
-        return Camera(K, Rt[:, :3], Rt[:, 3], one.original_size, lens, std, as_stored=self._as_stored)
+        lens, row = named_lens(r.distortion[i])
+        size, stored = one.original_size, self._as_stored
+        return Camera(K, Rt[:, :3], Rt[:, 3], size, row, std, as_stored=stored, lens=lens)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered

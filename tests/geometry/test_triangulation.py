@@ -10,7 +10,7 @@ from tests.conftest import refuses
 from tests.geometry import properties as twins
 from tests.geometry.properties import holds_for_every, random_camera
 from thesisrecon.api.cameras import triangulate
-from thesisrecon.camera import compose_camera, distort, undistort
+from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs, project
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
@@ -21,6 +21,7 @@ from thesisrecon.geometry.triangulation import (
     triangulate_observations,
 )
 from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.lens import distort, undistort
 from thesisrecon.optimize.bundle.partial import minimize_reprojection
 
 METHODS = ["polynomial", "linear", "midpoint", "iterated", "optimal"]

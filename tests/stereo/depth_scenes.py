@@ -7,9 +7,10 @@ from scipy.ndimage import map_coordinates
 
 from tests.synthetic import looking_along, photograph, reconstruction_of, texture
 from thesisrecon.arrays import F64
-from thesisrecon.camera import decompose_camera, distort, undistort
+from thesisrecon.camera import decompose_camera
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.lens import distort, undistort
 from thesisrecon.records import Image, Reconstruction, Tracks
 
 SIZE = (240, 180)

@@ -13,7 +13,6 @@ import numpy as np
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import F64, flag, rows_of_views
-from thesisrecon.camera import growing_radius, undistort
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
@@ -27,6 +26,7 @@ from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
+from thesisrecon.lens import growing_radius, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads

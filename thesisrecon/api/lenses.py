@@ -9,11 +9,12 @@ import numpy as np
 
 from thesisrecon.api.given import CameraInput, as_cameras, checked_sizes
 from thesisrecon.arrays import B8, F32, F64, I64, U8, numbers, require_calibration, require_shapes
-from thesisrecon.camera import Camera, distort, undistort
+from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.imaging.resampling import undistort_image as resampled
 from thesisrecon.imaging.resampling import warp_image
 from thesisrecon.io._images import read_pixels
+from thesisrecon.lens import distort, undistort
 from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.stereo.rectification import rotation_along_baseline
 

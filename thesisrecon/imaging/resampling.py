@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64, U8, Record, resizing_transform
-from thesisrecon.camera import distort
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.lens import distort
 from thesisrecon.records import Image, PinholeView, Reconstruction
 
 MAX_TAPS = 24  #: limit of the filter width: reductions by more than 6 alias
@@ -255,9 +255,12 @@ def undistort_image(
     given = rgb.astype(np.float32)
     if mask is not None:
         given[~mask] = np.nan
-    pixels = warp_image(given, lookup, size)
-    # In place: a full image in single precision takes 12 bytes per pixel.
-    del given
+    return resampled(given, lookup, size)
+
+
+def resampled(levels: F32, lookup: Callable[[range], F64], size: tuple[int, int]) -> tuple[U8, B8]:
+    """Resample levels (H, W, 3), NaN where there are none; return an image and which pixels are inside."""
+    pixels = warp_image(levels, lookup, size)
     seen = np.asarray(np.isfinite(pixels).all(axis=2))
     pixels[~seen] = 0.0
     np.clip(np.rint(pixels, out=pixels), 0.0, 255.0, out=pixels)

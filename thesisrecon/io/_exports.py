@@ -19,11 +19,12 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.arrays import F64, U8, rows_of_views
-from thesisrecon.camera import Camera, undistort
+from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
 from thesisrecon.io._other_models import LOOKS_BACK
+from thesisrecon.lens import undistort
 from thesisrecon.results import SparseModel, SparseView
 
 

@@ -19,6 +19,8 @@ from thesisrecon.metric._model import (
     CENTRE,
     FOCAL,
     K1,
+    LENS_STD,
+    LENS_WIDTH,
     WIDTH,
     MetricEstimate,
     camera_rows,
@@ -31,7 +33,7 @@ from thesisrecon.optimize.bundle.metric import (
     MetricBundleResult,
     refine_metric_bundle,
 )
-from thesisrecon.optimize.bundle.projection import Observations
+from thesisrecon.optimize.bundle.projection import LENS, Observations
 from thesisrecon.optimize.bundle.scatter import LinearisedFit, linearise_fit, point_blocks
 from thesisrecon.optimize.least_squares import best_huber_width, noise_from_distances
 from thesisrecon.records import IntrinsicsPrior
@@ -42,7 +44,7 @@ SETTLED, ROUND_SETTLED = 1e-4, 5e-3
 larger if the observations are chosen again after it."""
 MAX_CHANGE = 0.05
 """Relative change of centres and focal lengths up to which the simpler camera model is accurate enough."""
-FOCAL_AND_CENTRE = np.isin(np.arange(WIDTH), (FOCAL, *CENTRE))
+FOCAL_AND_CENTRE = np.isin(np.arange(LENS_WIDTH), (FOCAL, *CENTRE))
 
 
 @dataclass(frozen=True)
@@ -79,13 +81,18 @@ class MetricAdjustment:
         )  # fmt: skip
 
     def row_prior(self, model: MetricEstimate) -> IntrinsicsPrior:
-        """Prior of each row of ``model.cameras.intrinsics``, 8 columns."""
+        """Prior of each row of ``model.cameras.intrinsics``."""
         group = model.cameras.group
         first = np.unique(group, return_index=True)[1]
-        mean, std = np.zeros((len(first), WIDTH)), np.zeros((len(first), WIDTH))
+        mean, std = np.zeros((2, *model.cameras.intrinsics.shape))
         mean[:, : K1 + 1], std[:, : K1 + 1] = self.prior.mean[first], self.prior.std[first]
         has_lens = _shares_a_lens(model) & (std[:, K1] > 0.0)
-        std[:, K1 + 1 :] = np.where(has_lens, self.lens_std, 0.0)[:, None]
+        std[:, K1 + 1 : WIDTH] = np.where(has_lens, self.lens_std, 0.0)[:, None]
+        for row in np.flatnonzero(has_lens) if mean.shape[1] == LENS_WIDTH else ():
+            lens = model.cameras.intrinsics[row, LENS]
+            coefficients = LENS_STD[int(lens)]
+            mean[row, LENS], mean[row, K1], std[row, K1:] = lens, 0.0, 0.0
+            std[row, K1 : K1 + len(coefficients)] = coefficients
         # Images may be crops: the principal point has a bivariate t distribution, whose weight over that of
         # the normal one falls with the distance from the mean; 3 degrees of freedom: a finite variance.
         dof = 3.0
@@ -98,7 +105,7 @@ class MetricAdjustment:
         return IntrinsicsPrior.unshared(mean, std, **kinds)
 
     def free(self, model: MetricEstimate) -> B8:
-        """Which of the 8 intrinsics are estimated in some camera."""
+        """Which of the intrinsics are estimated in some camera."""
         return np.asarray((self.row_prior(model).std > 0.0).any(axis=0))
 
     def run(
@@ -107,8 +114,9 @@ class MetricAdjustment:
     ) -> tuple[MetricEstimate, MetricBundleResult]:  # fmt: skip
         """Adjust the model to its inliers, all that is ``free`` but ``fixed`` (V,) cameras; measure noise."""
         moves, options = self.free(model), self.options(model, iterations=iterations, settled=settled)
+        moves = moves if free is None else moves & free[: len(moves)]
         result = refine_metric_bundle(
-            model.cameras, model.X, _inlier_observations(model), free=moves if free is None else moves & free,
+            model.cameras, model.X, _inlier_observations(model), free=moves,
             prior=self.row_prior(model), options=options, fixed=fixed,
         )  # fmt: skip
         model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.camera import undistort
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.lens import undistort
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import Reconstruction, Similarity

@@ -8,16 +8,29 @@ import numpy as np
 
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.camera import undistort
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
+from thesisrecon.lens import ANGLE, PERSPECTIVE, fit_lens, undistort
 from thesisrecon.optimize.bundle.partial import refine_points
-from thesisrecon.optimize.bundle.projection import MetricCameras, MetricModel, image_points
+from thesisrecon.optimize.bundle.projection import (
+    DIVISION,
+    FISHEYE,
+    LENS,
+    RADIAL,
+    MetricCameras,
+    MetricModel,
+    image_points,
+)
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.
 FOCAL, ASPECT, SKEW, CENTRE, K1, WIDTH = 0, 1, 2, (3, 4), 5, 8
+LENS_WIDTH = LENS + 1  # further k4, p1, p2 and the number of the lens model
 EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0  # residual gates of the early and the late rounds in noise sigmas
+MAX_TANGENT = 4.0  # largest tangent of the angle from the axis of what triangulates: 76 degrees
+RADII = 100  # radii of the image at which one lens is fitted to another
+LENS_STD = {RADIAL: (0.5, 0.3, 0.1), DIVISION: (1.0,), FISHEYE: (0.2, 0.1, 0.05, 0.02)}
+"""Prior deviations of the coefficients about 0 of a lens that pairs of images show."""
 MIN_ANGLE = float(np.radians(0.05))  # smallest triangulation angle of a point
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
@@ -149,8 +162,12 @@ def retriangulate_tracks(
     """Triangulate all tracks, undistorted, from the registered views and from their inliers again."""
     t = model.tracks
     near = np.flatnonzero(model.registered[t.view_index])
+    normalized = normalized_observations(model.cameras, t.view_index[near], t.xy[near])
+    if model.cameras.intrinsics.shape[1] > WIDTH:
+        # Towards 90 degrees off the axis noise grows without bound.
+        usable = np.linalg.norm(normalized, axis=1) < MAX_TANGENT
+        near, normalized = near[usable], normalized[usable]
     view, point = t.view_index[near], t.point_index[near]
-    normalized = normalized_observations(model.cameras, view, t.xy[near])
     poses = np.concatenate([model.cameras.R, model.cameras.t[:, :, None]], axis=2)
     scale = np.median(model.cameras.intrinsics[model.cameras.group[model.registered], 0])
     loss = model.sigma_px / scale
@@ -251,7 +268,13 @@ def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
     key = np.concatenate([prior.shared[:, moves], same], axis=1)
     first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)[1:]
     shared = prior.shared[first]
-    return group.reshape(-1).astype(np.int64), np.column_stack([shared, shared[:, K1], shared[:, K1]])
+    of_lens = np.repeat(shared[:, K1:], _width(prior) - K1 - 1, axis=1)
+    return group.reshape(-1).astype(np.int64), np.column_stack([shared, of_lens])
+
+
+def _width(prior: IntrinsicsPrior) -> int:
+    """Columns of the intrinsics."""
+    return WIDTH if prior.lens is None else LENS_WIDTH
 
 
 def upgraded_model(
@@ -286,7 +309,7 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
     """(V, 8) start values: focals and principal points of K, else the median field of view; prior means."""
     group, longest = prior.group, sizes.max(axis=1)
     typical = float(np.median(K[registered, 0, 0] / longest[registered]))
-    rows = np.zeros((len(K), WIDTH))
+    rows = np.zeros((len(K), _width(prior)))
     rows[:, 1 : K1 + 1] = prior.mean[:, 1:]
     for g in range(int(group.max()) + 1):
         views = np.flatnonzero(group == g)
@@ -295,4 +318,36 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
         rows[views, FOCAL] = focal
         if len(known):
             rows[views[:, None], [*CENTRE]] = np.median(K[known, :2, 2], axis=0)
+    if prior.lens is not None:
+        rows[:, K1:] = 0.0
+        bent = prior.lens[:, :2].any(axis=1)
+        for view in np.flatnonzero(bent):
+            half = float(np.linalg.norm(sizes[view])) / 2.0
+            p = np.linspace(0.0, 1.0, RADII + 1)[1:]
+            k1, k2, base = prior.lens[view]
+            straight = p / (1.0 + (k1 + k2 * p**2) * p**2)
+            if base == PERSPECTIVE:
+                straight = undistort(np.column_stack([p, 0.0 * p]), np.array([k1, k2]))[:, 0]
+            rows[view] = refitted_lens(rows[view], FISHEYE, half * p, half * straight / rows[view, FOCAL])
     return rows
+
+
+def refitted_lens(row: F64, kind: int, radii: F64, tangents: F64) -> F64:
+    """A row of intrinsics with the lens of a ``kind`` that images directions at ``radii`` (N,) px.
+
+    ``tangents`` (N,) are those of their angles from the axis; large and negative ones are not fitted.
+    """
+    seen = (tangents > 0.0) & (tangents < MAX_TANGENT)
+    count = len(LENS_STD[kind])
+    if kind == DIVISION:
+        # r = r_d / (1 + k r_d^2), by least squares of its coefficients in r_d / r.
+        basis = np.column_stack([np.ones(seen.sum()), radii[seen] ** 2])
+        f, g = np.linalg.lstsq(basis, radii[seen] / tangents[seen], rcond=None)[0]
+        focal, coefficients = float(f), np.array([g * f])
+    else:
+        base = ANGLE if kind == FISHEYE else PERSPECTIVE
+        focal, coefficients = fit_lens(base, radii[seen], tangents[seen], count)
+    row = row.copy()
+    row[FOCAL], row[K1:], row[LENS] = focal, 0.0, kind
+    row[K1 : K1 + count] = coefficients
+    return row

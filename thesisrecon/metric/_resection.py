@@ -20,7 +20,7 @@ from thesisrecon.metric._model import EARLY_SIGMAS, LATE_SIGMAS, MANY_VIEWS, Met
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
 
-WITHOUT_K2_K3 = np.arange(_model.WIDTH) <= _model.K1
+WITHOUT_K2_K3 = np.arange(_model.LENS_WIDTH) <= _model.K1
 """k1 is free from the start: with k1 fixed, gates wide enough for right points would accept wrong ones."""
 MIN_POINTS = 15  # points of the model that a missing camera must see, unless other matches confirm its pose
 FEWEST_POINTS, MIN_MATCHES, AGREEING = 5, 15, 0.5
@@ -101,7 +101,7 @@ def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B
     assert cameras.shared is not None
     inside, outside = (cameras.shared[cameras.group[model.registered & v]] for v in (views, ~views))
     own = np.array([not np.isin(a, b).any() for a, b in zip(inside.T, outside.T, strict=True)])
-    part = adjustment.run(part, free=WITHOUT_K2_K3 & own, fixed=~views, iterations=6)[0]
+    part = adjustment.run(part, free=WITHOUT_K2_K3[: len(own)] & own, fixed=~views, iterations=6)[0]
     part = _model.retriangulate_tracks(
         replace(part, sigma_px=model.sigma_px, loss_sigmas=model.loss_sigmas, tail=model.tail),
         sigmas=LATE_SIGMAS,

@@ -91,7 +91,7 @@ def _per_view(
             std[:, column] = 0.1 * longest if column in CENTRE else np.inf
     known = IntrinsicsPrior.unshared(mean, std)
     if np.isfinite(focal_spread):
-        spread = np.where(np.arange(WIDTH) == FOCAL, focal_spread, np.inf)
+        spread = np.where(np.arange(mean.shape[1]) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
     cameras = MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared)
     seen = seen._replace(view_index=np.searchsorted(views, seen.view_index))

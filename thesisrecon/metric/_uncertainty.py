@@ -20,7 +20,7 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
-from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, WIDTH, MetricEstimate
+from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, MetricEstimate
 from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
 from thesisrecon.optimize.least_squares import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
@@ -35,8 +35,13 @@ CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a ric
 _COLUMNS = {
     "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
     "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
-    "k1": K1, "k2": K1 + 1, "k3": K1 + 2,
+    "k1": K1, "k2": K1 + 1, "k3": K1 + 2, "k4": K1 + 3,
 }  # fmt: skip
+
+
+def _columns(width: int) -> Mapping[str, int]:
+    """Columns by name of a table of ``width`` columns."""
+    return {name: column for name, column in _COLUMNS.items() if column < width}
 
 
 Intervals = Sequence[Mapping[str, IntrinsicInterval]]
@@ -90,7 +95,7 @@ def per_camera_estimates(
 def estimate_hierarchical_prior(own: PerCameraEstimates, shared: I64) -> HierarchicalPrior | None:
     """Estimate the scatter of the intrinsics of cameras of a kind; None if no intrinsic has an estimate."""
     kinds = own.kind.copy()
-    spread = np.full((len(kinds), WIDTH), np.inf)
+    spread = np.full(own.value.shape, np.inf)
     outside = np.zeros(len(kinds), dtype=bool)
     for column in (FOCAL, *CENTRE, K1):
         for kind in np.unique(kinds[kinds >= 0]):
@@ -190,7 +195,7 @@ def intrinsic_intervals(
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]
         row = model.cameras.intrinsics[g]
-        for name, column in _COLUMNS.items():
+        for name, column in _columns(len(row)).items():
             value, variance = float(row[column]), float(scatter.variance[g, column])
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
@@ -254,7 +259,7 @@ def pose_std(
     number = poses.number
     std = np.sqrt(np.diag(poses.covariance))
     for view in poses.views:
-        for name, column in _COLUMNS.items():
+        for name, column in _columns(number.shape[1]).items():
             unknown = number[model.cameras.group[view], column]
             if unknown >= 0:
                 own = intervals[view][name]

@@ -17,8 +17,9 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import check_returned, doubtful_views, returned_cameras, self_check
+from thesisrecon.metric._lens import with_best_lens
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
-from thesisrecon.metric._resection import MIN_POINTS, register_missing_cameras
+from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
 from thesisrecon.optimize.bundle.scatter import BlockScatter, LinearisedFit, block_scatter, pose_uncertainty
 from thesisrecon.optimize.least_squares import noise_from_distances
@@ -59,6 +60,7 @@ class MetricRefinement:
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([_model.truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
+        model = with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
@@ -114,8 +116,8 @@ def _assess(
     poses = _uncertainty.pose_std(model, pose_uncertainty(fit), scatter, intervals)
     model = complete
     check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
-    # An enlarged camera model replaces the prior that the images contradicted.
-    start = [] if enlarged else _contradiction(calibration)
+    # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.
+    start = [] if enlarged or adjustment.prior.lens is not None else _contradiction(calibration)
     failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
     failed_checks += [*_shared_camera.contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
     failed_checks += _shared_camera.inconsistent_principal_point(model, adjustment, scatter)
@@ -149,13 +151,14 @@ def _start(
     # Without distortion the noise is overestimated: keep the gate at least as wide as before.
     gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
     model = _adjustment.with_initial_gate(model)
+    start = _adjustment.FOCAL_AND_CENTRE if adjustment.prior.lens is None else WITHOUT_K2_K3
     for _ in range(3):
         if model.valid.sum() < 20:
             return None
         model = _model.select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
         if model.inlier.sum() < _adjustment.MIN_OBSERVATIONS:
             return None
-        model = gentle.run(model, free=_adjustment.FOCAL_AND_CENTRE, iterations=15)[0]
+        model = gentle.run(model, free=start, iterations=15)[0]
     return _model.select_inliers(model, sigmas=EARLY_SIGMAS, min_angle=0.0)
 
 

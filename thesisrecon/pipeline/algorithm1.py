@@ -18,6 +18,7 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
+from thesisrecon.pipeline.lens import as_imaged
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.outputs import (
     REPLACED_FILES,
@@ -57,6 +58,10 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
     job.require_images()
     precompile(until, run.workers.threads, run.progress)
     result = empty_result(run, job.inputs)
+
+    # Before everything: lenses that bend lines much, seen in pairs of images (Fitzgibbon 2001).
+    if job.prior.lens is None and until != "features":
+        job = replace(job, lens=front.lens(job))
 
     # Section 4.2.1: corners and seeds of every image.
     features = front.detect(job)
@@ -179,7 +184,8 @@ def attempt_cameras(
     if in_parts:
         aligned, keys = cameras_from_parts(job, tracks, pairs, ATTEMPTS)
     if aligned is None:
-        start, known = calibrated_part(projective, calibration), calibration
+        part = calibrated_part(projective, calibration)
+        start, known = as_imaged(part, tracks, job.prior), calibration
     else:
         start, known = aligned, from_metric(aligned, calibration)
     yield replace(result, metric=refine_metric(job, start, known, attempt, keys))

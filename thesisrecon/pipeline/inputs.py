@@ -21,6 +21,7 @@ from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.projection import Observations, read_observations, sort_observations
 from thesisrecon.pipeline.large_sets import tracks_of_part
+from thesisrecon.pipeline.lens import bent_pair, lens_of_matches, straight_matches
 from thesisrecon.pipeline.matching import (
     FromImages,
     report_choice,
@@ -78,18 +79,28 @@ class Given:
         report_choice(job, choice)
         return choice
 
+    def lens(self, job: Job) -> F64 | None:
+        """The lens that the given matches show."""
+        return lens_of_matches(job, self.matches)
+
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """Estimate and verify the epipolar geometry of the given matches (chapter 5)."""
         run, matches = job.run, self.matches
         variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
         given = [[m.xy1, m.xy2, m.index1, m.index2] for m in matches]
+        lens = [None if job.lens is None else job.lens[[m.i, m.j]] for m in matches]
         keys = {
-            f"{m.i:05d}-{m.j:05d}": run.key("matches", "given", variants, content, run.seed)
-            for m, content in zip(matches, given, strict=True)
+            f"{m.i:05d}-{m.j:05d}": run.key("matches", "given", variants, content, run.seed, *bent)
+            for m, content, bent in zip(matches, given, ([] if k is None else [k] for k in lens), strict=True)
         }
 
         def batches(missing: Sequence[int]) -> Iterator[Batch]:
-            return (([n], (job.config, matches[n], run.seed)) for n in missing)
+            ends = ([matches[n].i, matches[n].j] for n in missing)
+            sizes = (job.sizes[pair] for pair in ends)
+            return (
+                ([n], (job.config, matches[n], run.seed, lens[n], s))
+                for n, s in zip(missing, sizes, strict=True)
+            )
 
         return report_matches(job, run.map_cached("matches", keys, _verify, batches))
 
@@ -354,5 +365,10 @@ def at_working_size(given: Given, images: Sequence[Image]) -> Given:
     return Given([scaled(xy, s) for xy, s in corners], matches, tracks)
 
 
-def _verify(config: PipelineConfig, matches: Matches, seed: int) -> list[TwoView]:
-    return [verify_matches(config, matches, stream(seed, "matches", matches.i, matches.j))]
+def _verify(
+    config: PipelineConfig, matches: Matches, seed: int, lens: F64 | None, sizes: I64
+) -> list[TwoView]:
+    rng = stream(seed, "matches", matches.i, matches.j)
+    if lens is None:
+        return [verify_matches(config, matches, rng)]
+    return [bent_pair(verify_matches(config, straight_matches(matches, sizes, lens), rng), sizes, lens)]

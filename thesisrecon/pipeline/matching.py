@@ -13,17 +13,26 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from thesisrecon.arrays import B8, rows_of_views
+from thesisrecon.arrays import B8, F64, rows_of_views
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.imaging.on_demand import RecentlyUsed
 from thesisrecon.matching._prepared import select_found, strongest_corners, strongest_share
+from thesisrecon.matching._seeds import seed_matches
 from thesisrecon.matching.growth import SeedsAndGrowth
 from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
 from thesisrecon.pipeline.large_sets import has_narrow_cut, tracks_of_part
+from thesisrecon.pipeline.lens import (
+    Straightened,
+    StraightFrame,
+    frames_of,
+    lens_of_matches,
+    pair_from_frames,
+    pair_in_frames,
+)
 from thesisrecon.pipeline.run import Batch, Job, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Seeds, Tracks, TwoView
 
@@ -44,6 +53,7 @@ Prepare = Callable[[Image, Features], Any]
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | ArrayLike | Image
 """A file, an array of levels (H, W), (H, W, 3) or (H, W, 4), a Pillow image, or an :class:`Image`."""
+LENS_PAIRS = 60  # pairs of images whose seeds are matched to find the lens
 MASK_REACH = 4.0  # half width, in pixels of its scale, of the window that determines the position of a corner
 
 
@@ -144,15 +154,19 @@ class FromImages:
         digests = enumerate(image.digest for image in job.inputs.decoded)
         keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
 
+        frames = [None] * len(images) if job.lens is None else list(frames_of(job).values())
+        if job.lens is not None:
+            keys = {item: run.key("features", key, job.lens[int(item)]) for item, key in keys.items()}
+
         def batches(missing: Sequence[int]) -> Iterator[Batch]:
-            return (([i], (job.config, images[i])) for i in missing)
+            return (([i], (job.config, images[i], frames[i])) for i in missing)
 
         return report_features(job, run.map_cached("features", keys, _detect, batches))
 
     def prepare(self, job: Job, features: Sequence[Features]) -> Any:
         """The views prepared by the matching method, which tracks are aligned with too."""
         views = dict(enumerate(zip(job.images, features, strict=True)))
-        return PreparedViews(job.config.matching.prepare, views)
+        return PreparedViews(job.config.matching.prepare, views, None if job.lens is None else frames_of(job))
 
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
         """Select the pairs of images to match."""
@@ -165,6 +179,33 @@ class FromImages:
         report_choice(job, choice)
         run.progress("pairs", 1, 1)
         return choice
+
+    def lens(self, job: Job) -> F64 | None:
+        """The lens that seeds of pairs show."""
+        run, matching = job.run, job.config.matching
+        if not isinstance(matching, SeedsAndGrowth) or len(job.images) < MIN_GROUP:
+            return None
+        digests, prior = [image.digest for image in job.inputs.decoded], job.prior
+        variants = [run.variant_key(stage) for stage in ("features", "matching")]
+        key = run.key("pairs", "lens", digests, variants, prior.shared[:, 5], prior.std[:, 5], run.seed)
+        found = run.stored("pairs", "lens", key)
+        compute = (lambda: found) if found is not None else partial(dict, lens=self._lens(job, matching))
+        lens: F64 | None = run.cached("pairs", "lens", key, compute)["lens"]
+        return lens
+
+    def _lens(self, job: Job, matching: SeedsAndGrowth) -> F64 | None:
+        features = self.detect(job)
+        if any(found.seeds is None for found in features):
+            return None
+        n, rng = len(features), stream(job.run.seed, "lens")
+        every = np.column_stack(np.triu_indices(n, 1))
+        some = every[np.sort(rng.permutation(len(every))[:LENS_PAIRS])]
+        found = list[Matches]()
+        for i, j in some.tolist():
+            ways = {"orientation": matching.orientation, "ratio": matching.ratio}
+            sets = seed_matches(features[i], features[j], (i, j), **ways)
+            found.append(max((matches for matches, _ in sets), key=lambda m: len(m.xy1)))
+        return lens_of_matches(job, found)
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """Match the pairs and estimate their epipolar geometry; weak ones again with oblique views."""
@@ -192,9 +233,24 @@ class FromImages:
         """Build tracks from the accepted pairs."""
         run, accepted = job.run, [(pair.i, pair.j) for pair in pairs if pair.accepted]
         key = run.key("tracks", run.variant_key("tracks"), run.logs["matches"].keys, accepted, run.seed)
-        build, map_all, rng = job.config.tracks.build, run.workers.map_all, stream(run.seed, "tracks")
-        compute = partial(build, views, pairs, map_all=map_all, rng=rng)
+        rng = stream(run.seed, "tracks")
+        compute = partial(build_tracks, job, views, pairs, rng)
         return report_tracks(run, run.cached("tracks", "tracks", key, compute))
+
+
+def build_tracks(job: Job, views: Any, pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
+    """Tracks of the accepted pairs, in pixels of the images."""
+    frames = views.every_frame if isinstance(views, PreparedViews) else None
+    if frames is not None:
+        pairs = [pair_in_frames(pair, frames[pair.i], frames[pair.j]) for pair in pairs]
+    found: Tracks = job.config.tracks.build(views, pairs, map_all=job.run.workers.map_all, rng=rng)
+    if frames is None:
+        return found
+    xy = found.xy.copy()
+    for view, frame in frames.items():
+        here = found.view_index == view
+        xy[here] = frame.bent(xy[here])
+    return replace(found, xy=xy)
 
 
 class FromRun:
@@ -225,6 +281,10 @@ class FromRun:
     def select(self, job: Job, features: Sequence[Features]) -> None:
         """No choice: the pairs are those of the other run."""
 
+    def lens(self, job: Job) -> F64 | None:
+        """The lens of the other run."""
+        return None if self.whole.lens is None else self.whole.lens[list(self.views)]
+
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """The pairs within the images."""
         run, number = job.run, {view: k for k, view in enumerate(self.views)}
@@ -251,14 +311,17 @@ class FromRun:
 class PreparedViews(Sequence[Any]):
     """Views prepared for matching on demand, in a least-recently-used cache that is never pickled."""
 
-    def __init__(self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]]) -> None:
-        self._prepare, self._given = prepare, dict(given)
+    def __init__(
+        self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]],
+        frames: Mapping[str, StraightFrame] | None = None,
+    ) -> None:  # fmt: skip
+        self._prepare, self._given, self._frames = prepare, dict(given), frames
         # The cache may hold the same views of several methods.
         self._method = object()
         self._made: RecentlyUsed[tuple[object, int], Any] = RecentlyUsed(CACHE_BYTES)
 
-    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Prepare, dict[int, tuple[Image, Features]]]]:
-        return PreparedViews, (self._prepare, self._given)
+    def __reduce__(self) -> tuple[type[PreparedViews], tuple[Any, ...]]:
+        return PreparedViews, (self._prepare, self._given, self._frames)
 
     def __len__(self) -> int:
         return len(self._given)
@@ -266,11 +329,12 @@ class PreparedViews(Sequence[Any]):
     def __getitem__(self, view: int) -> Any:  # type: ignore[override]
         if view not in self._given:
             raise IndexError(f"view {view} is not among those given")
-        return self._made.get((self._method, view), lambda: self._prepare(*self._given[view]))
+        prepare = self._prepare if self._frames is None else Straightened(self._prepare, self._frames)
+        return self._made.get((self._method, view), lambda: prepare(*self._given[view]))
 
     def prepared_by(self, prepare: Prepare) -> PreparedViews:
         """The same views by another method, in the same cache."""
-        other = PreparedViews(prepare, self._given)
+        other = PreparedViews(prepare, self._given, self._frames)
         other._made = self._made
         return other
 
@@ -280,12 +344,24 @@ class PreparedViews(Sequence[Any]):
         return [features for _, features in self._given.values()]
 
     def masks(self, i: int, j: int) -> tuple[B8 | None, B8 | None]:
-        """Masks of two views, None: all pixels."""
-        return self._given[i][0].mask, self._given[j][0].mask
+        """Masks of two views, None: all pixels; straight images have no corners near masked pixels."""
+        return (None, None) if self._frames else (self._given[i][0].mask, self._given[j][0].mask)
+
+    def frames(self, i: int, j: int) -> tuple[StraightFrame, StraightFrame] | None:
+        """The straight frames of two views, if their images are straightened."""
+        names = (self._given[view][0].name for view in (i, j))
+        return None if self._frames is None else tuple(self._frames[name] for name in names)  # type: ignore
+
+    @property
+    def every_frame(self) -> Mapping[int, StraightFrame] | None:
+        """The straight frames of all views by number, if their images are straightened."""
+        if self._frames is None:
+            return None
+        return {view: self._frames[image.name] for view, (image, _) in self._given.items()}
 
     def subset(self, views: Iterable[int]) -> PreparedViews:
         """The same for some views, with an empty cache."""
-        return PreparedViews(self._prepare, {view: self._given[view] for view in views})
+        return PreparedViews(self._prepare, {view: self._given[view] for view in views}, self._frames)
 
 
 def batch_pairs(
@@ -338,8 +414,10 @@ def _pairs_of_few_views(
             ties.update(near[view])
 
 
-def _detect(config: PipelineConfig, image: Image) -> list[Features]:
-    return [detect_features(config, image)]
+def _detect(config: PipelineConfig, image: Image, frame: StraightFrame | None) -> list[Features]:
+    if frame is None:
+        return [detect_features(config, image)]
+    return [frame.features(detect_features(config, frame.image(image)), straight=False)]
 
 
 def _matched_in_turn(
@@ -395,7 +473,12 @@ def _matched(job: Job, views: PreparedViews, pairs: Sequence[tuple[int, int]], k
 def _match_all(
     config: PipelineConfig, views: PreparedViews, pairs: Sequence[tuple[int, int]], seed: int
 ) -> list[TwoView]:
-    return [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
+    found = list[TwoView]()
+    for i, j in pairs:
+        pair = match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j))
+        frames = views.frames(i, j)
+        found.append(pair if frames is None else pair_from_frames(pair, *frames))
+    return found
 
 
 def _item(i: int, j: int, kind: str) -> str:

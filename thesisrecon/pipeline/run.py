@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, TypedDict, get_args
 import numpy as np
 
 from thesisrecon._numba import code_digest
-from thesisrecon.arrays import I64, flag, whole_number
+from thesisrecon.arrays import F64, I64, flag, whole_number
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
@@ -134,6 +134,10 @@ class Run:
                 self.directory.stage(FOLDERS[stage]).save(item, key, record)
             return record
 
+    def stored(self, stage: str, item: str, key: str) -> Any:
+        """The record of one item from the cache, None if it is not there."""
+        return next(iter(self._loaded(stage, {item: key})))
+
     def _loaded(self, stage: str, keys: Mapping[str, str]) -> Iterator[Any]:
         """Cached records of items, None if missing; warns of changed ones."""
         folder = self.directory.stage(FOLDERS[stage])
@@ -248,8 +252,11 @@ class FrontEnd(Protocol):
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice | None:
         """The pairs of images to match."""
 
+    def lens(self, job: Job) -> F64 | None:
+        """Lenses (V, 3) of images in half diagonals: k1, k2 and the base; None: none bends lines much."""
+
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
-        """Matches and epipolar geometry of the pairs (4.2.2, chapter 5)."""
+        """Matches and epipolar geometry of the pairs (4.2.2, chapter 5), F in straight pixels."""
 
     def track(
         self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
@@ -268,6 +275,8 @@ class Job:
     surface_required: bool = False  # whether a surface that fails is a failure; otherwise it is a warning
     known: IntrinsicsPrior | None = None
     """Prior of the intrinsics, if another model determined them."""
+    lens: F64 | None = None
+    """Lenses (V, 3) of the images in half diagonals, if pairs of images show that they bend lines."""
 
     @property
     def config(self) -> PipelineConfig:
@@ -293,10 +302,11 @@ class Job:
     def prior(self) -> IntrinsicsPrior:
         """Prior of the intrinsics at working size."""
         if self.known is not None:
-            return self.known
+            return self.known if self.lens is None else replace(self.known, lens=self.lens)
         scales = np.array([image.scale for image in self.images])
         sizes = [image.original_size for image in self.images]
-        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+        prior = prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+        return replace(prior, lens=self.lens)
 
     def require_images(self) -> None:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""

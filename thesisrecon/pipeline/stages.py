@@ -29,6 +29,8 @@ from thesisrecon.pipeline.large_sets import (
     from_metric,
     tracks_of_part,
 )
+from thesisrecon.pipeline.lens import straight_pair, straight_tracks
+from thesisrecon.pipeline.matching import build_tracks
 from thesisrecon.pipeline.run import Batch, Job, name_images, stream
 from thesisrecon.records import (
     DepthMap,
@@ -69,9 +71,12 @@ def reconstruct_projective(
     job: Job, tracks: Tracks, pairs: Sequence[TwoView], attempt: int = 0
 ) -> Reconstruction:
     """Reconstruct up to a projective transform (chapter 6); ``attempt`` is the rank of the initial pair."""
-    sizes, method = job.sizes, job.config.projective
+    sizes, method, lens = job.sizes, job.config.projective, job.prior.lens
+    if lens is not None:
+        tracks = straight_tracks(tracks, sizes, lens)
+        pairs = [straight_pair(pair, sizes, lens) for pair in pairs]
     return _cached(
-        job, "projective", attempt, [job.run.logs["tracks"].keys, sizes],
+        job, "projective", attempt, [job.run.logs["tracks"].keys, sizes, *([] if lens is None else [lens])],
         lambda rng: method.reconstruct(tracks, pairs, sizes, rng=rng, attempt=attempt),
     )  # fmt: skip
 
@@ -252,7 +257,7 @@ def register_more(
 
     def register() -> MetricResult:
         rng = stream(run.seed, "metric", attempt, 1)
-        tracks = job.config.tracks.build(views, more, map_all=run.workers.map_all, rng=rng)
+        tracks = build_tracks(job, views, more, rng)
         return better_model(job, metric, cameras_on_tracks(old, tracks), calibration, rng)
 
     upstream = run.logs["metric"].keys[f"attempt-{attempt}"]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import F32, F64, U8, rows_of_views
-from thesisrecon.camera import distort
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.lens import distort
 from thesisrecon.records import (
     IdentifiabilityReport,
     Image,

@@ -314,9 +314,12 @@ def _sample(world: Packed, ray: F64, footprint: float, work: F64, jitter: tuple[
 
 @compiled
 def trace_rows(
-    world: Packed, camera: F64, samples: tuple[int, int], out: F32, depth: F64, shade: bool
+    world: Packed, camera: F64, samples: tuple[int, int], rays: F64, out: F32, depth: F64, shade: bool
 ) -> None:
-    """Samples (row, col) at pixel ((col + 0.5) / n - 0.5, (row + 0.5) / n - 0.5), n = samples per pixel."""
+    """Samples (row, col) at pixel ((col + 0.5) / n - 0.5, (row + 0.5) / n - 0.5), n = samples per pixel.
+
+    ``rays`` are unit directions (H n, W n, 3) in the camera frame of a lens, NaN for none; empty: a pinhole.
+    """
     per_pixel, first_row = samples
     f, cx, cy = camera[0], camera[1], camera[2]
     ray, work = np.zeros(6), np.zeros(22)
@@ -327,9 +330,13 @@ def trace_rows(
         for col in range(out.shape[1]):
             x = ((col + 0.5) / per_pixel - 0.5 - cx) / f
             y = ((row + first_row + 0.5) / per_pixel - 0.5 - cy) / f
-            n = sqrt(x * x + y * y + 1.0)
+            n, z = sqrt(x * x + y * y + 1.0), 1.0
+            if rays.shape[0] > 0:
+                x, y, z, n = rays[row, col, 0], rays[row, col, 1], rays[row, col, 2], 1.0
+                if x != x:
+                    continue
             for i in range(3):
-                ray[3 + i] = (R[i] * x + R[3 + i] * y + R[6 + i]) / n
+                ray[3 + i] = (R[i] * x + R[3 + i] * y + R[6 + i] * z) / n
             if shade:
                 a, b = 2.0 * (col % 2) - 1.0, 2.0 * (row % 2) - 1.0
                 jitter = (0.75 * a + 0.25 * b, 0.75 * b - 0.25 * a)
@@ -337,4 +344,4 @@ def trace_rows(
                 out[row, col, 0], out[row, col, 1], out[row, col, 2] = work[0], work[1], work[2]
             else:
                 t, _ = _first(world, ray, False)
-            depth[row, col] = t / n if t < FAR else 0.0
+            depth[row, col] = t * z / n if t < FAR else 0.0

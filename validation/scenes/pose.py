@@ -18,12 +18,13 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Pose:
-    """A true camera: ``K``, ``R`` (world-to-camera), ``C`` (m), and the ``exposure`` of its image."""
+    """A true camera: ``K``, ``R`` (world-to-camera), ``C`` (m), exposure, and row of a lens."""
 
     K: F64
     R: F64
     C: F64
     exposure: float = 1.0
+    lens: F64 | None = None
 
 
 def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.lens import directions_of_image
 from validation.scenes.kernels import BLOCK, CYLINDER, LEVELS, PLANE, trace_rows
 from validation.scenes.materials import Material, smooth
 from validation.scenes.pose import Pose
@@ -167,7 +168,7 @@ def _group_bounds(objects: list[list[Surface]], numbers: F64) -> F64:
 def trace(
     world: World, pose: Pose, size: tuple[int, int], *, per_pixel: int = 1, shade: bool = True
 ) -> tuple[F32, F64]:
-    """Return linear RGB (H n, W n, 3) and depth (H n, W n) of a pinhole camera, z in metres, 0 = sky.
+    """Return linear RGB (H n, W n, 3) and depth (H n, W n) of a camera, z in metres, 0 = sky or no ray.
     ``size`` is (width, height), n = ``per_pixel`` samples along each axis; sample (r, c) looks at pixel ((c +
     0.5) / n - 0.5, ...). Without ``shade`` the colours are zero. The exposure of ``pose`` is not used.
     """
@@ -175,5 +176,10 @@ def trace(
     depth = np.zeros(out.shape[:2])
     K = pose.K
     camera = np.concatenate([[K[0, 0], K[0, 2], K[1, 2]], pose.C, pose.R.ravel()])
-    trace_rows((*world,), camera, (per_pixel, 0), out, depth, shade)
+    rays = np.empty((0, 0, 3))
+    if pose.lens is not None:
+        x, y = ((np.arange(side * per_pixel) + 0.5) / per_pixel - 0.5 for side in size)
+        places = np.stack(np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[0, 0]), axis=-1)
+        rays = directions_of_image(places.reshape(-1, 2), pose.lens).reshape(*places.shape[:2], 3)
+    trace_rows((*world,), camera, (per_pixel, 0), rays, out, depth, shade)
     return out, depth

@@ -12,7 +12,8 @@ from scipy.ndimage import map_coordinates
 
 from thesisrecon.api.views import render
 from thesisrecon.arrays import F32, F64, U8
-from thesisrecon.camera import Camera, project_camera, undistort
+from thesisrecon.camera import Camera, project_camera
+from thesisrecon.lens import undistort
 from thesisrecon.records import TexturedMesh
 from validation.references.libraries import one_thread
 from validation.references.opencv import board_corners, calibrate_from_corners

@@ -116,6 +116,9 @@ def away_from_zero(w: float) -> float:
 
 _MORTON_BITS = 31
 TINY = 1e-12
+LENS = 11
+"""Column of the number of the lens model, in tables of twelve columns; others are radial."""
+RADIAL, DIVISION, FISHEYE = 0, 1, 2
 
 
 class Observations(NamedTuple):
@@ -219,10 +222,48 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
     """Return the pixel of a point in the camera frame, w away from 0; q is a row of intrinsics."""
     a, b = x0 / w, x1 / w
     r2 = a * a + b * b
+    if len(q) > LENS:
+        return _image_through_lens(q, a, b, r2)
     d = 1.0 + q[5] * r2
     if len(q) > 6:
         d += (q[6] + q[7] * r2) * r2 * r2
     return q[0] * a * d + q[2] * b * d + q[3], q[0] * q[1] * b * d + q[4]
+
+
+@kernel
+def _image_through_lens(q: F64, a: float, b: float, r2: float) -> tuple[float, float]:
+    """Return the pixel of a normalised point, by the lens model q[LENS]."""
+    d = _lens_profile(q, r2)[0]
+    u = a * d + 2.0 * q[9] * a * b + q[10] * (r2 + 2.0 * a * a)
+    v = b * d + 2.0 * q[10] * a * b + q[9] * (r2 + 2.0 * b * b)
+    return q[0] * u + q[2] * v + q[3], q[0] * q[1] * v + q[4]
+
+
+@kernel
+def _lens_profile(q: F64, r2: float) -> tuple[float, float, float, float]:
+    """Return d(r^2) of the image d (a, b) without decentring, its derivative by r^2, and s, e.
+
+    The derivative of d by the n-th radial coefficient is e s^n, counted from 1.
+    """
+    if q[LENS] == DIVISION:
+        # r_d = d r solves r = r_d / (1 + k r_d^2).
+        root = math.sqrt(max(1.0 - 4.0 * q[5] * r2, TINY))
+        d = 2.0 / (1.0 + root)
+        return d, d * d * q[5] / root, r2, d * d / root
+    s, scale, turn = r2, 1.0, 1.0
+    if q[LENS] == FISHEYE:
+        r = math.sqrt(r2)
+        angle = math.atan(r)
+        s = angle * angle
+        # Below, the quotient and its derivative by their series: exact to rounding.
+        scale = angle / r if r2 > 1e-12 else 1.0 - r2 / 3.0
+        turn = 1.0 / (1.0 + r2)
+    radial = 1.0 + (q[5] + (q[6] + (q[7] + q[8] * s) * s) * s) * s
+    slope = q[5] + (2.0 * q[6] + (3.0 * q[7] + 4.0 * q[8] * s) * s) * s
+    d = scale * radial
+    if q[LENS] == FISHEYE:
+        slope = q[5] - 1.0 / 3.0 if r2 < 1e-6 else 0.5 * ((radial + 2.0 * slope * s) * turn - d) / r2
+    return d, slope, s, scale
 
 
 @kernel
@@ -284,10 +325,11 @@ def linearize_metric(
     """Fill weighted residuals, in units of sigma, and their Jacobians; return the cost.
 
     A pose moves by x -> exp(w) x + d in the camera frame: columns (w, d) of A, then the intrinsics ``own``
-    among (log f, aspect, skew, cx, cy, k1, k2, k3); ``common`` are those in the columns of E.
+    among (log f, aspect, skew, cx, cy, k1, k2, k3, k4, p1, p2); ``common`` are those in the columns of E.
     """
     cost = 0.0
-    D = empty((2, 10))
+    point = max(model.intrinsics.shape[1], 8)
+    D = empty((2, point + 2))
     for k in range(len(obs.xy)):
         v, x = obs.view_index[k], model.X[obs.point_index[k]]
         r, q = model.R[v], model.intrinsics[model.group[v]]
@@ -305,7 +347,7 @@ def linearize_metric(
             # (I - (1 - sqrt(kept)) e e' / s) J with the residual over sqrt(kept): the gradient is the same.
             kept = np.sqrt(kept)
             root /= kept
-            for c in range(10):
+            for c in range(point + 2):
                 along = (1.0 - kept) * (e0 * D[0, c] + e1 * D[1, c]) / s
                 D[0, c], D[1, c] = D[0, c] - along * e0, D[1, c] - along * e1
         J.residual[k, 0], J.residual[k, 1] = root * e0, root * e1
@@ -313,8 +355,9 @@ def linearize_metric(
             J.A[k, 0, 6 + c], J.A[k, 1, 6 + c] = D[0, own[c]], D[1, own[c]]
         for c in range(len(common)):
             J.E[k, 0, c], J.E[k, 1, c] = D[0, common[c]], D[1, common[c]]
-        j00, j01, j02 = D[0, 8] / w, D[0, 9] / w, -(D[0, 8] * a + D[0, 9] * b) / w
-        j10, j11, j12 = D[1, 8] / w, D[1, 9] / w, -(D[1, 8] * a + D[1, 9] * b) / w
+        da, db = D[:, point], D[:, point + 1]
+        j00, j01, j02 = da[0] / w, db[0] / w, -(da[0] * a + db[0] * b) / w
+        j10, j11, j12 = da[1] / w, db[1] / w, -(da[1] * a + db[1] * b) / w
         A = J.A[k]
         A[0, 0], A[0, 1], A[0, 2] = j02 * x1 - j01 * w, j00 * w - j02 * x0, j01 * x0 - j00 * x1
         A[1, 0], A[1, 1], A[1, 2] = j12 * x1 - j11 * w, j10 * w - j12 * x0, j11 * x0 - j10 * x1
@@ -331,6 +374,9 @@ def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
     """Fill D (2, 10): derivatives of the pixel by eight intrinsics and the normalised point, times root."""
     f, g, skew = root * q[0], root * q[0] * q[1], root * q[2]
     r2 = a * a + b * b
+    if len(q) > LENS:
+        _fill_lens_columns(q, a, b, (f, g, skew, root), D)
+        return
     # d is the distortion, slope its derivative over r^2.
     d, slope = 1.0 + q[5] * r2, q[5]
     if len(q) > 6:
@@ -347,3 +393,30 @@ def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
     m00, m01, m11 = d + 2.0 * slope * a * a, 2.0 * slope * a * b, d + 2.0 * slope * b * b
     D[0, 8], D[0, 9] = f * m00 + skew * m01, f * m01 + skew * m11
     D[1, 8], D[1, 9] = g * m01, g * m11
+
+
+@kernel
+def _fill_lens_columns(q: F64, a: float, b: float, scales: tuple[float, float, float, float], D: F64) -> None:
+    """Fill D (2, 14) for a lens model of its own: eleven intrinsics, the model (0) and the point."""
+    f, g, skew, root = scales
+    r2 = a * a + b * b
+    d, slope, s, e = _lens_profile(q, r2)
+    u = a * d + 2.0 * q[9] * a * b + q[10] * (r2 + 2.0 * a * a)
+    v = b * d + 2.0 * q[10] * a * b + q[9] * (r2 + 2.0 * b * b)
+    D[0, 0], D[1, 0] = f * u, g * v
+    D[0, 1], D[1, 1] = 0.0, f * v
+    D[0, 2], D[1, 2] = root * v, 0.0
+    D[0, 3], D[1, 3] = root, 0.0
+    D[0, 4], D[1, 4] = 0.0, root
+    for n in range(4):
+        e *= s
+        D[0, 5 + n], D[1, 5 + n] = (f * a + skew * b) * e, g * b * e
+    xx, xy, yy = r2 + 2.0 * a * a, 2.0 * a * b, r2 + 2.0 * b * b
+    D[0, 9], D[1, 9] = f * xy + skew * yy, g * yy
+    D[0, 10], D[1, 10] = f * xx + skew * xy, g * xy
+    D[0, 11], D[1, 11] = 0.0, 0.0
+    m00 = d + 2.0 * slope * a * a + 2.0 * q[9] * b + 6.0 * q[10] * a
+    m01 = 2.0 * slope * a * b + 2.0 * q[9] * a + 2.0 * q[10] * b
+    m11 = d + 2.0 * slope * b * b + 6.0 * q[9] * b + 2.0 * q[10] * a
+    D[0, 12], D[0, 13] = f * m00 + skew * m01, f * m01 + skew * m11
+    D[1, 12], D[1, 13] = g * m01, g * m11
