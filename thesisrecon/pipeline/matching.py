@@ -188,9 +188,8 @@ class FromImages:
         digests, prior = [image.digest for image in job.inputs.decoded], job.prior
         variants = [run.variant_key(stage) for stage in ("features", "matching")]
         key = run.key("pairs", "lens", digests, variants, prior.shared[:, 5], prior.std[:, 5], run.seed)
-        found = run.stored("pairs", "lens", key)
-        compute = (lambda: found) if found is not None else partial(dict, lens=self._lens(job, matching))
-        lens: F64 | None = run.cached("pairs", "lens", key, compute)["lens"]
+        found = run.stored("pairs", "lens", key) or {"lens": self._lens(job, matching)}
+        lens: F64 | None = run.cached("pairs", "lens", key, lambda: found)["lens"]
         return lens
 
     def _lens(self, job: Job, matching: SeedsAndGrowth) -> F64 | None:
@@ -202,8 +201,9 @@ class FromImages:
         some = every[np.sort(rng.permutation(len(every))[:LENS_PAIRS])]
         found = list[Matches]()
         for i, j in some.tolist():
-            ways = {"orientation": matching.orientation, "ratio": matching.ratio}
-            sets = seed_matches(features[i], features[j], (i, j), **ways)
+            sets = seed_matches(
+                features[i], features[j], (i, j), orientation=matching.orientation, ratio=matching.ratio
+            )
             found.append(max((matches for matches, _ in sets), key=lambda m: len(m.xy1)))
         return lens_of_matches(job, found)
 
