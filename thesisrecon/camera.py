@@ -11,7 +11,14 @@ import numpy as np
 
 from thesisrecon import arrays
 from thesisrecon.arrays import B8, F64, Record
-from thesisrecon.lens import Lens, directions_of_image, has_distortion, image_of_directions, lens_row
+from thesisrecon.lens import (
+    Lens,
+    directions_of_image,
+    has_distortion,
+    image_of_directions,
+    lens_row,
+    named_lens,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +111,15 @@ class Camera(Record):
         std = self.std if self.std is None else dict(self.std)
         for name, value in {**fields, "size": (width, height), "std": std}.items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def of_row(
+        cls, pose: tuple[F64, F64, F64], size: tuple[int, int], row: F64, *,
+        std: Mapping[str, float] | None = None, as_stored: bool = False,
+    ) -> Camera:  # fmt: skip
+        """The camera of (K, R, t) with the lens of a row as in :attr:`lens_row`."""
+        lens, coefficients = named_lens(row)
+        return cls(*pose, size, coefficients, std, as_stored, lens)
 
     @classmethod
     def from_matrix(cls, P: F64, size: tuple[int, int]) -> Camera:

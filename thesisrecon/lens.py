@@ -10,6 +10,7 @@ angle from the axis (Kannala and Brandt, 2006), or where the division model r = 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -54,6 +55,18 @@ def named_lens(row: F64) -> tuple[Lens, F64]:
     names: tuple[Lens, ...] = get_args(Lens)
     lens = next(n for n in names if _PLACES[n][0] == row[BASE] and used <= set(_PLACES[n][1]))
     return lens, row[list(_PLACES[lens][1])]
+
+
+def simplest_row(lens: str, coefficients: F64) -> F64:
+    """The row of the simplest lens with these coefficients: of a radial one, k1, k2, k3."""
+    name, known = named_lens(lens_row(lens, coefficients))
+    return np.append(known, np.zeros(3))[:3] if name == "radial" else lens_row(name, known)
+
+
+def stacked_rows(rows: Sequence[F64]) -> F64:
+    """Rows of lenses (V, C) of one width: that of the longest."""
+    width = max((len(row) for row in rows), default=3)
+    return np.array([np.append(row, np.zeros(width - len(row))) for row in rows]).reshape(-1, width)
 
 
 def fit_lens(base: int, radii: F64, tangents: F64, coefficients: int) -> tuple[float, F64]:

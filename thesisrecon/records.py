@@ -219,7 +219,7 @@ class Reconstruction(Record):
     sigma_px: float  #: noise of one image coordinate
     reasons: tuple[str, ...]  #: per view why it is not registered; empty where it is
     K: F64 | None = None  #: (V, 3, 3) calibration matrices in the metric stratum
-    distortion: F64 | None = None  #: (V, 3) radial k1, k2, k3 as in :class:`thesisrecon.Camera`; None: none
+    distortion: F64 | None = None  #: (V, C) rows as :attr:`thesisrecon.Camera.lens_row`; None: none
 
     @property
     def used(self) -> B8:

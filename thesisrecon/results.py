@@ -14,7 +14,6 @@ import scipy
 from thesisrecon import records
 from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
 from thesisrecon.camera import Camera
-from thesisrecon.lens import named_lens
 
 SUMMARY = "summary.json"
 
@@ -77,9 +76,8 @@ class Cameras(Mapping[str, Camera]):
         std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
         std |= pose_deviations(self._metric, i)
         K = one.original_from_working @ r.K[i]
-        lens, row = named_lens(r.distortion[i])
-        size, stored = one.original_size, self._as_stored
-        return Camera(K, Rt[:, :3], Rt[:, 3], size, row, std, as_stored=stored, lens=lens)
+        pose, size = (K, Rt[:, :3], Rt[:, 3]), one.original_size
+        return Camera.of_row(pose, size, r.distortion[i], std=std, as_stored=self._as_stored)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered
@@ -225,7 +223,9 @@ class SparseView(Record):
     t: F64  #: (3,) translation -R centre
     K: F64 | None = None  #: (3, 3); None for a trajectory without intrinsics
     size: tuple[int, int] | None = None  #: width, height
-    distortion: F64 | None = None  #: (3,) k1, k2, k3, zeros for a pinhole; None if unknown or of another kind
+    distortion: F64 | None = (
+        None  #: row of the lens: (3,) k1, k2, k3, zeros for a pinhole, or (12,); None if unknown
+    )
     camera: int = 0  #: number of the camera; views with equal numbers have the same intrinsics
     std: Mapping[str, float] | None = None  #: as in :attr:`thesisrecon.Camera.std`; None if not stated
 

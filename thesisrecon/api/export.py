@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from typing import get_args
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
-from thesisrecon.lens import growing_radius, undistort
+from thesisrecon.lens import Lens, directions_of_image, growing_radius, named_lens, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
@@ -54,6 +55,12 @@ _DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] 
     "kalibr": formats.write_kalibr,
 }
 """Formats of cameras with distortion, which need no images."""
+FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
+_LENSES_OF = {
+    "opencv": ("radial", "brown", "rational", "fisheye"),
+    "kalibr": ("radial", "brown", "fisheye"),
+}
+"""Lenses that a format has; others have all, or no distortion."""
 _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
     "nerfstudio": lambda folder, model, masked: formats.write_nerfstudio(folder, model, masked=masked),
@@ -189,8 +196,11 @@ def _require_cameras(model: SparseModel, to: str) -> None:
         if view.K is None or view.size is None:
             raise UsageError(f"image {view.name} has no intrinsics or no size, which every export needs")
         if view.distortion is None:
-            known = "only radial distortion (k1, k2, k3) can be exported"
-            raise UsageError(f"the lens model of image {view.name} is unknown or of another kind; {known}")
+            raise UsageError(f"the lens model of image {view.name} is unknown; it cannot be exported")
+        lens = named_lens(view.distortion)[0]
+        if lens not in _LENSES_OF.get(to, get_args(Lens)):
+            advice = "colmap-undistorted removes it from the images"
+            raise UsageError(f"{to} has no camera model of a {lens} lens, as image {view.name} has; {advice}")
         if to in _DISTORTED and has_skew(view.K):
             advice = "colmap-undistorted removes it from the images"
             raise UsageError(f"{to} has no camera model with skew, but image {view.name} has skew; {advice}")
@@ -262,9 +272,17 @@ def _file_name(name: str, *, plain: bool) -> str:
 
 
 def _normalized(view: SparseView, xy: F64) -> F64:
-    """Undistorted normalised points (N, 2) of pixels."""
+    """Undistorted normalised points (N, 2) of pixels; far outside where there is none."""
     K, _, distortion = view.intrinsics
-    return undistort(dehomogenize(homogenize(xy) @ np.linalg.inv(K).T), distortion)
+    places = dehomogenize(homogenize(xy) @ np.linalg.inv(K).T)
+    if named_lens(distortion)[0] == "radial":
+        return undistort(places, distortion)
+    rays = directions_of_image(places, distortion)
+    with np.errstate(invalid="ignore"):
+        ahead = rays[:, 2] > 1.0 / FARTHEST
+        plane = dehomogenize(np.where(ahead[:, None], rays, 1.0))
+        outside = places * (FARTHEST / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300))
+    return np.where(ahead[:, None], plane, outside)
 
 
 def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:

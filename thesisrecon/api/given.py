@@ -16,6 +16,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._models import read_model
+from thesisrecon.lens import simplest_row
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult, SparseModel, SparseView
 
@@ -78,10 +79,10 @@ def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> Spars
             rule = "Camera(K, R, t, size) or Camera.from_matrix(P, size) of each image"
             raise UsageError(f"a model of cameras needs {rule}; {name} is a {type(camera).__name__}")
         require_image_name(name, "a model of cameras")
-    lenses = radial_coefficients("a model", list(cameras.values()))
     numbers_of: dict[bytes, int] = {}
     views = []
-    for (name, one), lens in zip(cameras.items(), lenses, strict=True):
+    for name, one in cameras.items():
+        lens = simplest_row(one.lens, np.zeros(1) if one.distortion is None else one.distortion)
         key = np.concatenate([one.K.ravel(), one.size, lens]).tobytes()
         number = numbers_of.setdefault(key, len(numbers_of))
         views.append(SparseView(name, one.R, one.t, one.K, one.size, lens, number, one.std))
@@ -105,16 +106,18 @@ def cameras_by_name(caller: str, model: Model) -> Mapping[str, Camera]:
 
 
 def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:
-    """The cameras of a model by name; UsageError, with its path, if one is incomplete or not radial."""
+    """The cameras of a model by name; UsageError, with its path, if one is incomplete."""
     cameras = {}
     for view in model.views:
         if view.K is None or view.size is None:
             raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
         if view.distortion is None:
             advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
-            raise UsageError(f"{path} gives {view.name} a lens that is not radial; {advice}")
-        fields = view.K, view.R, view.t, view.size, view.distortion
-        cameras[view.name] = Camera(*fields, std=view.std, as_stored=model.as_stored)
+            raise UsageError(f"{path} gives {view.name} a lens of an unknown kind; {advice}")
+        pose = view.K, view.R, view.t
+        cameras[view.name] = Camera.of_row(
+            pose, view.size, view.distortion, std=view.std, as_stored=model.as_stored
+        )
     return cameras
 
 
@@ -167,7 +170,8 @@ def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
     views = []
     for i in np.flatnonzero(r.registered):
         Rt = np.linalg.solve(r.K[i], r.P[i])
-        views.append(Camera(r.K[i], Rt[:, :3], Rt[:, 3], tuple(r.sizes[i].tolist()), lenses[i]))
+        pose = r.K[i], Rt[:, :3], Rt[:, 3]
+        views.append(Camera.of_row(pose, tuple(r.sizes[i].tolist()), lenses[i]))
     return views
 
 
@@ -184,8 +188,8 @@ def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
     table = np.zeros((len(views), 3))
     for row, view in zip(table, views, strict=True):
         lens = np.zeros(0) if view.distortion is None else view.distortion
-        if np.any(lens[3:]):
-            raise ValueError(f"{caller} takes distortion by k1, k2, k3; got {len(lens)} coefficients")
+        if view.lens != "radial":
+            raise ValueError(f"{caller} takes radial lenses (k1, k2, k3); got one that is {view.lens}")
         row[: len(lens[:3])] = lens[:3]
     return table
 

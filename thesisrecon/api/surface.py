@@ -10,7 +10,7 @@ import numpy as np
 
 from thesisrecon import records
 from thesisrecon._numba import ThreadPool
-from thesisrecon.api.given import CameraInput, as_cameras, named_cameras, radial_coefficients
+from thesisrecon.api.given import CameraInput, as_cameras, named_cameras
 from thesisrecon.arrays import F32, F64, I64, U8, number, numbers, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
@@ -18,6 +18,7 @@ from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
 from thesisrecon.imaging.resampling import pinhole_view
 from thesisrecon.io import _images
+from thesisrecon.lens import stacked_rows
 from thesisrecon.pipeline.matching import ImageInput
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
@@ -368,8 +369,8 @@ def _scaled(camera: Camera, scale: float, size: tuple[int, int]) -> Camera:
 
 
 def _model(views: Sequence[Camera]) -> records.Reconstruction:
-    """The cameras without points; ``ValueError`` if distortion has more than three coefficients."""
-    n, lenses = len(views), radial_coefficients("depth of known cameras", views)
+    """The cameras without points."""
+    n, lenses = len(views), stacked_rows([view.lens_row for view in views])
     none = np.zeros(0, dtype=np.int64)
     K, P = (np.array([getattr(view, name) for view in views]).reshape(n, 3, -1) for name in ("K", "P"))
     return records.Reconstruction(

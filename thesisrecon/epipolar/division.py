@@ -37,6 +37,7 @@ MAX_MAGNIFICATION = 5.0
 LEAST = 0.1
 """Smaller lenses are found in the metric stage: two deviations of the prior of k1 at 90 degrees."""
 MIN_MATCHES, MAX_MATCHES, MAX_PAIRS, MIN_PAIRS = 40, 600, 12, 3
+MAX_ROUNDS = 8  # estimates of the noise, which falls while the lens is refined
 TABLE = 4096  # radii at which the inverse of the straightening is tabulated
 
 
@@ -166,7 +167,7 @@ def _sampled(m: Matches, sizes: I64, rng: Generator) -> _Pair:
 
 def _best_of(pairs: Sequence[_Pair], values: Sequence[float], rng: Generator) -> DivisionEstimate | None:
     """The value of k1 by which all pairs together have the least truncated distances, refined."""
-    trials = [[_fundamental(pair, k, rng) for pair in pairs] for k in values]
+    trials = [[_fundamental(pair, np.array([k, 0.0, DIVISION]), rng) for pair in pairs] for k in values]
     best = int(np.argmin([sum(score for score, _ in trial) for trial in trials]))
     some = [(pair, F) for pair, (_, F) in zip(pairs, trials[best], strict=True) if F.any()]
     if len(some) < MIN_PAIRS:
@@ -174,10 +175,20 @@ def _best_of(pairs: Sequence[_Pair], values: Sequence[float], rng: Generator) ->
     found = _adjusted(some, np.array([values[best], 0.0, DIVISION]), 1)
     if len(values) == 1:
         return DivisionEstimate(*found[1:])
-    found = _adjusted(*found[:2], 2)
+    found = _adjusted(_searched_again(found, rng), found[1], 2)
+    found = _adjusted(_searched_again(found, rng), found[1], 2)
     radial = _adjusted(found[0], _radial_like(found[1]), 2)
     found = min(found, radial, key=_truncated)
     return DivisionEstimate(*found[1:])
+
+
+def _searched_again(found: _Adjusted, rng: Generator) -> list[tuple[_Pair, F64]]:
+    """The pairs with F of another search by the refined lens where it explains more matches."""
+    answer = list[tuple[_Pair, F64]]()
+    for pair, F in found[0]:
+        score, other = _fundamental(pair, found[1], rng)
+        answer.append((pair, other if score < _score(F, found[1], pair) else F))
+    return answer
 
 
 def _radial_like(k: F64) -> F64:
@@ -192,32 +203,35 @@ def _radial_like(k: F64) -> F64:
 
 def _truncated(found: _Adjusted) -> float:
     """Mean truncated squared distance of the matches of all pairs, in gates."""
+    sizes = [pair.places.shape[1] for pair, _ in found[0]]
+    return float(np.average([_score(F, found[1], pair) for pair, F in found[0]], weights=sizes))
+
+
+def _score(F: F64, k: F64, pair: _Pair) -> float:
+    """Mean truncated squared distance of the matches of a pair, in gates."""
     gate = 2.0 * LocallyOptimisedRansac().threshold_px
-    distances = np.concatenate([_distances(F, found[1], pair) for pair, F in found[0]])
-    return float(np.minimum((distances / gate) ** 2, 1.0).mean())
+    return float(np.minimum((_distances(F, k, pair) / gate) ** 2, 1.0).mean())
 
 
-def _fundamental(pair: _Pair, k: float, rng: Generator) -> tuple[float, F64]:
+def _fundamental(pair: _Pair, k: F64, rng: Generator) -> tuple[float, F64]:
     """Mean truncated squared distance of all matches in gates, and F; 1 and 0 without F."""
-    search = LocallyOptimisedRansac()
     straight, near = np.empty_like(pair.places), np.ones(pair.places.shape[1], dtype=bool)
     for side, half in enumerate(pair.half):
         # An image of twice the half diagonal about 0 for any shape.
         unit = np.full(2, np.sqrt(2.0))
-        lens, shift = np.array([k, 0.0, DIVISION]), (unit - 1.0) / 2.0
-        places, magnification = straighten(pair.places[side] + shift, unit, lens)
+        shift = (unit - 1.0) / 2.0
+        places, magnification = straighten(pair.places[side] + shift, unit, k)
         straight[side] = half * (places - shift)
         near &= is_straight(magnification)
     if near.sum() < MIN_MATCHES // 2:
         return 1.0, np.zeros((3, 3))
     try:
-        F = search.estimate(straight[0][near], straight[1][near], rng).F
+        F = LocallyOptimisedRansac().estimate(straight[0][near], straight[1][near], rng).F
     except StageFailure:
         return 1.0, np.zeros((3, 3))
     scale = [np.diag([half, half, 1.0]) for half in pair.half]
     F = unit_norm(scale[1] @ F @ scale[0])
-    distance = _distances(F, np.array([k, 0.0, DIVISION]), pair)
-    return float(np.minimum((distance / (2.0 * search.threshold_px)) ** 2, 1.0).mean()), F
+    return _score(F, k, pair), F
 
 
 def _distances(F: F64, k: F64, pair: _Pair) -> F64:
@@ -249,11 +263,11 @@ _Adjusted = tuple[list[tuple[_Pair, F64]], F64, F64]
 def _adjusted(some: Sequence[tuple[_Pair, F64]], k: F64, unknowns: int) -> _Adjusted:
     """Pairs with F, k and its covariance of the least robust sum of squared distances; F have rank 2."""
     state: _State = [F for _, F in some], k
-    for _ in range(3):
-        distances = [
-            np.abs(_distances(F, state[1], pair)) for (pair, _), F in zip(some, state[0], strict=True)
-        ]
-        noise = max(noise_from_distances(np.concatenate(distances)), 0.05)
+    noise = np.inf
+    for _ in range(MAX_ROUNDS):
+        pairs = zip(some, state[0], strict=True)
+        distances = [np.abs(_distances(F, state[1], pair)) for (pair, _), F in pairs]
+        before, noise = noise, max(noise_from_distances(np.concatenate(distances)), 0.05)
         near = [
             pair._replace(places=pair.places[:, distance < 6.0 * noise])
             for (pair, _), distance in zip(some, distances, strict=True)
@@ -263,6 +277,8 @@ def _adjusted(some: Sequence[tuple[_Pair, F64]], k: F64, unknowns: int) -> _Adju
             problem.linearize, problem.moved, problem.cost, state, max_iterations=10, tolerance=1e-5,
             initial_damping=1e-3,
         ).state  # fmt: skip
+        if noise > 0.98 * before:
+            break
     covariance = np.zeros((2, 2))
     free = slice(-unknowns, None)
     covariance[:unknowns, :unknowns] = (

@@ -27,6 +27,7 @@ from thesisrecon.arrays import B8, F64, I64, U8, resizing_transform, rows_of_vie
 from thesisrecon.camera import project_camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._files import first_repeated, read_bytes, require_image_name, write_atomically
+from thesisrecon.lens import Lens, named_lens, simplest_row
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import SparseModel, SparseView
 
@@ -43,11 +44,17 @@ _KINDS = (
     ("EQUIRECTANGULAR", 2),
 )  # fmt: skip
 """Camera models by number: name and number of parameters."""
-_RADIAL = {
-    "SIMPLE_PINHOLE": (), "PINHOLE": (), "SIMPLE_RADIAL": (3,), "RADIAL": (3, 4), "OPENCV": (4, 5),
-    "FULL_OPENCV": (4, 5, 8),
+_LENSES: dict[str, Lens] = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "radial"),
+    **dict.fromkeys(("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "fisheye"),
+    "OPENCV": "brown", "FULL_OPENCV": "rational", "OPENCV_FISHEYE": "fisheye",
+    "THIN_PRISM_FISHEYE": "thin-prism-fisheye", "SIMPLE_DIVISION": "division", "DIVISION": "division",
 }  # fmt: skip
-"""Places of k1, k2, k3 among the parameters; the further ones must be zero."""
+"""Lens of each kind; its coefficients, after focal lengths and principal point, have the same order."""
+_KIND_OF = {lens: kind for kind, lens in _LENSES.items()} | {
+    "division": "DIVISION",
+    "fisheye": "OPENCV_FISHEYE",
+}
 _Row = TypeVar("_Row")
 _Point = tuple[int, tuple[float, float, float], bytes]  # number, position and colour
 
@@ -192,9 +199,8 @@ def _view(image: _Image, cameras: dict[int, _Camera]) -> SparseView:
         focal = _last_focal(kind)
         K = np.diag([params[0], params[focal], 1.0])
         K[:2, 2] = params[focal + 1 : focal + 3] - PIXEL_CENTRE
-        places = _RADIAL.get(kind)
-        if places is not None and not np.delete(params, places)[focal + 3 :].any():
-            distortion = np.array([*params[list(places)], 0.0, 0.0, 0.0][:3])
+        if kind in _LENSES:
+            distortion = simplest_row(_LENSES[kind], params[focal + 3 :])
     R = scipy.spatial.transform.Rotation.from_quat(np.roll(image.pose[:4], -1)).as_matrix()
     return SparseView(image.name, R, image.pose[4:], K, size, distortion, image.camera)
 
@@ -447,9 +453,21 @@ def _write(
 
 
 def _camera_params(K: F64, distortion: F64, *, pinhole: bool) -> tuple[str, tuple[float, ...]]:
-    """Return the smallest COLMAP camera model for K and (k1, k2, k3), and its parameters."""
+    """Return the smallest COLMAP camera model for K and the row of a lens, and its parameters."""
     (fx, fy), (cx, cy) = K[[0, 1], [0, 1]].tolist(), (K[:2, 2] + PIXEL_CENTRE).tolist()
-    k1, k2, k3 = distortion.tolist()
+    lens, known = named_lens(distortion)
+    if lens != "radial":
+        k = known.tolist()
+        if lens == "brown":
+            lens, k = ("rational", [*k, 0.0, 0.0, 0.0]) if k[4] else (lens, k[:4])
+        kind = {
+            "brown": "OPENCV",
+            "rational": "FULL_OPENCV",
+            "fisheye": "OPENCV_FISHEYE",
+            "division": "DIVISION",
+        }
+        return kind.get(lens, "THIN_PRISM_FISHEYE"), (fx, fy, cx, cy, *k)
+    k1, k2, k3 = known.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
     # One focal length for both moves no pixel by more than rounding.

@@ -24,7 +24,7 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
 from thesisrecon.io._other_models import LOOKS_BACK
-from thesisrecon.lens import undistort
+from thesisrecon.lens import named_lens, undistort
 from thesisrecon.results import SparseModel, SparseView
 
 
@@ -121,9 +121,14 @@ def write_opencv(folder: Path, model: SparseModel) -> Path:
     cameras, number = _distinct_cameras(model)
     head = "%YAML:1.0\n---\n"
     for i, view in enumerate(cameras):
-        K, (width, height), (k1, k2, k3) = view.intrinsics
+        K, (width, height), row = view.intrinsics
+        lens, known = named_lens(row)
+        if lens == "radial":
+            known = np.insert(known, [2, 2], 0.0)
         entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
-        entries.append(_matrix("distortion_coefficients", np.array([[k1, k2, 0.0, 0.0, k3]])))
+        # OpenCV has one set of functions for fisheye lenses and one for all others.
+        entries += ["distortion_model: fisheye\n"] if lens == "fisheye" else []
+        entries.append(_matrix("distortion_coefficients", known[None]))
         write_text(folder / f"camera_{i}.yml", head + "".join(entries))
     images = []
     for view, i in zip(model.views, number, strict=True):
@@ -145,13 +150,17 @@ def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
     lines, notes = list[str](), list[str]()
     for i, view in enumerate(_distinct_cameras(model)[0]):
         K, (width, height), _ = view.intrinsics
-        (k1, k2), error_px = _two_coefficients(view)
+        lens, known = named_lens(view.intrinsics[2])
+        kind, error_px = "equidistant" if lens == "fisheye" else "radtan", 0.0
+        if lens == "radial":
+            (k1, k2), error_px = _two_coefficients(view)
+            known = np.array([k1, k2, 0.0, 0.0])
         if error_px > 0.0:
             notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
         lines += [
             f"cam{i}:", "  camera_model: pinhole",
-            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]", "  distortion_model: radtan",
-            f"  distortion_coeffs: [{_numbers(np.array([k1, k2, 0.0, 0.0]), ', ')}]",
+            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]", f"  distortion_model: {kind}",
+            f"  distortion_coeffs: [{_numbers(known[:4], ', ')}]",
             f"  resolution: [{width}, {height}]", f"  rostopic: /cam{i}/image_raw",
         ]  # fmt: skip
     write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
@@ -215,6 +224,7 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
     listed = [
         {"name": name, "width": camera.size[0], "height": camera.size[1]}
         | {key: getattr(camera, key) for key in ("K", "distortion", "R", "t", "centre")}
+        | ({"lens": camera.lens} if camera.lens != "radial" else {})
         | ({"std": dict(sorted(camera.std.items()))} if camera.std else {})
         for name, camera in cameras.items()
     ]

@@ -117,18 +117,18 @@ def _read_views(path: Path) -> list[SparseView]:
 
 
 def _view(name: str, entry: Any, camera: int) -> SparseView:
-    entry = {"distortion": (0.0, 0.0, 0.0)} | entry
+    entry = {"distortion": (0.0, 0.0, 0.0), "lens": "radial"} | entry
     keys = ("K", "R", "distortion", "t" if "t" in entry else "C")
     K, R, k, t = (np.array(entry[key], dtype=np.float64) for key in keys)
     if "t" not in entry:
         t = -R @ t
     size = (int(entry["width"]), int(entry["height"])) if "width" in entry else None
     # The record checks shapes and values; its tolerance for R is that of four digits.
-    Camera(K, R, t, size or (1, 1), k)
-    if k.shape != (3,) or max(size or (1, 1)) > MAX_SIDE_PX:
+    camera_of = Camera(K, R, t, size or (1, 1), k, lens=entry["lens"])
+    if (camera_of.lens == "radial" and k.shape != (3,)) or max(size or (1, 1)) > MAX_SIDE_PX:
         raise ValueError("three coefficients and possible sides are needed")
     std = {str(part): float(value) for part, value in entry.get("std", {}).items()}
-    return SparseView(name, R, t, K, size, k, camera, std or None)
+    return SparseView(name, R, t, K, size, camera_of.lens_row, camera, std or None)
 
 
 def _read_trajectory(path: Path) -> list[SparseView]:

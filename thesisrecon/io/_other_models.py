@@ -24,6 +24,7 @@ from thesisrecon.errors import UsageError, in_words
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import read_bytes, read_json, read_text
+from thesisrecon.lens import simplest_row
 from thesisrecon.results import SparseModel, SparseView
 
 LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
@@ -120,12 +121,14 @@ def read_transforms(path: Path) -> SparseModel:
 def _nerf_camera(
     given: dict[str, Any], folder: Path, file: str
 ) -> tuple[F64 | None, tuple[int, int] | None, F64 | None]:
-    """K, size and distortion of a frame; None for what is not given or not radial."""
+    """K, size and lens of a frame; None for what is not given or of an unknown kind."""
     size = (int(given["w"]), int(given["h"])) if "w" in given and "h" in given else _size_of(folder, file)
     numbers = {k: float(given.get(k, 0.0)) for k in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    radial = not (numbers["k4"] or numbers["p1"] or numbers["p2"])
-    radial = radial and "FISHEYE" not in str(given.get("camera_model", "")).upper()
-    lens = np.array([numbers["k1"], numbers["k2"], numbers["k3"]]) if radial else None
+    fisheye = "FISHEYE" in str(given.get("camera_model", "")).upper()
+    order = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    known = not any(numbers[k] for k in numbers.keys() - set(order))
+    coefficients = np.array([numbers[k] for k in order])
+    lens = simplest_row("fisheye" if fisheye else "brown", coefficients) if known else None
     if "fl_x" not in given and size is None:
         return None, None, lens
     if "fl_x" in given:
@@ -336,9 +339,8 @@ def read_kalibr(path: Path) -> SparseModel:
         width, height = (int(v) for v in camera["resolution"])
         model = camera.get("distortion_model", "none")
         lens = np.zeros(4) if model == "none" else np.array(camera["distortion_coeffs"], dtype=np.float64)
-        radial = camera["camera_model"] == "pinhole" and model in ("radtan", "none")
-        radial = radial and not lens[2:].any()
-        k = np.append(lens[:2], 0.0) if radial else None
+        kind = {"radtan": "brown", "none": "brown", "equidistant": "fisheye"}.get(model)
+        k = simplest_row(kind, lens) if kind and camera["camera_model"] == "pinhole" else None
         views.append(SparseView(name, R, t, _calibration(fx, fy, cx, cy), (width, height), k, i))
     return SparseModel(views)
 

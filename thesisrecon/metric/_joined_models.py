@@ -16,7 +16,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.lens import undistort
+from thesisrecon.lens import stacked_rows, undistort
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import draw_samples
 from thesisrecon.records import Reconstruction, Similarity
@@ -272,7 +272,8 @@ def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree:
     of_first = np.where((both & only)[t.point_index], first.registered[t.view_index], first.inlier)
     of_second = np.where((both & ~second.valid)[t.point_index], new[t.view_index], second.inlier)
     inlier = of_first | (of_second & (only | both)[t.point_index])
-    distortion = np.where(new[:, None], second.distortion, first.distortion)
+    lenses = stacked_rows([*first.distortion, *second.distortion])
+    distortion = np.where(new[:, None], lenses[len(P) :], lenses[: len(P)])
     registered, valid, reasons = first.registered | new, first.valid | only, ("",) * len(P)
     seen = (registered, valid, inlier, t, first.sizes, first.sigma_px, reasons, K, distortion)
     return Reconstruction("metric", P, X, *seen)

@@ -24,8 +24,10 @@ from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import nearest_rotation
+from thesisrecon.lens import stacked_rows
 from thesisrecon.matching.pair_selection import strong_pairs
 from thesisrecon.optimize.bundle.projection import MetricModel, image_points
+from thesisrecon.pipeline.lens import as_imaged, straight_pair, straight_tracks
 from thesisrecon.pipeline.run import Batch, Job, stream
 from thesisrecon.records import (
     IntrinsicsPrior,
@@ -235,7 +237,7 @@ def input_of_part(
 def prior_of_views(prior: IntrinsicsPrior, views: I64 | Sequence[int]) -> IntrinsicsPrior:
     """The prior of some views."""
     rows = {name: getattr(prior, name)[views] for name in ("mean", "std", "shared", "kind")}
-    return replace(prior, **rows)
+    return replace(prior, **rows, lens=None if prior.lens is None else prior.lens[views])
 
 
 def reconstruct_part(
@@ -252,12 +254,16 @@ def reconstruct_part(
         valid=np.zeros(N, dtype=bool), inlier=np.zeros(len(tracks.xy), dtype=bool), tracks=tracks,
         sizes=sizes, sigma_px=1.0, reasons=("",) * n, K=np.zeros((n, 3, 3)), distortion=np.zeros((n, 3)),
     )  # fmt: skip
+    straight, pairs = tracks, given.pairs
+    if prior.lens is not None:
+        straight = straight_tracks(tracks, sizes, prior.lens)
+        pairs = tuple(straight_pair(pair, sizes, prior.lens) for pair in pairs)
     for attempt in range(attempts):
         rng = stream(seed, "part", number, attempt)
         try:
-            projective = config.projective.reconstruct(tracks, given.pairs, sizes, rng=rng, attempt=attempt)
+            projective = config.projective.reconstruct(straight, pairs, sizes, rng=rng, attempt=attempt)
             calibration = calibrate_with_core(config.selfcalibration, projective, prior=prior, rng=rng)
-            start = calibrated_part(projective, calibration)
+            start = as_imaged(calibrated_part(projective, calibration), tracks, prior)
             metric = config.metric.refine(start, calibration, prior=prior, rng=rng, threads=1)
         except StageFailure:
             continue
@@ -381,7 +387,7 @@ def _cameras_in_one_frame(
 ) -> tuple[B8, F64, F64, F64, F64]:
     """Registered views (V,), R, centres, K and distortion, if possible from the part that owns the view."""
     registered, R, K = np.zeros(n_views, dtype=bool), np.zeros((n_views, 3, 3)), np.zeros((n_views, 3, 3))
-    C, distortion = np.zeros((n_views, 3)), np.zeros((n_views, 3))
+    C, lenses = np.zeros((n_views, 3)), [np.zeros(3)] * n_views
     for inner, (p, (part, similarity)) in product((True, False), placed.items()):
         model = part.model
         free = model.registered & ~registered[part.views] & (np.isin(part.views, own[p]) | (not inner))
@@ -389,9 +395,11 @@ def _cameras_in_one_frame(
         turned, centres = _poses(model, np.flatnonzero(free))
         assert model.K is not None
         R[views], C[views], K[views] = turned @ similarity.R.T, similarity.apply(centres), model.K[free]
-        distortion[views] = 0.0 if model.distortion is None else model.distortion[free]
+        if model.distortion is not None:
+            for view, lens in zip(views.tolist(), model.distortion[free], strict=True):
+                lenses[view] = lens
         registered[views] = True
-    return registered, R, C, K, distortion
+    return registered, R, C, K, stacked_rows(lenses)
 
 
 def _points_in_one_frame(tracks: Tracks, placed: Iterable[tuple[_Part, Similarity]]) -> tuple[F64, I64, B8]:

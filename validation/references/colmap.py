@@ -22,6 +22,7 @@ from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._files import write_text
 from thesisrecon.io._models import read_model
+from thesisrecon.lens import stacked_rows
 from thesisrecon.records import Reconstruction, Tracks
 from validation.references.libraries import pycolmap
 
@@ -29,22 +30,21 @@ from validation.references.libraries import pycolmap
 def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
     """Read a COLMAP model as a metric reconstruction in the pixels of its images, which ``names`` number. All
     points are valid and all observations inliers. ``sigma_px`` is 1.4826 times the median absolute coordinate
-    residual. UsageError for missing or damaged files and for other cameras than pinholes with three radial
-    coefficients.
+    residual. UsageError for missing or damaged files and for lenses of an unknown kind.
     """
     model = read_model(folder)
     unknown = sorted(set(model.names) - set(names))
     if unknown:
         raise ValueError(f"names must hold each image once; missing: {unknown[:3]}")
     V, N = len(names), len(model.X)
-    K, distortion, P = np.zeros((V, 3, 3)), np.zeros((V, 3)), np.zeros((V, 3, 4))
+    K, rows, P = np.zeros((V, 3, 3)), [np.zeros(3)] * V, np.zeros((V, 3, 4))
     sizes, registered = np.zeros((V, 2), np.int64), np.isin(names, model.names)
     index = np.array([names.index(name) for name in model.names], np.int64)
     residual = np.zeros((len(model.xy), 2))
     for k, (i, view) in enumerate(zip(index.tolist(), model.views, strict=True)):
         if view.K is None or view.distortion is None or view.size is None:
-            raise UsageError(f"the camera of {view.name} has other distortion than three radial coefficients")
-        K[i], distortion[i], sizes[i] = view.K, view.distortion, view.size
+            raise UsageError(f"the camera of {view.name} has a lens of an unknown kind")
+        K[i], rows[i], sizes[i] = view.K, view.distortion, view.size
         P[i] = compose_camera(view.K, view.R, view.t)
         here = model.view_index == k
         # Points may lie in a camera's principal plane, or so far away that squares overflow.
@@ -52,7 +52,7 @@ def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
             X = model.X[model.point_index[here]]
             seen = project_camera(view.K, view.R, view.t, X, distortion=view.distortion)
             residual[here] = np.abs(seen - model.xy[here])
-    residual = residual[np.isfinite(residual)]
+    residual, distortion = residual[np.isfinite(residual)], stacked_rows(rows)
     order = np.lexsort((index[model.view_index], model.point_index))
     view_index, point_index = index[model.view_index][order], model.point_index[order]
     sigma_px = 1.4826 * float(np.median(residual)) if len(residual) else 0.0

@@ -1,0 +1,135 @@
+"""Lenses that bend lines: found in pairs of images, and cameras of a room without any prior."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thesisrecon import Camera, reconstruct_from_tracks
+from thesisrecon.arrays import F64
+from thesisrecon.epipolar.division import bend, estimate_division, is_straight, straighten
+from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.lens import DIVISION, PERSPECTIVE, image_of_directions, lens_row
+from thesisrecon.pipeline.inputs import given_tracks, views_of
+
+SIZE = (1000, 750)
+CENTRE = (np.array(SIZE) - 1.0) / 2.0 + [6.0, -5.0]
+LENSES: dict[str, tuple[Any, list[float], float]] = {
+    "straight": ("radial", [0.0], 700.0),
+    "slight": ("radial", [-0.05], 800.0),
+    "radial": ("radial", [-0.2, 0.04], 520.0),
+    "fisheye": ("fisheye", [-0.02, 0.001], 380.0),
+}
+
+
+def _inside(lens: str, *, seed: int = 0, views: int = 12, points: int = 1800) -> tuple[F64, F64, F64]:
+    """Pixels (V, N, 2) of a room, cameras on a circle in it that look outwards; centres and rotations."""
+    kind, k, focal = LENSES[lens]
+    rng = np.random.default_rng([11, seed])
+    X = rng.uniform(-1.0, 1.0, (points, 3))
+    wall = rng.integers(0, 3, points)
+    X[np.arange(points), wall] = np.sign(X[np.arange(points), wall])
+    X *= [7.0, 7.0, 3.5]
+    angles = 2.0 * np.pi * np.arange(views) / views
+    C = np.column_stack([2.5 * np.cos(angles), 2.5 * np.sin(angles), 0.6 * np.sin(3.0 * angles)])
+    turn = Rotation.from_euler(
+        "yx", np.column_stack([90.0 - np.degrees(angles), rng.normal(0, 8, views)]), degrees=True
+    )
+    R = turn.inv().as_matrix() @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    row, xy = lens_row(kind, np.array(k)), np.full((views, points, 2), np.nan)
+    for v in range(views):
+        Y = (X - C[v]) @ R[v].T
+        ahead = Y[:, 2] > 0.1 * np.linalg.norm(Y, axis=1)
+        place = image_of_directions(Y[ahead], row) * focal + CENTRE
+        inside = ((place > 0) & (place < np.array(SIZE) - 1.0)).all(axis=1)
+        seen = np.flatnonzero(ahead)[inside]
+        xy[v, seen] = place[inside]
+    return xy + rng.normal(0.0, 0.3, xy.shape), C, R
+
+
+def _matches(xy: F64) -> Any:
+    return given_tracks(xy, views_of([SIZE] * len(xy), None, None)).matches
+
+
+def _straightness(lens: str, k: F64) -> float:
+    """Largest distance px of true straight positions from those of a lens, up to a focal length."""
+    kind, coefficients, focal = LENSES[lens]
+    tangents = np.linspace(0.02, 1.2, 60)
+    rays = np.column_stack([tangents, 0.0 * tangents, np.ones(60)])
+    middle = (np.array(SIZE) - 1.0) / 2.0
+    xy = image_of_directions(rays, lens_row(kind, np.array(coefficients))) * focal + middle
+    straight = (straighten(xy, np.array(SIZE), k)[0] - middle)[:, 0]
+    scale = float(straight @ tangents / (tangents @ tangents))
+    return float(np.abs(straight / scale - tangents).max())
+
+
+@pytest.mark.parametrize(("lens", "base"), [
+    ("straight", None), ("slight", None), ("radial", PERSPECTIVE), ("fisheye", DIVISION),
+])  # fmt: skip
+def test_pairs_show_the_lens(lens: str, base: int | None) -> None:
+    found = estimate_division(_matches(_inside(lens)[0]), np.array([SIZE] * 12), np.random.default_rng(0))
+    assert found is not None
+    assert found.bends is (base is not None)
+    if base is not None:
+        assert found.k[2] == base
+        assert _straightness(lens, found.k) < 0.01
+        assert _straightness(lens, np.array([0.0, 0.0, DIVISION])) > 0.05
+
+
+def test_wrong_matches_do_not_change_the_lens() -> None:
+    rng, xy = np.random.default_rng(5), _inside("fisheye")[0]
+    # A third of the points are seen somewhere else in each image.
+    wrong = rng.permutation(xy.shape[1])[: xy.shape[1] // 3]
+    xy[:, wrong] = np.where(np.isnan(xy[:, wrong]), np.nan, rng.uniform(0, 700, xy[:, wrong].shape))
+    found = estimate_division(_matches(xy), np.array([SIZE] * 12), rng)
+    assert found is not None
+    assert found.bends
+    assert _straightness("fisheye", found.k) < 0.01
+
+
+@pytest.mark.parametrize("k", [[-0.9, -0.3, DIVISION], [-0.3, 0.08, PERSPECTIVE], [0.1, 0.0, DIVISION]])
+def test_straight_positions_have_an_inverse(k: list[float]) -> None:
+    rng, size = np.random.default_rng(2), np.array(SIZE)
+    xy = rng.uniform(0.0, size - 1.0, (300, 2))
+    straight, magnification = straighten(xy, size, np.array(k))
+    near = is_straight(magnification)
+    np.testing.assert_allclose(bend(straight[near], size, np.array(k)), xy[near], atol=1e-9)
+    along = xy[near] - (size - 1.0) / 2.0
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    ends = (straighten(xy[near] + sign * 1e-3 * along, size, np.array(k))[0] for sign in (1, -1))
+    slope = np.linalg.norm(next(ends) - next(ends), axis=1) / 2e-3
+    np.testing.assert_allclose(magnification[near], slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize("lens", ["radial", "fisheye"])
+def test_cameras_of_a_room_without_a_prior(lens: str) -> None:
+    xy, C, _ = _inside(lens, views=18 if lens == "radial" else 12)
+    result = reconstruct_from_tracks(xy, [SIZE] * len(C))
+    assert len(result.cameras) == len(C)
+    assert result.metric is not None
+    assert result.metric.trusted, result.metric.failed_checks
+    kind, k, focal = LENSES[lens]
+    camera = result.cameras[0]
+    assert camera.std is not None
+    assert camera.lens == kind
+    assert abs(camera.K[0, 0] - focal) < max(3.0 * camera.std["focal_px"], 0.002 * focal)
+    centres = np.array([result.cameras[i].centre for i in range(len(C))])
+    off = estimate_similarity(centres, C).apply(centres) - C
+    extent = np.sqrt(((C - C.mean(axis=0)) ** 2).sum(axis=1).mean())
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.005 * extent
+    # Rays at the radius of a corner have their angle from the axis to a tenth of a degree.
+    places = np.array([[np.linalg.norm(SIZE) / 2.0 - 10.0, 0.0]])
+    true = Camera(np.diag([focal, focal, 1.0]), np.eye(3), np.zeros(3), SIZE, np.array(k), lens=kind)
+    ours = Camera(
+        np.diag([camera.K[0, 0]] * 2 + [1.0]),
+        np.eye(3),
+        np.zeros(3),
+        SIZE,
+        camera.distortion,
+        lens=camera.lens,
+    )
+    angles = [np.degrees(np.arccos(one.unproject(places)[0, 2])) for one in (ours, true)]
+    assert abs(angles[0] - angles[1]) < 0.1
