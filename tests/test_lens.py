@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from thesisrecon import Camera, export
+from thesisrecon.camera import camera_of_row
 from thesisrecon.io._models import read_model
 from thesisrecon.lens import PERSPECTIVE, WIDTH, image_of_directions, lens_row, named_lens
 from thesisrecon.optimize.bundle.projection import (
@@ -137,5 +138,5 @@ def test_files_of_cameras_keep_the_lens(lens: Any, tmp_path: Path) -> None:
             continue
         folder = tmp_path / to / file
         view = read_model(folder if folder.exists() else report.path).views[0]
-        back = Camera.of_row((view.K, np.eye(3), np.zeros(3)), view.size, view.distortion)
+        back = camera_of_row((view.K, np.eye(3), np.zeros(3)), view.size, view.distortion)
         np.testing.assert_allclose(back.project(X), camera.project(X), atol=1e-6)

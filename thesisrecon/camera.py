@@ -113,15 +113,6 @@ class Camera(Record):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def of_row(
-        cls, pose: tuple[F64, F64, F64], size: tuple[int, int], row: F64, *,
-        std: Mapping[str, float] | None = None, as_stored: bool = False,
-    ) -> Camera:  # fmt: skip
-        """The camera of (K, R, t) with the lens of a row as in :attr:`lens_row`."""
-        lens, coefficients = named_lens(row)
-        return cls(*pose, size, coefficients, std, as_stored, lens)
-
-    @classmethod
     def from_matrix(cls, P: F64, size: tuple[int, int]) -> Camera:
         """Return the camera of a matrix of any scale and sign, by RQ decomposition (HZ 6.2.4).
 
@@ -222,6 +213,15 @@ class Camera(Record):
     @property
     def _coefficients(self) -> F64:
         return np.zeros(1) if self.distortion is None else np.asarray(self.distortion, dtype=np.float64)
+
+
+def camera_of_row(
+    pose: tuple[F64, F64, F64], size: tuple[int, int], row: F64, *, std: Mapping[str, float] | None = None,
+    as_stored: bool = False,
+) -> Camera:  # fmt: skip
+    """The camera of (K, R, t) with the lens of a row as in :attr:`Camera.lens_row`."""
+    lens, coefficients = named_lens(row)
+    return Camera(*pose, size, coefficients, std, as_stored, lens)
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:

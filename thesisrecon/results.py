@@ -13,7 +13,7 @@ import scipy
 
 from thesisrecon import records
 from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
-from thesisrecon.camera import Camera
+from thesisrecon.camera import Camera, camera_of_row
 
 SUMMARY = "summary.json"
 
@@ -77,7 +77,7 @@ class Cameras(Mapping[str, Camera]):
         std |= pose_deviations(self._metric, i)
         K = one.original_from_working @ r.K[i]
         pose, size = (K, Rt[:, :3], Rt[:, 3]), one.original_size
-        return Camera.of_row(pose, size, r.distortion[i], std=std, as_stored=self._as_stored)
+        return camera_of_row(pose, size, r.distortion[i], std=std, as_stored=self._as_stored)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered

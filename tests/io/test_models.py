@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import thesisrecon as tr
 from tests.conftest import refuses
 from tests.io.test_colmap import NAMES, export, scene
+from thesisrecon.camera import camera_of_row
 from thesisrecon.errors import UsageError
 from thesisrecon.io._models import read_model
 
@@ -19,6 +20,7 @@ KINDS = (
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
     "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
 )  # fmt: skip
+AHEAD = np.array([[0.2, -0.1, 1.0], [-0.4, 0.3, 1.5], [0.0, 0.0, 2.0]])
 RADIAL = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 2, "FULL_OPENCV": 3}
 
 
@@ -96,15 +98,19 @@ def test_a_rig_with_cameras_of_all_kinds_is_read_as_pycolmap_reads_it(tmp_path, 
         if kind in RADIAL:
             expected = [0.1 * (k + 1) if k < RADIAL[kind] else 0.0 for k in range(3)]
             np.testing.assert_allclose(view.distortion, expected)
-        else:
+        elif kind in ("FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM", "EQUIRECTANGULAR"):
             assert view.distortion is None
+        else:
+            ours_there = camera_of_row((view.K, np.eye(3), np.zeros(3)), view.size, view.distortion)
+            expected = camera.img_from_cam(AHEAD) - 0.5
+            np.testing.assert_allclose(ours_there.project(AHEAD), expected, atol=1e-9)
         here = ours.view_index == i
         np.testing.assert_array_equal(ours.point_index[here], [0, 1, 2])
         np.testing.assert_allclose(ours.xy[here, 0], 10.0 * np.arange(3) + view.camera - 0.5)
 
 
 @pytest.mark.references
-def test_tangential_distortion_is_of_another_kind(tmp_path):
+def test_tangential_distortion_is_read(tmp_path):
     import pycolmap
 
     export(tmp_path, scene(k=(-0.1, 0.05, -0.02)))
@@ -113,8 +119,9 @@ def test_tangential_distortion_is_of_another_kind(tmp_path):
     (tmp_path / "text").mkdir()
     model.write_text(tmp_path / "text")
     view = read_model(tmp_path / "text").views[0]
-    assert view.distortion is None
-    assert view.K[0, 0] == pytest.approx(600.0)
+    ours = camera_of_row((view.K, np.eye(3), np.zeros(3)), view.size, view.distortion)
+    assert ours.lens == "brown"
+    np.testing.assert_allclose(ours.project(AHEAD), model.cameras[1].img_from_cam(AHEAD) - 0.5, atol=1e-9)
 
 
 CAMERA = {"K": [[500.0, 0, 320], [0, 510, 240], [0, 0, 1]], "R": R.tolist(), "width": 640, "height": 480}

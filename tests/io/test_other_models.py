@@ -80,7 +80,9 @@ def test_nerf_gives_an_angle_and_kalibr_a_chain(tmp_path):
     chain.write_text(f"cam0:\n{own}cam1:\n  T_cn_cnm1:\n{rows}  - [0, 0, 0, 1]\n{own}")
     np.testing.assert_allclose(read_cameras(chain)["cam1"].centre, [0.1, 0, 0])
     chain.write_text(f"cam0:\n{entry.format(p=0.01)}")
-    refuses(UsageError, "not radial", read_cameras, chain)
+    assert read_cameras(chain)["cam0"].distortion.tolist() == [0.1, 0.2, 0.01, 0.0, 0.0]
+    chain.write_text(f"cam0:\n{entry.format(p=0.01)}".replace("radtan", "fov"))
+    refuses(UsageError, "an unknown kind", read_cameras, chain)
 
 
 @pytest.mark.parametrize(

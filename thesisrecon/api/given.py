@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import F64, I64, numbers, require_shapes, sizes_of_images
-from thesisrecon.camera import Camera
+from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._models import read_model
@@ -115,7 +115,7 @@ def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:
             advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
             raise UsageError(f"{path} gives {view.name} a lens of an unknown kind; {advice}")
         pose = view.K, view.R, view.t
-        cameras[view.name] = Camera.of_row(
+        cameras[view.name] = camera_of_row(
             pose, view.size, view.distortion, std=view.std, as_stored=model.as_stored
         )
     return cameras
@@ -171,7 +171,7 @@ def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
     for i in np.flatnonzero(r.registered):
         Rt = np.linalg.solve(r.K[i], r.P[i])
         pose = r.K[i], Rt[:, :3], Rt[:, 3]
-        views.append(Camera.of_row(pose, tuple(r.sizes[i].tolist()), lenses[i]))
+        views.append(camera_of_row(pose, tuple(r.sizes[i].tolist()), lenses[i]))
     return views
 
 
