@@ -229,8 +229,8 @@ def _print_gates(results: Results, gates: Mapping[str, Gate]) -> None:
     here = available_scenes(quick=False)
     for place, count in left.items():
         scene = place.partition("/")[2]
-        why = "this run leaves it out" if scene in here else "its images are not on this machine"
-        print(f"not run  {place}, {counted(count, 'gate')}: {why}")
+        reason = "this run leaves it out" if scene in here else "its images are not on this machine"
+        print(f"not run  {place}, {counted(count, 'gate')}: {reason}")
 
 
 def _add_ablate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -61,7 +61,7 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
 
     # Before everything: lenses that bend lines much, seen in pairs of images (Fitzgibbon 2001).
     if job.prior.lens is None and until != "features":
-        job = replace(job, lens=front.lens(job))
+        run.lens = front.lens(job)
 
     # Section 4.2.1: corners and seeds of every image.
     features = front.detect(job)

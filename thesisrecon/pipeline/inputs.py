@@ -88,7 +88,7 @@ class Given:
         run, matches = job.run, self.matches
         variants = [run.variant_key(stage) for stage in ("epipolar", "verification")]
         given = [[m.xy1, m.xy2, m.index1, m.index2] for m in matches]
-        lens = [None if job.lens is None else job.lens[[m.i, m.j]] for m in matches]
+        lens = [None if job.prior.lens is None else job.prior.lens[[m.i, m.j]] for m in matches]
         keys = {
             f"{m.i:05d}-{m.j:05d}": run.key("matches", "given", variants, content, run.seed, *bent)
             for m, content, bent in zip(matches, given, ([] if k is None else [k] for k in lens), strict=True)

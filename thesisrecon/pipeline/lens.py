@@ -132,10 +132,10 @@ class Straightened:
 
 def frames_of(job: Job) -> Mapping[str, StraightFrame]:
     """The straight frames of the images of a job with lenses, by name."""
-    assert job.lens is not None
+    assert job.prior.lens is not None
     made: dict[tuple[Any, ...], StraightFrame] = {}
     answer = {}
-    for image, lens in zip(job.images, job.lens, strict=True):
+    for image, lens in zip(job.images, job.prior.lens, strict=True):
         key = (*image.size, *lens.tolist())
         answer[image.name] = made.setdefault(key, StraightFrame.of(image.size, lens))
     return answer

@@ -154,9 +154,9 @@ class FromImages:
         digests = enumerate(image.digest for image in job.inputs.decoded)
         keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
 
-        frames = [None] * len(images) if job.lens is None else list(frames_of(job).values())
-        if job.lens is not None:
-            keys = {item: run.key("features", key, job.lens[int(item)]) for item, key in keys.items()}
+        frames = [None] * len(images) if job.prior.lens is None else list(frames_of(job).values())
+        if job.prior.lens is not None:
+            keys = {item: run.key("features", key, job.prior.lens[int(item)]) for item, key in keys.items()}
 
         def batches(missing: Sequence[int]) -> Iterator[Batch]:
             return (([i], (job.config, images[i], frames[i])) for i in missing)
@@ -166,7 +166,9 @@ class FromImages:
     def prepare(self, job: Job, features: Sequence[Features]) -> Any:
         """The views prepared by the matching method, which tracks are aligned with too."""
         views = dict(enumerate(zip(job.images, features, strict=True)))
-        return PreparedViews(job.config.matching.prepare, views, None if job.lens is None else frames_of(job))
+        return PreparedViews(
+            job.config.matching.prepare, views, None if job.prior.lens is None else frames_of(job)
+        )
 
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
         """Select the pairs of images to match."""
@@ -283,7 +285,7 @@ class FromRun:
 
     def lens(self, job: Job) -> F64 | None:
         """The lens of the other run."""
-        return None if self.whole.lens is None else self.whole.lens[list(self.views)]
+        return None if self.whole.prior.lens is None else self.whole.prior.lens[list(self.views)]
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """The pairs within the images."""

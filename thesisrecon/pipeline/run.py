@@ -100,6 +100,8 @@ class Run:
     warnings: list[str] = field(default_factory=list, init=False)
     groups: list[dict[str, Any]] = field(default_factory=list, init=False)  #: results of runs inside this one
     cameras: IntrinsicsPrior | None = field(default=None, init=False)  #: known before models are joined
+    lens: F64 | None = field(default=None, init=False)
+    """Lenses (V, 3) of the images in half diagonals, if pairs of images show that they bend lines."""
     started: float = field(default_factory=time.perf_counter, init=False)
     _stage: str = field(default="", init=False)  # the one being computed
 
@@ -275,8 +277,6 @@ class Job:
     surface_required: bool = False  # whether a surface that fails is a failure; otherwise it is a warning
     known: IntrinsicsPrior | None = None
     """Prior of the intrinsics, if another model determined them."""
-    lens: F64 | None = None
-    """Lenses (V, 3) of the images in half diagonals, if pairs of images show that they bend lines."""
 
     @property
     def config(self) -> PipelineConfig:
@@ -298,15 +298,19 @@ class Job:
         """Working sizes (V, 2) of the images."""
         return np.array([image.size for image in self.images], dtype=np.int64)
 
-    @cached_property
+    @property
     def prior(self) -> IntrinsicsPrior:
-        """Prior of the intrinsics at working size."""
+        """Prior of the intrinsics at working size, with the lenses that were found."""
+        lens = self.run.lens
+        return self._given_prior if lens is None else replace(self._given_prior, lens=lens)
+
+    @cached_property
+    def _given_prior(self) -> IntrinsicsPrior:
         if self.known is not None:
-            return self.known if self.lens is None else replace(self.known, lens=self.lens)
+            return self.known
         scales = np.array([image.scale for image in self.images])
         sizes = [image.original_size for image in self.images]
-        prior = prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
-        return replace(prior, lens=self.lens)
+        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
 
     def require_images(self) -> None:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""

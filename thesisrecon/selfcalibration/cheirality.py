@@ -298,7 +298,7 @@ class ModulusConstraint:
         kept = distinct_planes(planes, cost)[: self.max_candidates]
         if not len(planes):
             raise StageFailure.of("no-modulus-solution", len(starts), len(pairs))
-        return planes[kept]
+        return np.asarray(planes[kept])
 
 
 def _pairs_of_constant_cameras(first: I64) -> I64:

@@ -34,7 +34,7 @@ def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
 def _points_at_infinity(P: F64, v: F64) -> F64:
     """Triangulated points (D', 4), v x P X = 0, from vanishing points v (V, D, 3)."""
     v = v / np.linalg.norm(v, axis=2, keepdims=True)
-    seen = np.isfinite(v).all(axis=2)
+    seen = np.asarray(np.isfinite(v).all(axis=2))
     found = []
     for d in np.flatnonzero(seen.sum(axis=0) >= 2):
         rows = np.cross(v[seen[:, d], d, :, None], P[seen[:, d]], axisa=-2, axisb=-2, axisc=-2)
