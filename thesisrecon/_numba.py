@@ -27,6 +27,7 @@ import tempfile
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
@@ -352,6 +353,9 @@ class _Walk:
             self.found.append(f"{value.dtype} {value.shape} {value.tobytes().hex()}")
         elif isinstance(value, ModuleType):
             self.found.append(value.__name__)
+        elif isinstance(value, ContextVar):
+            # It cannot be pickled.
+            self.found.append(value.name)
         elif isinstance(value, (int, float, complex, str, bytes, np.generic, np.dtype, Path, type(None))):
             self.found.append(repr(value))
         else:
