@@ -35,7 +35,7 @@ def page() -> str:
             for m in task.measures
         ]
         lines += [""]
-    command = "`python -m validation layout SET FOLDER -o OUT` lays out a download."
+    command = "`python -m validation layout strecha FOLDER -o OUT` lays out a download of this set."
     lines += ["## Public data sets", "", command, ""]
     lines += ["| set | the download |", "| --- | --- |"]
     lines += [f"| `{name}` | {cell(one.about)} |" for name, one in SETS.items()]
