@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 
-from thesisrecon import Camera, reconstruct_from_tracks
+from thesisrecon import Camera, reconstruct, reconstruct_from_tracks
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.division import bend, estimate_division, is_straight, straighten
 from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.imaging.resampling import resampled
+from thesisrecon.io._images import read_image
+from thesisrecon.io._models import read_model
 from thesisrecon.lens import DIVISION, PERSPECTIVE, image_of_directions, lens_row
 from thesisrecon.pipeline.inputs import given_tracks, views_of
 
+FIXTURES = Path(__file__).parents[2] / "fixtures"
 SIZE = (1000, 750)
 CENTRE = (np.array(SIZE) - 1.0) / 2.0 + [6.0, -5.0]
 LENSES: dict[str, tuple[Any, list[float], float]] = {
@@ -133,3 +139,36 @@ def test_cameras_of_a_room_without_a_prior(lens: str) -> None:
     )
     angles = [np.degrees(np.arccos(one.unproject(places)[0, 2])) for one in (ours, true)]
     assert abs(angles[0] - angles[1]) < 0.1
+
+
+@pytest.mark.slow
+def test_bent_photographs_give_the_cameras_of_straight_ones(tmp_path: Path) -> None:
+    k, shrink = np.array([-0.35, -0.05, DIVISION]), 0.7
+    truth = read_model(FIXTURES / "courtyard" / "cameras.json")
+    names = truth.names[:8]
+    for name in names:
+        image = read_image(FIXTURES / "courtyard" / "images" / name, max_size_px=640).images[0]
+        size = np.array(image.size)
+        middle = (size - 1.0) / 2.0
+
+        def lookup(rows: range, size: Any = size, middle: Any = middle) -> F64:
+            x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
+            straight = straighten(np.stack([x, y], axis=-1).reshape(-1, 2), size, k)[0]
+            return np.asarray((middle + shrink * (straight - middle)).reshape(*x.shape, 2))
+
+        rgb, _ = resampled(image.levels, lookup, image.size)
+        PillowImage.fromarray(rgb).save(tmp_path / f"{Path(name).stem}.png")
+    result = reconstruct(tmp_path, tmp_path / "out", until="metric", threads=1)
+    assert len(result.cameras) == len(names)
+    camera, view = result.cameras[0], truth.views[0]
+    assert camera.lens in ("division", "fisheye", "radial")
+    assert camera.std is not None
+    assert view.K is not None
+    assert view.size is not None
+    focal = view.K[0, 0] * 640.0 / max(view.size) / shrink
+    assert abs(camera.K[0, 0] - focal) < max(3.0 * camera.std["focal_px"], 0.005 * focal)
+    C = np.array([truth.views[i].centre for i in range(len(names))])
+    centres = np.array([result.cameras[i].centre for i in range(len(names))])
+    off = estimate_similarity(centres, C).apply(centres) - C
+    extent = np.sqrt(((C - C.mean(axis=0)) ** 2).sum(axis=1).mean())
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.005 * extent

@@ -199,8 +199,11 @@ class FromImages:
         if any(found.seeds is None for found in features):
             return None
         n, rng = len(features), stream(job.run.seed, "lens")
-        every = np.column_stack(np.triu_indices(n, 1))
-        some = every[np.sort(rng.permutation(len(every))[:LENS_PAIRS])]
+        # Half of them are neighbours by name, which overlap in a sequence.
+        first = np.sort(rng.permutation(n - 1)[: LENS_PAIRS // 2])
+        others = np.sort(rng.integers(0, n, (LENS_PAIRS // 2, 2)), axis=1)
+        both = np.concatenate([np.column_stack([first, first + 1]), others[others[:, 0] < others[:, 1]]])
+        some = np.unique(both, axis=0)
         found = list[Matches]()
         for i, j in some.tolist():
             sets = seed_matches(
