@@ -123,9 +123,10 @@ def list_images(folder: Path) -> list[Path]:
 
 def image_subfolders(folder: Path, *others: Path | str | None) -> str:
     """Names of the subfolders with images, which are not read, but for ``others`` such as the masks."""
-    known = {Path(other).resolve() for other in (folder, *others) if other is not None}
+    # realpath, unlike resolve, has an answer for links in a circle.
+    known = {os.path.realpath(other) for other in (folder, *others) if other is not None}
     inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-    inside = (path for path in inside if path.resolve() not in known and os.access(path, os.R_OK))
+    inside = (path for path in inside if os.path.realpath(path) not in known and os.access(path, os.R_OK))
     return printable(", ".join(path.name for path in inside if list_images(path)))
 
 
