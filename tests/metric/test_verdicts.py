@@ -101,7 +101,9 @@ def test_wrong_focal_lengths_are_not_trusted_or_inside_their_interval(make, seed
     focal = result.metric.intrinsics[0]["focal_px"]
     sigmas = abs(focal.value - scene.focal) / focal.std
     # The scenes are hard enough: without its richer models the interval was 3 to 15 times too narrow.
-    assert focal.std > 0.01 * focal.value
+    # The lens of the rig is found in pairs of images; as a pinhole its focal length was 91 % off.
+    assert focal.std > 0.01 * focal.value or make is fisheye_rig
+    assert abs(focal.value - scene.focal) < 0.01 * scene.focal or make is stabilised_arc
     assert not result.metric.trusted or sigmas < MAX_SIGMAS
 
 
