@@ -36,7 +36,7 @@ MAX_MAGNIFICATION = 5.0
 """Points beyond this magnification, 60 degrees or more off the axis, wait for the metric stage."""
 LEAST = 0.1
 """Smaller lenses are found in the metric stage: two deviations of the prior of k1 at 90 degrees."""
-MIN_MATCHES, MAX_MATCHES, MAX_PAIRS, MIN_PAIRS = 40, 600, 12, 3
+MIN_MATCHES, MAX_MATCHES, MAX_PAIRS, FEW_PAIRS, MIN_PAIRS = 40, 600, 12, 4, 3
 MAX_ROUNDS = 8  # estimates of the noise, which falls while the lens is refined
 TABLE = 4096  # radii at which the inverse of the straightening is tabulated
 
@@ -53,6 +53,11 @@ class DivisionEstimate:
         """Whether lines bend more than the metric stage expects of a lens."""
         deviation = float(np.sqrt(self.covariance.sum()))
         return bool(abs(self.k[0] + self.k[1]) > LEAST + 2.0 * deviation)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether k1, refined from zero, is surely near it."""
+        return bool(abs(self.k[0]) < LEAST / 2.0 and self.covariance[0, 0] < LEAST**2 / 4.0)
 
 
 def straighten(xy: F64, sizes: I64 | F64, k: F64) -> tuple[F64, F64]:
@@ -134,24 +139,26 @@ def estimate_division(matches: Sequence[Matches], sizes: I64, rng: Generator) ->
 
     Most lenses bend little: other values are tried only where a refined one differs from zero.
     """
-    chosen = _chosen_pairs(matches)
-    if len(chosen) < MIN_PAIRS:
-        return None
-    pairs = [_sampled(m, sizes, rng) for m in chosen]
+    pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, MAX_PAIRS)]
+    found = _best_of(pairs[:FEW_PAIRS], (0.0,), rng)
+    return found if found is not None and found.is_small else _best_of(pairs, VALUES, rng)
+
+
+def is_nearly_straight(matches: Sequence[Matches], sizes: I64, rng: Generator) -> bool:
+    """Whether a few pairs of images of one camera show that its lens bends little."""
+    pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, FEW_PAIRS)]
     found = _best_of(pairs, (0.0,), rng)
-    if found is None or abs(found.k[0]) > LEAST / 2.0 or found.covariance[0, 0] > LEAST**2 / 4.0:
-        found = _best_of(pairs, VALUES, rng)
-    return found
+    return found is not None and found.is_small
 
 
-def _chosen_pairs(matches: Sequence[Matches]) -> list[Matches]:
+def _chosen_pairs(matches: Sequence[Matches], wanted: int) -> list[Matches]:
     """Pairs of many matches, such that few of them share an image."""
     order = sorted((m for m in matches if len(m.xy1) >= MIN_MATCHES), key=lambda m: -len(m.xy1))
     used: dict[int, int] = {}
     chosen = list[Matches]()
     for most in (1, 2, len(order)):
         for m in order:
-            if len(chosen) < MAX_PAIRS and m not in chosen and max(used.get(m.i, 0), used.get(m.j, 0)) < most:
+            if len(chosen) < wanted and m not in chosen and max(used.get(m.i, 0), used.get(m.j, 0)) < most:
                 used[m.i], used[m.j] = used.get(m.i, 0) + 1, used.get(m.j, 0) + 1
                 chosen.append(m)
     return chosen
@@ -167,6 +174,8 @@ def _sampled(m: Matches, sizes: I64, rng: Generator) -> _Pair:
 
 def _best_of(pairs: Sequence[_Pair], values: Sequence[float], rng: Generator) -> DivisionEstimate | None:
     """The value of k1 by which all pairs together have the least truncated distances, refined."""
+    if len(pairs) < MIN_PAIRS:
+        return None
     trials = [[_fundamental(pair, np.array([k, 0.0, DIVISION]), rng) for pair in pairs] for k in values]
     best = int(np.argmin([sum(score for score, _ in trial) for trial in trials]))
     some = [(pair, F) for pair, (_, F) in zip(pairs, trials[best], strict=True) if F.any()]

@@ -13,13 +13,31 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar.division import bend, estimate_division, is_straight, straighten
+from thesisrecon.epipolar.division import (
+    bend,
+    estimate_division,
+    is_nearly_straight,
+    is_straight,
+    straighten,
+)
 from thesisrecon.imaging.resampling import resampled
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.pipeline.run import Job, stream
 from thesisrecon.records import Features, Image, IntrinsicsPrior, Matches, Reconstruction, Tracks, TwoView
 
 SAMPLES = 129  # points along a side of an image at which its straight frame is measured
+
+
+def bends_little(job: Job, matches: Sequence[Matches]) -> bool:
+    """Whether some matches show that no lens of three images or more bends lines much."""
+    prior, answer = job.prior, True
+    camera = prior.shared[:, 5]
+    numbers, count = np.unique(camera[prior.std[:, 5] > 0.0], return_counts=True)
+    for number in numbers[count >= 3]:
+        of_camera = [m for m in matches if camera[m.i] == number == camera[m.j]]
+        rng = stream(job.run.seed, "lens", int(number), 1)
+        answer = answer and is_nearly_straight(of_camera, job.sizes, rng)
+    return answer
 
 
 def lens_of_matches(job: Job, matches: Sequence[Matches]) -> F64 | None:

@@ -28,6 +28,7 @@ from thesisrecon.pipeline.large_sets import has_narrow_cut, tracks_of_part
 from thesisrecon.pipeline.lens import (
     Straightened,
     StraightFrame,
+    bends_little,
     frames_of,
     lens_of_matches,
     pair_from_frames,
@@ -53,7 +54,10 @@ Prepare = Callable[[Image, Features], Any]
 OWN_MATCHERS = {*KINDS["matching"].values(), FunctionMatcher}
 ImageInput = str | Path | ArrayLike | Image
 """A file, an array of levels (H, W), (H, W, 3) or (H, W, 4), a Pillow image, or an :class:`Image`."""
-LENS_PAIRS = 60  # pairs of images whose seeds are matched to find the lens
+LENS_PAIRS, FEW_LENS_PAIRS = (
+    60,
+    6,
+)  # pairs of images whose seeds are matched to find the lens, and a first few
 MASK_REACH = 4.0  # half width, in pixels of its scale, of the window that determines the position of a corner
 
 
@@ -199,18 +203,25 @@ class FromImages:
         if any(found.seeds is None for found in features):
             return None
         n, rng = len(features), stream(job.run.seed, "lens")
-        # Half of them are neighbours by name, which overlap in a sequence.
-        first = np.sort(rng.permutation(n - 1)[: LENS_PAIRS // 2])
+        first = rng.permutation(n - 1)
         others = np.sort(rng.integers(0, n, (LENS_PAIRS // 2, 2)), axis=1)
-        both = np.concatenate([np.column_stack([first, first + 1]), others[others[:, 0] < others[:, 1]]])
-        some = np.unique(both, axis=0)
-        found = list[Matches]()
-        for i, j in some.tolist():
-            sets = seed_matches(
-                features[i], features[j], (i, j), orientation=matching.orientation, ratio=matching.ratio
-            )
-            found.append(max((matches for matches, _ in sets), key=lambda m: len(m.xy1)))
-        return lens_of_matches(job, found)
+
+        def seeds(pairs: Any, orientation: Any) -> list[Matches]:
+            found = list[Matches]()
+            for i, j in pairs.tolist():
+                sets = seed_matches(
+                    features[i], features[j], (i, j), orientation=orientation, ratio=matching.ratio
+                )
+                found.append(max((matches for matches, _ in sets), key=lambda m: len(m.xy1)))
+            return found
+
+        # Half of the pairs are neighbours by name, which overlap in a sequence; few of them show most lenses.
+        near = np.column_stack([first, first + 1])[: LENS_PAIRS // 2]
+        upright = "rotated" if matching.orientation == "rotated" else "upright"
+        if bends_little(job, seeds(near[:FEW_LENS_PAIRS], upright)):
+            return None
+        some = np.unique(np.concatenate([near, others[others[:, 0] < others[:, 1]]]), axis=0)
+        return lens_of_matches(job, seeds(some, matching.orientation))
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """Match the pairs and estimate their epipolar geometry; weak ones again with oblique views."""
