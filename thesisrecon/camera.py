@@ -14,7 +14,6 @@ from thesisrecon.arrays import B8, F64, Record
 from thesisrecon.lens import (
     Lens,
     directions_of_image,
-    has_distortion,
     image_of_directions,
     lens_row,
     named_lens,
@@ -143,7 +142,7 @@ class Camera(Record):
     @property
     def is_pinhole(self) -> bool:
         """Whether the camera has no distortion."""
-        return not has_distortion(self.lens_row)
+        return not np.any(self.lens_row)
 
     def project(self, X: F64) -> F64:
         """Project points to pixels, distortion included.

@@ -79,9 +79,39 @@ def fit_lens(base: int, radii: F64, tangents: F64, coefficients: int) -> tuple[f
     return float(fit[0]), fit[1:] / fit[0]
 
 
-def has_distortion(k: F64) -> bool:
-    """Whether a lens (C,) is not that of a pinhole."""
-    return bool(np.any(k))
+def straight_places(p: F64, k: F64) -> tuple[F64, F64]:
+    """Straight places (..., 2) of places p of an image in half diagonals about its middle, by a lens as of
+    :func:`straight_weights`, and their magnification (...), negative beyond the horizon of the lens.
+    """
+    r2 = np.sum(p**2, axis=-1)
+    w, slope = straight_weights(k, r2)
+    growth = w - 2.0 * r2 * slope
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return p / w[..., None], np.where((w > 0.0) & (growth > 0.0), growth / w**2, -1.0)
+
+
+def straight_weights(k: F64, r2: F64) -> tuple[F64, F64]:
+    """w by which places at squared radii r2 (...) of an image are divided to be straight, and dw / dr^2.
+
+    A lens k (3,), or (..., 3), in half diagonals is k1, k2 and its base: w = 1 + k1 r^2 + k2 r^4 of the
+    radius in the image, or in perspective of the straight one; then w is negative where nothing is imaged.
+    """
+    k = np.broadcast_to(k, (*r2.shape, 3))
+    w, slope = 1.0 + (k[..., 0] + k[..., 1] * r2) * r2, k[..., 0] + 2.0 * k[..., 1] * r2
+    radial = k[..., 2] == PERSPECTIVE
+    if not radial.any():
+        return w, slope
+    r, lens = np.sqrt(r2[radial]), k[radial, :2]
+    s = undistort(np.column_stack([r, 0.0 * r]), lens)[:, 0]
+    s2 = s**2
+    back = s * (1.0 + (lens[:, 0] + lens[:, 1] * s2) * s2)
+    growth = 1.0 + (3.0 * lens[:, 0] + 5.0 * lens[:, 1] * s2) * s2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_radius = np.where(s > 1e-6, (1.0 / s - r / s2 / growth) / (2.0 * r), lens[:, 0])
+    found = (np.abs(back - r) <= 1e-6 * (1.0 + r)) & (growth > 0.0)
+    w[radial] = np.where(found, np.divide(r, s, out=np.ones_like(r), where=s > 0.0), -1.0)
+    slope[radial] = np.where(found, by_radius, 0.0)
+    return w, slope
 
 
 def image_of_directions(X: F64, k: float | F64) -> F64:

@@ -20,7 +20,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import unit_norm
-from thesisrecon.lens import DIVISION, PERSPECTIVE, undistort
+from thesisrecon.lens import DIVISION, PERSPECTIVE, straight_places, straight_weights
 from thesisrecon.optimize.least_squares import (
     DenseSystem,
     huber,
@@ -66,34 +66,8 @@ def straighten(xy: F64, sizes: I64 | F64, k: F64) -> tuple[F64, F64]:
     ``sizes`` (2,) or (N, 2) and ``k``, (3,) or (N, 3), are those of the image of each pixel.
     """
     middle, half = (np.asarray(sizes) - 1.0) / 2.0, _half_diagonal(sizes)
-    p = (xy - middle) / half
-    r2 = np.sum(p**2, axis=-1)
-    w, slope = _weights(k, r2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        growth = w - 2.0 * r2 * slope
-        return np.asarray(middle + half * p / w[..., None]), np.where(
-            (w > 0.0) & (growth > 0.0), growth / w**2, -1.0
-        )
-
-
-def _weights(k: F64, r2: F64) -> tuple[F64, F64]:
-    """w of squared radii (N,) of the image, negative where a radial lens images nothing; dw / dr^2."""
-    k = np.broadcast_to(k, (*r2.shape, 3))
-    w, slope = 1.0 + (k[..., 0] + k[..., 1] * r2) * r2, k[..., 0] + 2.0 * k[..., 1] * r2
-    radial = k[..., 2] == PERSPECTIVE
-    if not radial.any():
-        return w, slope
-    r, lens = np.sqrt(r2[radial]), k[radial, :2]
-    s = undistort(np.column_stack([r, 0.0 * r]), lens)[:, 0]
-    s2 = s**2
-    back = s * (1.0 + (lens[:, 0] + lens[:, 1] * s2) * s2)
-    growth = 1.0 + (3.0 * lens[:, 0] + 5.0 * lens[:, 1] * s2) * s2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_radius = np.where(s > 1e-6, (1.0 / s - r / s2 / growth) / (2.0 * r), lens[:, 0])
-    found = (np.abs(back - r) <= 1e-6 * (1.0 + r)) & (growth > 0.0)
-    w[radial] = np.where(found, np.divide(r, s, out=np.ones_like(r), where=s > 0.0), -1.0)
-    slope[radial] = np.where(found, by_radius, 0.0)
-    return w, slope
+    places, magnification = straight_places(np.asarray((xy - middle) / half), k)
+    return np.asarray(middle + half * places), magnification
 
 
 def bend(xy: F64, size: I64 | F64, k: F64) -> F64:
@@ -140,15 +114,19 @@ def estimate_division(matches: Sequence[Matches], sizes: I64, rng: Generator) ->
     Most lenses bend little: other values are tried only where a refined one differs from zero.
     """
     pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, MAX_PAIRS)]
-    found = _best_of(pairs[:FEW_PAIRS], (0.0,), rng)
-    return found if found is not None and found.is_small else _best_of(pairs, VALUES, rng)
+    return _small_lens(pairs[:FEW_PAIRS], rng) or _best_of(pairs, VALUES, rng)
 
 
 def is_nearly_straight(matches: Sequence[Matches], sizes: I64, rng: Generator) -> bool:
     """Whether a few pairs of images of one camera show that its lens bends little."""
     pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, FEW_PAIRS)]
+    return _small_lens(pairs, rng) is not None
+
+
+def _small_lens(pairs: Sequence[_Pair], rng: Generator) -> DivisionEstimate | None:
+    """The lens refined from zero; None if it may be larger than k1 near zero."""
     found = _best_of(pairs, (0.0,), rng)
-    return found is not None and found.is_small
+    return found if found is not None and found.is_small else None
 
 
 def _chosen_pairs(matches: Sequence[Matches], wanted: int) -> list[Matches]:
@@ -203,7 +181,7 @@ def _searched_again(found: _Adjusted, rng: Generator) -> list[tuple[_Pair, F64]]
 def _radial_like(k: F64) -> F64:
     """The radial lens of least squares like a division lens, over the image."""
     radii = np.linspace(0.0, 1.0, 101)[1:]
-    w, slope = _weights(k, radii**2)
+    w, slope = straight_weights(k, radii**2)
     s = radii / w
     seen = (w > 0.0) & (w - 2.0 * radii**2 * slope > 0.0) & (s < 4.0)
     fit = np.linalg.lstsq(s[seen, None] ** [3, 5], (radii - s)[seen], rcond=None)[0]
@@ -224,14 +202,8 @@ def _score(F: F64, k: F64, pair: _Pair) -> float:
 
 def _fundamental(pair: _Pair, k: F64, rng: Generator) -> tuple[float, F64]:
     """Mean truncated squared distance of all matches in gates, and F; 1 and 0 without F."""
-    straight, near = np.empty_like(pair.places), np.ones(pair.places.shape[1], dtype=bool)
-    for side, half in enumerate(pair.half):
-        # An image of twice the half diagonal about 0 for any shape.
-        unit = np.full(2, np.sqrt(2.0))
-        shift = (unit - 1.0) / 2.0
-        places, magnification = straighten(pair.places[side] + shift, unit, k)
-        straight[side] = half * (places - shift)
-        near &= is_straight(magnification)
+    places, magnification = straight_places(pair.places, k)
+    straight, near = pair.half[:, None, None] * places, is_straight(magnification).all(axis=0)
     if near.sum() < MIN_MATCHES // 2:
         return 1.0, np.zeros((3, 3))
     try:
@@ -251,7 +223,7 @@ def _distances(F: F64, k: F64, pair: _Pair) -> F64:
 def _derivatives(directions: F64, F: F64, k: F64, pair: _Pair) -> tuple[F64, F64]:
     """Distances (N,) and their derivatives (N, D) along ``directions`` (D, 3, 3) of F."""
     places = pair.places
-    w, slope = _weights(k, np.sum(places**2, axis=2))
+    w, slope = straight_weights(k, np.sum(places**2, axis=2))
     x1, x2 = np.concatenate([places, w[..., None]], axis=2)
     by_place = 2.0 * slope[..., None] * places
     every = np.concatenate([F[None], directions])

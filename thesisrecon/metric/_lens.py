@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.lens import directions_of_image
+from thesisrecon.lens import ANGLE, DIVISION, PERSPECTIVE, directions_of_image
 from thesisrecon.metric import _model
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._model import FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
-from thesisrecon.optimize.bundle.projection import DIVISION, FISHEYE, LENS, RADIAL
+from thesisrecon.optimize.bundle.projection import LENS
 
 
 def with_best_lens(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
@@ -18,7 +18,7 @@ def with_best_lens(model: MetricEstimate, adjustment: MetricAdjustment) -> Metri
     if model.cameras.intrinsics.shape[1] == _model.WIDTH:
         return model
     models = [_settled(model, adjustment)]
-    models += [_settled(with_lens(models[0], kind), adjustment) for kind in (RADIAL, DIVISION)]
+    models += [_settled(with_lens(models[0], kind), adjustment) for kind in (PERSPECTIVE, DIVISION)]
     gate = LATE_SIGMAS * min(m.gate_px for m in models)
     return min(models, key=lambda m: _model.truncated_cost(m, gate))
 
@@ -34,7 +34,7 @@ def _settled(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstim
 def with_lens(model: MetricEstimate, kind: int) -> MetricEstimate:
     """The model whose equidistant lenses are those of another kind, fitted over the image."""
     rows = model.cameras.intrinsics.copy()
-    for row in np.flatnonzero(rows[:, LENS] == FISHEYE):
+    for row in np.flatnonzero(rows[:, LENS] == ANGLE):
         sizes = model.sizes[model.cameras.group == row]
         radii = np.linspace(0.0, np.linalg.norm(sizes, axis=1).max() / 2.0, _model.RADII + 1)[1:]
         rays = directions_of_image(np.column_stack([radii, 0.0 * radii]) / rows[row, FOCAL], rows[row, K1:])

@@ -10,13 +10,10 @@ from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
-from thesisrecon.lens import ANGLE, PERSPECTIVE, fit_lens, undistort
+from thesisrecon.lens import ANGLE, DIVISION, PERSPECTIVE, fit_lens, straight_places, undistort
 from thesisrecon.optimize.bundle.partial import refine_points
 from thesisrecon.optimize.bundle.projection import (
-    DIVISION,
-    FISHEYE,
     LENS,
-    RADIAL,
     MetricCameras,
     MetricModel,
     image_points,
@@ -29,7 +26,7 @@ LENS_WIDTH = LENS + 1  # further k4, p1, p2 and the number of the lens model
 EARLY_SIGMAS, LATE_SIGMAS = 12.0, 7.0  # residual gates of the early and the late rounds in noise sigmas
 MAX_TANGENT = 4.0  # largest tangent of the angle from the axis of what triangulates: 76 degrees
 RADII = 100  # radii of the image at which one lens is fitted to another
-LENS_STD = {RADIAL: (0.5, 0.3, 0.1), DIVISION: (1.0,), FISHEYE: (0.2, 0.1, 0.05, 0.02)}
+LENS_STD = {PERSPECTIVE: (0.5, 0.3, 0.1), DIVISION: (1.0,), ANGLE: (0.2, 0.1, 0.05, 0.02)}
 """Prior deviations of the coefficients about 0 of a lens that pairs of images show."""
 MIN_ANGLE = float(np.radians(0.05))  # smallest triangulation angle of a point
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
@@ -319,21 +316,16 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
         if len(known):
             rows[views[:, None], [*CENTRE]] = np.median(K[known, :2, 2], axis=0)
     if prior.lens is not None:
-        rows[:, K1:] = 0.0
-        bent = prior.lens[:, :2].any(axis=1)
-        for view in np.flatnonzero(bent):
+        p = np.linspace(0.0, 1.0, RADII + 1)[1:]
+        for view in np.flatnonzero(prior.lens[:, :2].any(axis=1)):
             half = float(np.linalg.norm(sizes[view])) / 2.0
-            p = np.linspace(0.0, 1.0, RADII + 1)[1:]
-            k1, k2, base = prior.lens[view]
-            straight = p / (1.0 + (k1 + k2 * p**2) * p**2)
-            if base == PERSPECTIVE:
-                straight = undistort(np.column_stack([p, 0.0 * p]), np.array([k1, k2]))[:, 0]
-            rows[view] = refitted_lens(rows[view], FISHEYE, half * p, half * straight / rows[view, FOCAL])
+            straight = straight_places(np.column_stack([p, 0.0 * p]), prior.lens[view])[0][:, 0]
+            rows[view] = refitted_lens(rows[view], ANGLE, half * p, half * straight / rows[view, FOCAL])
     return rows
 
 
 def refitted_lens(row: F64, kind: int, radii: F64, tangents: F64) -> F64:
-    """A row of intrinsics with the lens of a ``kind`` that images directions at ``radii`` (N,) px.
+    """A row of intrinsics with the lens of a base ``kind`` that images directions at ``radii`` (N,) px.
 
     ``tangents`` (N,) are those of their angles from the axis; large and negative ones are not fitted.
     """
@@ -345,8 +337,7 @@ def refitted_lens(row: F64, kind: int, radii: F64, tangents: F64) -> F64:
         f, g = np.linalg.lstsq(basis, radii[seen] / tangents[seen], rcond=None)[0]
         focal, coefficients = float(f), np.array([g * f])
     else:
-        base = ANGLE if kind == FISHEYE else PERSPECTIVE
-        focal, coefficients = fit_lens(base, radii[seen], tangents[seen], count)
+        focal, coefficients = fit_lens(kind, radii[seen], tangents[seen], count)
     row = row.copy()
     row[FOCAL], row[K1:], row[LENS] = focal, 0.0, kind
     row[K1 : K1 + count] = coefficients

@@ -256,7 +256,7 @@ class FromImages:
 
 def build_tracks(job: Job, views: Any, pairs: Sequence[TwoView], rng: np.random.Generator) -> Tracks:
     """Tracks of the accepted pairs, in pixels of the images."""
-    frames = views.every_frame if isinstance(views, PreparedViews) else None
+    frames = views.frames if isinstance(views, PreparedViews) else None
     if frames is not None:
         pairs = [pair_in_frames(pair, frames[pair.i], frames[pair.j]) for pair in pairs]
     found: Tracks = job.config.tracks.build(views, pairs, map_all=job.run.workers.map_all, rng=rng)
@@ -363,13 +363,8 @@ class PreparedViews(Sequence[Any]):
         """Masks of two views, None: all pixels; straight images have no corners near masked pixels."""
         return (None, None) if self._frames else (self._given[i][0].mask, self._given[j][0].mask)
 
-    def frames(self, i: int, j: int) -> tuple[StraightFrame, StraightFrame] | None:
-        """The straight frames of two views, if their images are straightened."""
-        names = (self._given[view][0].name for view in (i, j))
-        return None if self._frames is None else tuple(self._frames[name] for name in names)  # type: ignore
-
     @property
-    def every_frame(self) -> Mapping[int, StraightFrame] | None:
+    def frames(self) -> Mapping[int, StraightFrame] | None:
         """The straight frames of all views by number, if their images are straightened."""
         if self._frames is None:
             return None
@@ -489,12 +484,9 @@ def _matched(job: Job, views: PreparedViews, pairs: Sequence[tuple[int, int]], k
 def _match_all(
     config: PipelineConfig, views: PreparedViews, pairs: Sequence[tuple[int, int]], seed: int
 ) -> list[TwoView]:
-    found = list[TwoView]()
-    for i, j in pairs:
-        pair = match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j))
-        frames = views.frames(i, j)
-        found.append(pair if frames is None else pair_from_frames(pair, *frames))
-    return found
+    frames = views.frames
+    found = [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
+    return found if frames is None else [pair_from_frames(p, frames[p.i], frames[p.j]) for p in found]
 
 
 def _item(i: int, j: int, kind: str) -> str:

@@ -75,8 +75,10 @@ def find_moves(runs: Sequence[Mapping[str, Any]], gates: Mapping[str, Gate]) -> 
 def moved_gate(
     gate: Gate, values: Sequence[float], references: Mapping[str, float], *, share: bool = False
 ) -> Gate:
-    """Return the gate measured anew; a change within its noise is none. One run keeps the noise. The least
-    noise is relative to the value, or for a ``share`` in per cent to what is missing to 100 if that is less.
+    """Return the gate measured again; smaller changes than its noise do not count. One run keeps the noise.
+
+    The least noise is relative to the value, or for a ``share`` in per cent to what is missing to 100 if that
+    is less.
     """
     measured = float(np.mean(values))
     size = min(abs(measured), abs(100.0 - measured)) if share else abs(measured)

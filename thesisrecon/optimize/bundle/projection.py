@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64, I64, numbers, require_finite, require_shapes, whole_numbers
+from thesisrecon.lens import ANGLE, BASE, DIVISION
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,8 @@ def away_from_zero(w: float) -> float:
 
 _MORTON_BITS = 31
 TINY = 1e-12
-LENS = 11
-"""Column of the number of the lens model, in tables of twelve columns; others are radial."""
-RADIAL, DIVISION, FISHEYE = 0, 1, 2
+LENS = 5 + BASE
+"""Column of the base of the lens, in tables of twelve columns; others are radial."""
 
 
 class Observations(NamedTuple):
@@ -251,7 +251,7 @@ def _lens_profile(q: F64, r2: float) -> tuple[float, float, float, float]:
         d = 2.0 / (1.0 + root)
         return d, d * d * q[5] / root, r2, d * d / root
     s, scale, turn = r2, 1.0, 1.0
-    if q[LENS] == FISHEYE:
+    if q[LENS] == ANGLE:
         r = math.sqrt(r2)
         angle = math.atan(r)
         s = angle * angle
@@ -261,7 +261,7 @@ def _lens_profile(q: F64, r2: float) -> tuple[float, float, float, float]:
     radial = 1.0 + (q[5] + (q[6] + (q[7] + q[8] * s) * s) * s) * s
     slope = q[5] + (2.0 * q[6] + (3.0 * q[7] + 4.0 * q[8] * s) * s) * s
     d = scale * radial
-    if q[LENS] == FISHEYE:
+    if q[LENS] == ANGLE:
         slope = q[5] - 1.0 / 3.0 if r2 < 1e-6 else 0.5 * ((radial + 2.0 * slope * s) * turn - d) / r2
     return d, slope, s, scale
 

@@ -16,7 +16,7 @@ from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure, unknown_word
 from thesisrecon.geometry.camera_matrix import project
-from thesisrecon.geometry.homogeneous import homogenize, whitened_frame
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, whitened_frame
 from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
 from validation.metrics.fundamental_precision import rms_epipolar_distance
@@ -59,16 +59,11 @@ def _epipolar(F: F64, exact: TwoViews) -> float:
 
 
 def _transfer(H: F64, exact: TwoViews) -> float:
-    return _rms(_dehomogenized(homogenize(exact.xy1) @ H.T) - exact.xy2)
+    return _rms(dehomogenize(homogenize(exact.xy1) @ H.T) - exact.xy2)
 
 
 def _reprojection(P: F64, exact: TwoViews) -> float:
     return _rms(project(P, exact.X) - exact.xy2)
-
-
-def _dehomogenized(xh: F64) -> F64:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(xh[:, :2] / xh[:, 2:])
 
 
 def _rms(difference: F64) -> float:
