@@ -155,6 +155,10 @@ def test_the_maps_are_inverse_to_each_other(rng, case):
         shown = np.isfinite(there).all(axis=1)
         back = rectified.original_from_rectified(side, there[shown])
         assert np.abs(back - pixels[shown]).max(initial=0.0) < 1e-9
+        if method is not polar:
+            # A third as many pixels a side show the same area.
+            smaller = rectified.reduced(1 / 3).rectified_from_original(side, pixels[shown], within=False)
+            np.testing.assert_allclose(smaller, (there[shown] + 0.5) / 3.0 - 0.5, atol=1e-9)
 
 
 @pytest.mark.parametrize(
