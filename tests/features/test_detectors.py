@@ -51,6 +51,19 @@ def test_a_corner_is_found_between_the_pixels(variant, dx, dy):
     assert distance.min() < 0.25
 
 
+@pytest.mark.parametrize("variant", [with_constants(MultiScaleCorners, upsample_below_px=0)(), VARIANTS[1]])
+def test_corners_of_every_size_are_right_on_average(variant):
+    errors = {}
+    for place in np.random.default_rng(0).uniform(-0.5, 0.5, (36, 2)):
+        found = variant.detect(chessboard(*place))
+        for scale in np.unique(found.scale):
+            error = found.xy[found.scale == scale] - (60, 50) - place
+            errors.setdefault(scale, []).append(error[np.linalg.norm(error, axis=1).argmin()])
+    assert len(errors) == 2
+    for off in errors.values():
+        assert (np.abs(np.mean(off, axis=0)) < 4.0 * np.std(off, axis=0) / np.sqrt(36)).all()
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_corners_are_sorted_inside_and_the_same_each_time(variant):
     image = photograph(texture(200, 260))

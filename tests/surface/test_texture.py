@@ -61,6 +61,21 @@ def test_a_new_view_shows_the_painted_sphere(sphere):
     assert np.sqrt(np.mean(difference(mesh) ** 2)) < 6.0
 
 
+def test_colours_are_those_of_the_projected_places_and_smaller_images_keep_waves_but_alias_none(sphere):
+    y, x = np.indices((120, 160))
+    view = photograph(ring_of()[0])
+    view = replace(view, rgb=np.stack([x, y, x + y], axis=-1).clip(0, 255).astype(np.uint8))
+    surface, count = prepared_views(sphere, [view])[0], len(sphere.vertices)
+    weight, color = np.zeros(count, np.float32), np.zeros((count, 3), np.float32)
+    blending.observe_points(sphere.vertices, vertex_normals(sphere), surface, weight, color)
+    np.testing.assert_allclose(color[weight > 0, :2], project(view.P, sphere.vertices)[weight > 0], atol=1e-3)
+    for period, least, most in ((16.0, 0.9, 1.01), (3.0, 0.0, 0.3)):
+        waves = np.rint(128.0 + 100.0 * np.cos(2.0 * np.pi * x / period)).astype(np.uint8)
+        smaller = texture_atlas._reduced(replace(view, rgb=np.repeat(waves[:, :, None], 3, axis=2)), 0.5)
+        inner = smaller.rgb[:, 10:-10].astype(float)
+        assert least < np.sqrt(2.0) * inner.std() / 100.0 < most
+
+
 def test_a_model_of_noisy_depths_is_a_small_file(tmp_path):
     views = ring_of()
     noisy = [sphere_map(m.view, m.P, noise=0.01) for m in views]
