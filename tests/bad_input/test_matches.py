@@ -191,7 +191,7 @@ def test_singular_and_empty_arrays_are_rejected():
         (correct_matches, np.zeros((3, 3)), XY, XY), (strata.transform, np.ones((4, 4)), P, "cameras"),
         (strata.transform, np.zeros((4, 4)), np.eye(4), "conics"),
         (strata.image_of_absolute_conic, np.ones((3, 3))),
-        (strata.intersect_line, CONIC, np.zeros(3), LINE3), (strata.curvature_sign, np.zeros((4, 4))),
+        (strata.intersect_line, CONIC, np.zeros(3), LINE3),
         (two_view.epipoles, np.eye(4)), (two_view.canonical_cameras, np.zeros((2, 3))),
     ]  # fmt: skip
     assert accepted(calls, r"needs .*(invertible|zero|finite camera|\(3, 3\))") == []

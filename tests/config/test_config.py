@@ -53,7 +53,7 @@ def test_settings_of_each_type_are_those_of_the_text_and_survive_toml():
     values = {
         "features.spread": False, "features.levels": 3, "features.measure.formula": "harris",
         "features.measure.integration_sigma_px": 2.0, "matching.ratio": 0.75, "matching.growth": False,
-        "matching.support": "never", "intrinsics.principal_point_px": (1.0, 2.5),
+        "intrinsics.principal_point_px": (1.0, 2.5),
         "selfcalibration.search": None,
     }  # fmt: skip
     texts = {None: "none", (1.0, 2.5): "[1, 2.5]", 2.0: "2e0"}

@@ -62,7 +62,7 @@ def test_costs_and_their_means_over_supports_equal_plain_loops(first, n):
             apart = np.abs(levels[:, y, x].astype(int) - levels2[:, y, u]).sum()
             ones = int(bits[y, x] ^ bits2[y, u]).bit_count()
             costs[y, q, x] = (400 * ones + 9 * min(apart, 300)) >> 8
-    given = left, right, np.empty((4, 0, height, width), np.uint8), first, np.array([400, 9, 300], np.int16)
+    given = left, right, np.zeros((4, 2, height, width), np.uint8), first, np.array([400, 9, 300], np.int16)
     cost_volume(*given, np.uint8(33), found)
     assert (found == costs).all()
 
@@ -91,22 +91,21 @@ def test_costs_and_their_means_over_supports_equal_plain_loops(first, n):
         assert np.abs(found[y, :, x] - mean).max() < 0.501
 
 
-@pytest.mark.parametrize("pairs", [2, 4])
 @pytest.mark.parametrize("shape", [(11, 6, 14), (200, 1, 9), (1, 5, 8), (6, 4, 1)])
-def test_sums_of_paths(shape, pairs):
+def test_sums_of_paths(shape):
     rng = np.random.default_rng(5)
     height, _, width = shape
     costs = rng.integers(0, 49, shape).astype(np.uint8)
     grey = rng.integers(0, 3000, (height, width)).astype(np.int16)
-    jumps = np.empty((4, height, width), np.uint8)
+    jumps = np.empty((2, height, width), np.uint8)
     adaptive_P2(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
 
     def penalty(y, x, v, u):
         return int(max(30.0, 70.0 * 200.0 / (200.0 + abs(int(grey[y, x]) - int(grey[v, u])))))
 
-    total = np.empty((pairs, *shape), np.uint8)
+    total = np.empty((2, *shape), np.uint8)
     sum_paths(costs, jumps, np.uint8(20), total, np.empty((2, scratch_size(*shape)), np.uint8))
-    for found, (dy, dx) in zip(total, [(0, 1), (1, 0), (1, 1), (1, -1)], strict=False):
+    for found, (dy, dx) in zip(total, [(0, 1), (1, 0)], strict=True):
         there, back = (path_sum(costs, penalty, 20, (s * dy, s * dx)) for s in (1, -1))
         assert (found == there + back).all()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -13,13 +13,7 @@ from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multip
 from thesisrecon.epipolar._sampling import squared_distances
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
 from thesisrecon.errors import StageFailure, counted
-from thesisrecon.geometry.homogeneous import (
-    cross_matrix,
-    dehomogenize,
-    directions_across,
-    homogenize,
-    unit_norm,
-)
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.relative_pose import (
     depths_of_matches,
     essential_five_points,
@@ -29,7 +23,7 @@ from thesisrecon.geometry.relative_pose import (
 )
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.optimize.bundle.projection import move_poses
-from thesisrecon.optimize.least_squares import INLIER_SIGMAS, DenseSystem, trimmed_noise_scale
+from thesisrecon.optimize.least_squares import INLIER_SIGMAS, trimmed_noise_scale
 from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
 _SAMPLE, _UNKNOWN = 5, 5
@@ -43,8 +37,6 @@ _REFITTED = 1000  # matches of a refit
 _HIGH, _DOUBT = 3.0, 0.05
 # Residuals in units of the frame below which they are rounding errors.
 _EXACT = 1e-9
-
-_TURNS = cross_matrix(np.eye(3))  # derivatives of a rotation about the axes
 
 Pose = tuple[F64, F64]
 
@@ -97,10 +89,6 @@ class _Pair:
         """F of E (..., 3, 3) in the frame."""
         return np.asarray(self.inverse2.T @ E @ self.inverse1)
 
-    def only(self, rows: I64) -> _Pair:
-        """Some of the matches."""
-        return replace(self, points=self.points[rows], x1=self.x1[rows], x2=self.x2[rows])
-
     def squared(self, E: F64, rows: I64 | slice = slice(None)) -> F64:
         """Squared Sampson distances (B, M) of some matches."""
         return squared_distances(self.fundamental(E).reshape(-1, 9), self.points[rows].T.copy())
@@ -109,25 +97,15 @@ class _Pair:
         """R and t of E that place most matches in front of both cameras."""
         return pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
 
-    def tangent(self, R: F64, t: F64) -> F64:
-        """Derivatives (9, 5) of F by rotation and by the two directions across t."""
-        turns, moves = cross_matrix(t) @ _TURNS @ R, cross_matrix(directions_across(t)) @ R
-        return np.asarray(self.fundamental(np.concatenate([turns, moves])).reshape(5, 9).T)
-
     def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
         """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
-        F = self.fundamental(essential_from_pose(R, t))
+        f, D, T = np.empty(9), np.empty((2, 3)), np.empty((5, 9))
+        _tangent(self.inverse1, self.inverse2, R, t, f, D, T)
+        F = f.reshape(3, 3)
         a, b = homogenize(self.points[:, :2]), homogenize(self.points[:, 2:])
         slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
-        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ self.tangent(R, t) / slope[:, None]
+        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ T.T / slope[:, None]
         return np.asarray(np.sum(J @ np.linalg.pinv(J[inliers].T @ J[inliers]) * J, axis=1))
-
-    def normal_equations(self, R: F64, t: F64) -> DenseSystem:
-        """Those of the Sampson distances of all matches over the five unknowns of :meth:`tangent`."""
-        G, h = np.empty((9, 9)), np.empty(9)
-        f = np.ascontiguousarray(self.fundamental(essential_from_pose(R, t)).ravel())
-        cost, J = normal_equations(f, self.points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h), self.tangent(R, t)
-        return DenseSystem(float(cost), J.T @ G @ J, J.T @ h)
 
 
 def fit_essential(
@@ -198,7 +176,6 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
 
 def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
     """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
-
     R, t = pose[0][None].copy(), pose[1][None] / np.linalg.norm(pose[1])
     _refine_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, iterations)
     return R[0], t[0]
@@ -241,19 +218,10 @@ def _refine_pose(points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, most
 def _linearize_pose(
     points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, D: F64, H: F64, g: F64
 ) -> float:
-    """Fill two directions D (2, 3) across t, and the normal equations over x -> exp(w) x + D'd; the cost."""
-    f, T, E, G, h = empty(9), empty((5, 9)), empty((3, 3)), empty((9, 9)), empty(9)
-    _directions_across(t, D)
-    _cross_times(t, R, E)
-    _in_frame(E, inverse1, inverse2, f)
+    """Fill D as :func:`_tangent` does, and the normal equations over x -> exp(w) x + D'd; the cost."""
+    f, T, G, h = empty(9), empty((5, 9)), empty((9, 9)), empty(9)
+    _tangent(inverse1, inverse2, R, t, f, D, T)
     cost: float = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
-    axis, change = empty(3), empty((3, 3))
-    for a in range(5):
-        for i in range(3):
-            axis[i] = D[a - 3, i] if a >= 3 else 1.0 if i == a else 0.0
-        # exp(w) turns E as a whole; d changes t alone.
-        _cross_times(axis, E if a < 3 else R, change)
-        _in_frame(change, inverse1, inverse2, T[a])
     for a in range(5):
         g[a] = 0.0
         for i in range(9):
@@ -264,6 +232,21 @@ def _linearize_pose(
                 for j in range(9):
                     H[a, b] += T[a, i] * G[i, j] * T[b, j]
     return cost
+
+
+@kernel(forceinline=True)
+def _tangent(inverse1: F64, inverse2: F64, R: F64, t: F64, f: F64, D: F64, T: F64) -> None:
+    """Fill F (9,) of a pose, two directions D (2, 3) across t, and the derivatives T (5, 9) of F by w and d."""
+    E, axis, change = empty((3, 3)), empty(3), empty((3, 3))
+    _directions_across(t, D)
+    _cross_times(t, R, E)
+    _in_frame(E, inverse1, inverse2, f)
+    for a in range(5):
+        for i in range(3):
+            axis[i] = D[a - 3, i] if a >= 3 else 1.0 if i == a else 0.0
+        # exp(w) turns E as a whole; d changes t alone.
+        _cross_times(axis, E if a < 3 else R, change)
+        _in_frame(change, inverse1, inverse2, T[a])
 
 
 @kernel
@@ -324,12 +307,12 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
     R, t = pair.pose(essential_from_pose(*pose), rows)
-    system = pair.only(rows).normal_equations(R, t)
-    sigma = float(np.sqrt(2.0 * system.cost / max(len(rows) - _UNKNOWN, 1)))
-    values, vectors = np.linalg.eigh(system.hessian)
+    D, H, g = np.empty((2, 3)), np.empty((5, 5)), np.empty(5)
+    cost = _linearize_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, D, H, g)
+    sigma = float(np.sqrt(2.0 * cost / max(len(rows) - _UNKNOWN, 1)))
+    values, vectors = np.linalg.eigh(H)
     half = np.zeros((6, 5))
-    # t moves by w x t + d.
-    half[:3, :3], half[3:, :3], half[3:, 3:] = np.eye(3), cross_matrix(t), directions_across(t).T
+    half[:3, :3], half[3:, 3:] = np.eye(3), D.T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(

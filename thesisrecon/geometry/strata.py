@@ -1,4 +1,4 @@
-"""Sections 3.3 and 3.4: how entities transform, the strata with their groups and invariants, and conics.
+"""Sections 3.3 and 3.4: how entities transform, the strata with their invariants, and conics.
 
 A transform G (4, 4) maps points X -> G X, as in the thesis' table 3.3; the matrices of 3.4.2 to 3.4.5 in its
 text act on rows, X' -> X' G, and are the transposes of those here.
@@ -26,11 +26,7 @@ from thesisrecon.errors import unknown_word
 from thesisrecon.geometry.homogeneous import checked_inverse, checked_unit
 from thesisrecon.records import Similarity
 
-Group = Literal["projective", "affine", "metric", "euclidean"]
 Entity = Literal["points", "planes", "cameras", "conics", "dual conics"]
-
-DEGREES_OF_FREEDOM: dict[Group, int] = {"projective": 15, "affine": 12, "metric": 7, "euclidean": 6}
-"""Ordered from the largest group, with the fewest invariants, to the smallest."""
 
 PLANE_AT_INFINITY = np.array([0.0, 0.0, 0.0, 1.0])
 """Canonical position in the affine and all later strata (3.4.3)."""
@@ -50,28 +46,6 @@ def transform(G: F64, entity: F64, kind: Entity) -> F64:
         return np.asarray(G @ entity @ G.T)
     inverse = checked_inverse(G, "transform")
     return np.asarray(inverse.T @ entity @ inverse if kind == "conics" else entity @ inverse)
-
-
-def group_of(G: F64, *, tolerance: float = 1e-9) -> Group:
-    """The smallest group that a transform belongs to (figure 3.1).
-
-    G = [A t; b' 1] is affine if b = 0, metric if also A'A = s^2 I and det A > 0, and Euclidean if also s = 1.
-    The unit of length of the test is that of G, or |t| / |A| if this is larger.
-    """
-    if G.shape == (4, 4) and np.isfinite(G).all() and G[:3, :3].any():
-        length = max(1.0, float(np.linalg.norm(G[:3, 3]) / np.linalg.norm(G[:3, :3])))
-        units = np.array([length, length, length, 1.0])
-        G = G / units[:, None] * units
-    if G.shape != (4, 4) or not np.isfinite(G).all() or not np.linalg.cond(G) < 1e14:
-        raise ValueError(f"group_of needs a finite invertible (4, 4) matrix; got shape {G.shape}")
-    if np.linalg.norm(G[3, :3]) > tolerance * np.linalg.norm(G):
-        return "projective"
-    A = G[:3, :3] / G[3, 3]
-    gram = A.T @ A
-    squared_scale = float(np.trace(gram)) / 3.0
-    if np.linalg.norm(gram - squared_scale * np.eye(3)) > tolerance * squared_scale or np.linalg.det(A) < 0.0:
-        return "affine"
-    return "euclidean" if abs(squared_scale - 1.0) <= tolerance else "metric"
 
 
 def affine_from_projective(plane: F64) -> F64:
@@ -121,26 +95,6 @@ def metric_from_projective(dual_quadric: F64) -> F64:
     size = np.append(np.sqrt(s[:3]), np.sqrt(s[0]))
     size[3] *= np.sign(np.linalg.det(V))
     return np.asarray(np.linalg.inv(V * size))
-
-
-def cross_ratio(X: F64) -> float:
-    """(l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
-
-    At most two of the homogeneous points may be equal; inf if X1 = X4 or X2 = X3.
-    """
-    if X.ndim != 2 or X.shape[0] != 4 or not np.isfinite(X).all():
-        raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")
-    unit = X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
-    _, s, Vt = np.linalg.svd(unit)
-    if len(s) > 2 and s[2] > 1e-6:
-        raise ValueError(f"cross_ratio needs collinear points; they deviate by {s[2]:.2g}")
-    a, b = Vt[:2] @ unit.T
-    difference = np.outer(a, b) - np.outer(b, a)
-    above = difference[0, 2] * difference[1, 3]
-    below = difference[0, 3] * difference[1, 2]
-    if max(abs(above), abs(below)) < 1e-24:
-        raise ValueError("cross_ratio does not exist if three of the four points are equal")
-    return float(above / below) if below != 0.0 else np.inf
 
 
 def upgrade_cameras(P: F64, K: F64, metric_from_projective: F64) -> tuple[F64, F64, F64]:
@@ -252,18 +206,6 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
         return np.asarray(units * (x if abs(sxx) < abs(syy) else y)[None])
     first, second = q * x + sxx * y, syy * x + q * y
     return np.asarray(units * (first[None] if touches else np.stack([first, second])))
-
-
-def curvature_sign(Q: F64) -> int:
-    """The sign of the Gaussian curvature of a quadric's real points, a projective invariant (3.4.2).
-
-    K = -det Q / |grad|^4 up to a positive factor: 1 for ellipsoids, elliptic paraboloids and hyperboloids of
-    two sheets, -1 for saddles, 0 for cones, cylinders and planes.
-    """
-    require_finite("curvature_sign", Q)
-    units = np.append(np.full(3, _length_scale(Q)), 1.0)
-    det = float(np.linalg.det(checked_unit(units[:, None] * Q * units, "curvature_sign")))
-    return 0 if abs(det) < 1e-14 else -int(np.sign(det))
 
 
 def image_of_absolute_conic(K: F64, *, is_dual: bool = False) -> F64:

@@ -45,14 +45,6 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
     return unit_tensor(T)
 
 
-def trifocal_residuals(T: F64, x1: F64, l2: F64, l3: F64) -> F64:
-    """x1^i l2_j l3_k T_i^jk: 0 if l2 and l3 pass through the images of a point on the ray of x1.
-
-    Points (lines through x2 and x3) give four independent equations, lines (points of l1) two (HZ 15.1).
-    """
-    return np.asarray(np.einsum("...i,...j,...k,ijk->...", x1, l2, l3, T))
-
-
 def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
     """Transfer lines of views 1 and 2 to view 3: l3 is the null vector of [l1]x (l2_j T_i^jk) (figure 3.15).
 
@@ -76,14 +68,6 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     epipolar = x1 @ F21.T
     across = np.cross(x2, np.column_stack([epipolar[:, :2], np.zeros(len(x2))]))
     return dehomogenize(np.einsum("nki,ni->nk", np.einsum("nj,ijk->nki", across, T), x1))
-
-
-def transfer_by_epipolar_lines(F31: F64, F32: F64, xy1: F64, xy2: F64) -> F64:
-    """Transfer matches of views 1 and 2 to the intersection of their epipolar lines in view 3 (3.6.3).
-
-    Inf or NaN if the lines coincide, as for points of the plane of the three centres.
-    """
-    return dehomogenize(np.cross(homogenize(xy1) @ F31.T, homogenize(xy2) @ F32.T))
 
 
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:

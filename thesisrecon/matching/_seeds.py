@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
 from itertools import product
-from typing import Literal
 
 import numpy as np
 import scipy
@@ -156,20 +155,18 @@ def _frame(seeds: Seeds) -> F64:
 
 
 def seed_matches(
-    features1: Features, features2: Features, pair: tuple[int, int], *,
-    orientation: Literal["auto", "upright", "rotated"], ratio: float,
-) -> Iterator[SeedSet]:  # fmt: skip
+    features1: Features, features2: Features, pair: tuple[int, int], *, ratio: float
+) -> Iterator[SeedSet]:
     """Sets of matched seeds: one of each orientation, or one of all with oblique views of either image."""
     seeds1, seeds2 = features1.seeds, features2.seeds
     assert seeds1 is not None
     assert seeds2 is not None
-    orientations = {"auto": (False, True), "upright": (False,), "rotated": (True,)}[orientation]
     if features1.oblique is None or features2.oblique is None:
-        for rotated in orientations:
+        for rotated in (False, True):
             yield match_seeds(seeds1, seeds2, pair, rotated=rotated, ratio=ratio), neighbour_support
         return
     ways = (_joined(seeds1, features1.oblique), seeds2), (seeds1, _joined(seeds2, features2.oblique))
-    each = product(orientations, ways)
+    each = product((False, True), ways)
     matches = join_matches([match_seeds(*way, pair, rotated=kind, ratio=ratio) for kind, way in each])
     yield select_found(matches, strongest_distinct(matches, REACH_PX)), map_support
 

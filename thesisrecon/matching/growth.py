@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -261,23 +260,18 @@ def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> 
 class SeedsAndGrowth:
     """Matching by seeds, then guided by their F and by local affine maps of known matches (4.2.2).
 
+    F is estimated from the seeds whose neighbours have similar displacements, and also from all seeds if few
+    of these or fewer than half agree; the F with more inliers is used. Patches rotated to their dominant
+    gradient are matched if few upright ones agree with one F.
+
     Parameters
     ----------
     ratio : float
         Maximum ratio of the distances to the best and second best match of a seed.
     neighbours : int
         Number of matches that define a local affine map.
-    orientation : {"auto", "upright", "rotated"}
-        Patches of the seeds: upright, rotated to their dominant gradient, or upright first and rotated if
-        few upright ones agree with one F.
-    support : {"auto", "always", "never"}
-        "always": estimate F from the seeds whose neighbours have similar displacements; "never": from all
-        seeds; "auto": from the former, and also from all seeds if few of the former or fewer than half agree;
-        the F with more inliers is used.
     growth : bool
-        Match all corners by guided search, else only corners at seeds.
-    coarse_first : bool
-        Match the corners of the coarser scale first; they give a better F for all.
+        Match all corners by guided search, those of the coarser scale first, else only corners at seeds.
     rematch : bool
         Repeat the guided matching with the F and the maps of its own matches. If these cover a third of the
         corners of image 1, only the other corners are matched again.
@@ -293,10 +287,7 @@ class SeedsAndGrowth:
 
     ratio: float = 0.8
     neighbours: int = 10
-    orientation: Literal["auto", "upright", "rotated"] = "auto"
-    support: Literal["auto", "always", "never"] = "auto"
     growth: bool = True
-    coarse_first: bool = True
     rematch: bool = True
     align: bool = True
     many_images: int = 40
@@ -332,8 +323,8 @@ class SeedsAndGrowth:
         # Faint and blurred images have seeds at the coarse levels only.
         if not (len(features1.xy) and len(features2.xy)):
             return empty_matches(pair)
-        sets = seed_matches(features1, features2, pair, orientation=self.orientation, ratio=self.ratio)
-        start = self._verified_seeds(sets, estimate_fundamental, rng)
+        sets = seed_matches(features1, features2, pair, ratio=self.ratio)
+        start = _verified_seeds(sets, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
         if self.growth:
@@ -344,37 +335,6 @@ class SeedsAndGrowth:
         if not self.align:
             return select_found(matches, strongest_distinct(matches))
         return align_matches(view1, view2, matches, affine_std=self.affine_std)
-
-    def _verified_seeds(
-        self, sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
-    ) -> tuple[Matches, FundamentalFit] | None:
-        """The largest set of seeds that agree with one F, and F; tries later sets only if few agree."""
-        best: tuple[Matches, FundamentalFit] | None = None
-        most = 0
-        for seeds, support in sets:
-            for trial in self._trials(seeds, support):
-                found = _verified(trial, estimate, rng)
-                if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
-                    best, most = found, len(found[0].xy1)
-                # A second trial, with all seeds, helps weak pairs only.
-                if most >= max(100, 0.5 * len(trial.xy1)):
-                    break
-            if most >= max(50, 0.5 * len(seeds.xy1)):
-                break
-        return best
-
-    def _trials(self, seeds: Matches, support: Callable[[Matches], F64]) -> tuple[Matches, ...]:
-        """Sets of seeds to estimate F from; none if there are too few."""
-        if self.support == "never":
-            return (seeds,) if len(seeds.xy1) >= MIN_SEEDS else ()
-        wide = support is map_support
-        # Of a strength of 10 at most; seeds whose maps are affine need less.
-        supported = support(seeds) >= (1.0 if wide else 2.0)
-        if supported.sum() < MIN_SEEDS:
-            return ()
-        chosen = select_found(seeds, supported)
-        # So few seeds of simulated views are right that a wrong F of all may have more inliers.
-        return (chosen, seeds) if self.support == "auto" and not wide else (chosen,)
 
     def _grow_around_seeds(
         self, view1: PreparedImage, view2: PreparedImage, start: tuple[Matches, FundamentalFit],
@@ -400,9 +360,9 @@ class SeedsAndGrowth:
         """Match the corners of the coarser scale, then all, then all or the rest, guided by those before."""
         scale = view1.features.scale
         everything = np.arange(len(scale))
-        if self.coarse_first:
-            grown = self._grow(view1, view2, np.flatnonzero(scale > scale.min()), *start)
-            start = _verified(grown, estimate, rng) or start
+        # The coarser scale gives a better F for all.
+        grown = self._grow(view1, view2, np.flatnonzero(scale > scale.min()), *start)
+        start = _verified(grown, estimate, rng) or start
         grown = self._grow(view1, view2, everything, *start)
         if not self.rematch:
             return grown
@@ -438,6 +398,37 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
+
+
+def _verified_seeds(
+    sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
+) -> tuple[Matches, FundamentalFit] | None:
+    """The largest set of seeds that agree with one F, and F; tries later sets only if few agree."""
+    best: tuple[Matches, FundamentalFit] | None = None
+    most = 0
+    for seeds, support in sets:
+        for trial in _trials(seeds, support):
+            found = _verified(trial, estimate, rng)
+            if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
+                best, most = found, len(found[0].xy1)
+            # A second trial, with all seeds, helps weak pairs only.
+            if most >= max(100, 0.5 * len(trial.xy1)):
+                break
+        if most >= max(50, 0.5 * len(seeds.xy1)):
+            break
+    return best
+
+
+def _trials(seeds: Matches, support: Callable[[Matches], F64]) -> tuple[Matches, ...]:
+    """Sets of seeds to estimate F from; none if there are too few."""
+    wide = support is map_support
+    # Of a strength of 10 at most; seeds whose maps are affine need less.
+    supported = support(seeds) >= (1.0 if wide else 2.0)
+    if supported.sum() < MIN_SEEDS:
+        return ()
+    chosen = select_found(seeds, supported)
+    # So few seeds of simulated views are right that a wrong F of all may have more inliers.
+    return (chosen,) if wide else (chosen, seeds)
 
 
 def _verified(

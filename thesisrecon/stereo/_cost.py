@@ -287,12 +287,8 @@ def cost_volume(
     left: CostFeatures, right: CostFeatures, masks: U8, first: int, weights: I16, outside: np.uint8,
     volume: U8,
 ) -> None:  # fmt: skip
-    """Matching costs (H, D, W) of :func:`_row_costs`, averaged over support arms unless these are empty."""
+    """Matching costs (H, D, W) of :func:`_row_costs`, averaged over support arms."""
     height, n, width = volume.shape
-    if masks.shape[1] == 0:
-        for y in range(height):
-            _row_costs(y, left, right, first, weights, outside, volume[y])
-        return
     span = 2 * ARM + 1
     ring, counts = zeros((n, span, width), np.uint16), zeros((span, width), np.uint16)
     costs, ones = zeros((n, width + 2 * ARM), np.uint8), full(width + 2 * ARM, 1, np.uint8)

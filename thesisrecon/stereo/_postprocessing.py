@@ -327,12 +327,12 @@ def texture_of(image: StereoImage, noise: float) -> F32:
     return out
 
 
-def disparity_noise(raw: F32, smooth: F32, *, refined: bool) -> float:
+def disparity_noise(raw: F32, smooth: F32) -> float:
     """Standard deviation of the disparities: median deviation from the smoothed ones, plus pixel locking."""
     subsampling = 5  # Row and column step of the pixels used for a median
-    # Standard deviation of the errors that neighbours share, measured on known disparities: pixel locking,
-    # or 0.03 in clean to 0.13 in noisy images of what the refinement leaves.
-    locking_px = 0.1 if refined else LOCKING_PX
+    # Standard deviation of the errors that neighbours share, measured on known disparities: what the
+    # refinement leaves, 0.03 in clean to 0.13 in noisy images.
+    locking_px = 0.1
     apart = np.abs(raw[::subsampling, ::subsampling] - smooth[::subsampling, ::subsampling])
     known = apart[np.isfinite(apart)]
     return float(np.hypot(1.4826 * np.median(known), locking_px)) if len(known) else float("nan")

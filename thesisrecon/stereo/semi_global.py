@@ -1,8 +1,8 @@
 """Semi-global matching of rectified pairs (thesis, section 2.5; Hirschmüller, PAMI 30(2), 2008).
 
-It sums the minimal costs of the paths that reach a pixel along its row and column (4 paths), or along the
-diagonals as well (8 paths). Occlusions are found afterwards by the left-right check. All inner loops run over
-pixels of a row so that the compiler vectorises them; horizontal paths are computed on transposed blocks.
+It sums the minimal costs of the four paths that reach a pixel along its row and column. Occlusions are found
+afterwards by the left-right check. All inner loops run over pixels of a row so that the compiler vectorises
+them; horizontal paths are computed on transposed blocks.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thesisrecon._numba import copy_to, empty, full, kernel, zeros
+from thesisrecon._numba import copy_to, full, kernel, zeros
 from thesisrecon.arrays import F32, I16, U8, U64
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo import _cost, _postprocessing
@@ -41,7 +41,7 @@ def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.
 
 @kernel(error_model="numpy")
 def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
-    """Penalties P2 (4, H, W) from the left, upper, upper left and upper right neighbour of each pixel.
+    """Penalties P2 (2, H, W) from the left and the upper neighbour of each pixel.
 
     They decrease with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
     (Hirschmüller 2008, section 2.2).
@@ -51,10 +51,7 @@ def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.flo
     for y in range(height):
         _adapt_P2(grey[y, 1:], grey[y, : width - 1], largest, least, scale, out[0, y, 1:])
         if y > 0:
-            above = grey[y - 1]
-            _adapt_P2(grey[y], above, largest, least, scale, out[1, y])
-            _adapt_P2(grey[y, 1:], above[: width - 1], largest, least, scale, out[2, y, 1:])
-            _adapt_P2(grey[y, : width - 1], above[1:], largest, least, scale, out[3, y, : width - 1])
+            _adapt_P2(grey[y], grey[y - 1], largest, least, scale, out[1, y])
 
 
 @kernel
@@ -81,60 +78,34 @@ def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8,
 
 @kernel
 def _extend_row(
-    cost: U8, before: U8, base: U8, p2: U8, settings: tuple[np.uint8, int, U8], path: U8, least: U8
+    cost: U8, before: U8, base: U8, p2: U8, P1: np.uint8, unreachable: U8, path: U8, least: U8
 ) -> None:
-    """Path costs (D, W) of a row from the previous one, ``shift`` columns aside, of penalties ``p2``."""
-    P1, shift, unreachable = settings
-    n, width = cost.shape
-    a, b = max(0, -shift), width - max(0, shift)
-    c, d = a + shift, b + shift
+    """Path costs (D, W) of a row from the previous one, of penalties ``p2``."""
+    n = len(cost)
     least[:] = 255
     for q in range(n):
-        if b > a:
-            below = before[q - 1, c:d] if q > 0 else unreachable[c:d]
-            above = before[q + 1, c:d] if q < n - 1 else unreachable[c:d]
-            _extend(
-                cost[q, a:b], (below, before[q, c:d], above), base[c:d], p2[c:d], P1, path[q, a:b], least[a:b]
-            )
-        for first, last in ((0, a), (b, width)):
-            for x in range(first, last):
-                path[q, x] = cost[q, x]
-                least[x] = min(least[x], cost[q, x])
+        below = before[q - 1] if q > 0 else unreachable
+        above = before[q + 1] if q < n - 1 else unreachable
+        _extend(cost[q], (below, before[q], above), base, p2, P1, path[q], least)
 
 
 @kernel
-def _shifted(p2: U8, shift: int, out: U8) -> None:
-    """Shift a row of penalties by ``shift`` columns, zeros outside."""
-    width = len(p2)
-    a, b = min(max(0, shift), width), max(width + min(0, shift), 0)
-    out[:a], out[b:] = 0, 0
-    if b > a:
-        copy_to(out[a:b], p2[a - shift : b - shift])
-
-
-@kernel
-def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, shift: int, total: U8) -> None:
-    """Sum path costs from above, ``shift`` columns aside, and the opposite ones, to ``total`` (N, D, W)."""
+def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, total: U8) -> None:
+    """Sum path costs from above and the opposite ones to ``total`` (N, D, W)."""
     rows, n, width = costs.shape
     unreachable = full(width, np.uint8(255 - P1), np.uint8)
-    least, p2 = empty((2, width), np.uint8), empty(width, np.uint8)
-    start = (P1, width, unreachable)  # No column continues a path.
-    _extend_row(costs[0], total[0], least[0], p2, start, total[0], least[0])
-    for y in range(1, rows):
+    # Paths begin behind a row of zeros.
+    paths, least = zeros((2, n, width), np.uint8), zeros((2, width), np.uint8)
+    before = paths[0]
+    for y in range(rows):
         # The sum still holds the path from above only, from which the next row continues.
-        _shifted(P2[y], shift, p2)
-        settings = (P1, shift, unreachable)
-        old, new = least[(y - 1) & 1], least[y & 1]
-        _extend_row(costs[y], total[y - 1], old, p2, settings, total[y], new)
-    paths = empty((2, n, width), np.uint8)
-    path, new = paths[(rows - 1) & 1], least[(rows - 1) & 1]
-    _extend_row(costs[rows - 1], path, new, p2, start, path, new)
-    for y in range(rows - 1, -1, -1):
-        path = paths[y & 1]
-        if y < rows - 1:
-            settings = (P1, -shift, unreachable)
-            old = least[(y + 1) & 1]
-            _extend_row(costs[y], paths[(y + 1) & 1], old, P2[y + 1], settings, path, least[y & 1])
+        _extend_row(costs[y], before, least[y & 1], P2[y], P1, unreachable, total[y], least[(y + 1) & 1])
+        before = total[y]
+    least[0] = 0
+    for k in range(rows):
+        y = rows - 1 - k
+        p2, path = P2[min(y + 1, rows - 1)], paths[(k + 1) & 1]
+        _extend_row(costs[y], paths[k & 1], least[k & 1], p2, P1, unreachable, path, least[(k + 1) & 1])
         for q in range(n):
             values, sums = path[q], total[y, q]
             for x in range(width):
@@ -229,8 +200,7 @@ def scratch_size(height: int, disparities: int, width: int) -> int:
 def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
     """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
 
-    ``P2`` (4, H, W) of :func:`adaptive_P2`; ``total`` (P, H, D, W): P = 2 for rows and columns, 4 with
-    diagonals.
+    ``P2`` (2, H, W) of :func:`adaptive_P2`; ``total`` (2, H, D, W): along rows, along columns.
     """
     height, n, width = costs.shape
     # Horizontal paths are sequential in x: transposed rows are vectorised over y.
@@ -243,12 +213,9 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
         p2 = zeros((width, high), np.uint8)
         for y in range(rows):
             copy_to(p2[:, y], P2[0, start + y])
-        _sum_opposite(transposed[:width], p2, P1, 0, summed[:width])
+        _sum_opposite(transposed[:width], p2, P1, summed[:width])
         _transpose_back(summed, total[0, start : start + rows])
-    _sum_opposite(costs, P2[1], P1, 0, total[1])
-    if len(total) == 4:
-        _sum_opposite(costs, P2[2], P1, -1, total[2])
-        _sum_opposite(costs, P2[3], P1, 1, total[3])
+    _sum_opposite(costs, P2[1], P1, total[1])
 
 
 @dataclass(frozen=True)
@@ -256,33 +223,20 @@ class SemiGlobalMatching:
     """Semi-global matching with census and colour costs.
 
     The cost is the Hamming distance of 5 x 5 census transforms (Zabih and Woodfill 1994), which are invariant
-    to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. Costs
-    averaged over an adaptive support improve little with diagonal paths, which extend foreground disparities
-    beyond the corners of objects.
+    to exposure, plus the truncated colour difference, which distinguishes regions of equal pattern. Costs are
+    averaged over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels. They improve little
+    with diagonal paths, which extend foreground disparities beyond the corners of objects.
     """
 
-    paths: int = 4  #: 4 (rows and columns) or 8 (with diagonals)
     census_share: float = 0.56  #: share of the census in the maximal cost; the colours have the rest
     truncation: float = 10.0  #: largest colour difference in the cost, in standard deviations of the noise
-    support: bool = True
-    """Average the costs over cross-shaped regions (Zhang, Lu and Lafruit 2009) with arms of 2 pixels."""
-    smoothing_radius: int = 2  #: radius of the edge-preserving mean over similar disparities; 0 = none
-    refinements: int = 2  #: passes of the least squares of intensities, which remove pixel locking
 
     # Limit for costs and path sums of one strip of rows.
     memory_mb = 256.0
 
     def __post_init__(self) -> None:
-        if self.paths not in (4, 8):
-            raise ValueError(f"paths must be 4 or 8; got {self.paths}")
-        if not (
-            0.0 <= self.census_share <= 1.0
-            and self.truncation > 0.0
-            and min(self.smoothing_radius, self.refinements) >= 0
-        ):
-            raise ValueError(
-                "census_share must be in [0, 1], truncation positive, smoothing_radius and refinements >= 0"
-            )
+        if not (0.0 <= self.census_share <= 1.0 and self.truncation > 0.0):
+            raise ValueError("census_share must be in [0, 1] and truncation positive")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """Compute the disparities of the left image, NaN where occluded or ambiguous.
@@ -296,25 +250,24 @@ class SemiGlobalMatching:
         images = _cost.prepare_stereo_images(left, right)
         measured = float(np.mean([_cost.estimate_noise(image) for image in images]))
         noise = float(np.hypot(min_noise, measured))
-        (height, width), n, pairs = images[0].valid.shape, last - first + 1, self.paths // 2
+        (height, width), n = images[0].valid.shape, last - first + 1
         bits = np.empty((2, height, width), np.int32)
         for image, out in zip(images, bits, strict=True):
             _cost.census(image.grey, out)
-        arms = np.empty((4, _cost.ARM if self.support else 0, height, width), np.uint8)
-        if self.support:
-            # The colour difference at which an arm of the support ends is five standard deviations.
-            tolerance = np.int16(min(round(5.0 * noise * _cost.LEVELS), 255 * _cost.LEVELS))
-            _cost.support_masks(images[0].channels, images[0].valid, tolerance, arms)
+        arms = np.empty((4, _cost.ARM, height, width), np.uint8)
+        # The colour difference at which an arm of the support ends is five standard deviations.
+        tolerance = np.int16(min(round(5.0 * noise * _cost.LEVELS), 255 * _cost.LEVELS))
+        _cost.support_masks(images[0].channels, images[0].valid, tolerance, arms)
         # A partner outside the image costs a share of the maximal cost.
         weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(0.4 * MAX_COST))
         penalties, P1_cost = _adapted_P2(images[0], noise), np.uint8(round(P1 * MAX_COST))
         # Confidence 1/2 if the second best disparity costs P1 more on every path.
-        half = float(2 * pairs * P1 * MAX_COST)
+        half = float(4 * P1 * MAX_COST)
         found = np.empty((3, height, width), np.float32)
-        # One byte per pixel and disparity for the cost, and one for each pair of opposite paths.
+        # One byte per pixel and disparity for the cost, and one for each of two pairs of opposite paths.
         memory = 1e6 * self.memory_mb
         room = max(memory - 2 * scratch_size(height, n, width), 0.5 * memory)
-        for start, stop, top, bottom in _cost.row_strips(height, (1 + pairs) * width * n, room):
+        for start, stop, top, bottom in _cost.row_strips(height, 3 * width * n, room):
             rows = slice(top, bottom)
             features = [
                 (bits[side, rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows])
@@ -322,9 +275,9 @@ class SemiGlobalMatching:
             ]
             # One allocation gets large memory pages.
             cells, transposed = (bottom - top) * n * width, scratch_size(bottom - top, n, width)
-            whole = np.empty((1 + pairs) * cells + 2 * transposed, np.uint8)
-            volume, sums, scratch = np.split(whole, [cells, (1 + pairs) * cells])
-            volume, sums = volume.reshape(-1, n, width), sums.reshape(pairs, -1, n, width)
+            whole = np.empty(3 * cells + 2 * transposed, np.uint8)
+            volume, sums, scratch = np.split(whole, [cells, 3 * cells])
+            volume, sums = volume.reshape(-1, n, width), sums.reshape(2, -1, n, width)
             support = np.ascontiguousarray(arms[:, :, rows])
             _cost.cost_volume(features[0], features[1], support, first, weights, outside, volume)
             steps = np.ascontiguousarray(penalties[:, rows])
@@ -355,24 +308,19 @@ class SemiGlobalMatching:
         _postprocessing.check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
         # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
         _postprocessing.remove_speckles(left, texture > np.float32(1.7), step, 60)
-        if self.refinements:
-            left = _postprocessing.refine_by_gradient(left, *images, self.refinements)
+        left = _postprocessing.refine_by_gradient(left, *images, passes=2)
         closed, smooth = _postprocessing.fill_pinholes(left, least=5), np.empty_like(left)
         closed[np.isnan(texture)] = np.nan
-        _postprocessing.edge_preserving_mean(closed, step, self.smoothing_radius, smooth)
+        _postprocessing.edge_preserving_mean(closed, step, 2, smooth)
         confidence = _postprocessing.final_confidence(confidence, left, smooth, texture)
-        sigma_px = _postprocessing.disparity_noise(closed, smooth, refined=self.refinements > 0)
+        sigma_px = _postprocessing.disparity_noise(closed, smooth)
         return DisparityMap(smooth, confidence, sigma_px)
 
 
 def _adapted_P2(image: _cost.StereoImage, noise: float) -> U8:
     """P2 / (1 + g / ``EDGE``) with the intensity step g, at least ``MIN_P2``; see :func:`adaptive_P2`."""
     edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
-    out = np.empty((4, *image.valid.shape), np.uint8)
+    out = np.empty((2, *image.valid.shape), np.uint8)
     scale = np.float32(edge * noise * _cost.LEVELS * len(image.channels))
     adaptive_P2(image.grey, np.float32(P2 * MAX_COST), np.float32(MIN_P2 * MAX_COST), scale, out)
     return out
-
-
-PUBLISHED = SemiGlobalMatching(paths=8, census_share=1.0, support=False, smoothing_radius=0, refinements=0)
-"""Semi-global matching as published: eight paths over census costs of single pixels."""

@@ -23,6 +23,7 @@ from thesisrecon.camera import rq
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_centre
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize
+from thesisrecon.geometry.relative_pose import depths_of_matches, poses_from_essential
 from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, require_parallax_of_matches
 from thesisrecon.imaging.raster import run_in_strips
 from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
@@ -88,12 +89,12 @@ def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> Ca
     require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
-    candidates = _decompose(E / np.linalg.norm(E))
-    shares = [_ratio_in_front(R, t, rays1, rays2) for R, t in candidates]
+    R, t = poses_from_essential(E / np.linalg.norm(E))
+    shares = (depths_of_matches(R, t, rays1, rays2) > 0.0).all(axis=2).mean(axis=1)
     best = int(np.argmax(shares))
     if not shares[best] >= in_front:
         raise StageFailure.of("scene-behind-cameras", 100.0 * shares[best], len(xy1), len(shares))
-    return _pair_with(F, K1, K2, *candidates[best])
+    return _pair_with(F, K1, K2, R[best], t[best])
 
 
 def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
@@ -115,24 +116,6 @@ def _pair_with(F: F64, K1: F64, K2: F64, R: F64, t: F64) -> CalibratedPair:
     baseline: F64 = np.asarray(np.linalg.solve(own, e2), dtype=np.float64)
     baseline *= np.sign(baseline @ t) / np.linalg.norm(baseline)
     return CalibratedPair(np.asarray(K1, dtype=np.float64), own / own[2, 2], turn, baseline)
-
-
-def _ratio_in_front(R: F64, t: F64, rays1: F64, rays2: F64) -> float:
-    """Share of ray pairs (N, 3) that meet, at their closest points, in front of both cameras."""
-    turned = rays1 @ R.T
-    normal = np.cross(turned, rays2)
-    first = -np.sum(np.cross(t, rays2) * normal, axis=1)
-    second = -np.sum(np.cross(t, turned) * normal, axis=1)
-    return float(np.mean((first > 0.0) & (second > 0.0)))
-
-
-def _decompose(E: F64) -> list[tuple[F64, F64]]:
-    """The four R = U W V' or U W' V' and unit t = +-u_3 of an essential matrix (HZ 9.6.2)."""
-    U, _, Vt = np.linalg.svd(E)
-    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turns = [U @ W @ Vt for W in (quarter, quarter.T)]
-    turns = [R * np.sign(np.linalg.det(R)) for R in turns]
-    return [(R, sign * U[:, 2]) for R in turns for sign in (1.0, -1.0)]
 
 
 @dataclass(frozen=True, eq=False)
