@@ -236,7 +236,7 @@ def _linearize_pose(
 
 @kernel(forceinline=True)
 def _tangent(inverse1: F64, inverse2: F64, R: F64, t: F64, f: F64, D: F64, T: F64) -> None:
-    """Fill F (9,) of a pose, two directions D (2, 3) across t, and the derivatives T (5, 9) of F by w and d."""
+    """Fill F (9,) of a pose, two directions D (2, 3) across t, and the derivatives T (5, 9) of F."""
     E, axis, change = empty((3, 3)), empty(3), empty((3, 3))
     _directions_across(t, D)
     _cross_times(t, R, E)
