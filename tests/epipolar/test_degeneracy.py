@@ -25,15 +25,9 @@ from thesisrecon.epipolar import homography
 from thesisrecon.epipolar._matches import PairFrame, multiplicity_weights
 from thesisrecon.epipolar.degeneracy import _contradicted_fraction, assess_degeneracy
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry import two_view
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
-from thesisrecon.geometry.two_view import (
-    epipoles,
-    homography_linear,
-    homography_sampson_residuals,
-    sampson_residuals,
-    symmetric_residuals,
-)
 from thesisrecon.optimize.ransac import log10_false_alarms
 from thesisrecon.records import FundamentalFit
 
@@ -132,7 +126,9 @@ def test_relief_determines_a_facade():
     for seed in range(8):
         scene = make_facade(np.random.default_rng(seed), relief=0.03, off_plane=0.15, wrong=0.2, repeated=0.2)
         fit = estimate_fundamental(scene.xy1, scene.xy2)
-        assert np.sqrt(np.mean(symmetric_residuals(fit.F, scene.exact1, scene.exact2) ** 2) / 2.0) < 1.0
+        assert (
+            np.sqrt(np.mean(two_view.symmetric_residuals(fit.F, scene.exact1, scene.exact2) ** 2) / 2.0) < 1.0
+        )
         sure += fit.determined
     assert sure >= 6
 
@@ -155,16 +151,16 @@ def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
     flat = make_pair(300, np.random.default_rng(8), planar=True)
     X = np.c_[rng.uniform(-1.0, 1.0, (30, 2)), rng.uniform(4.0, 4.6, 30)]
     xy1, xy2 = with_points(flat, X, sigma=0.3, rng=rng)
-    e2 = epipoles(flat.F)[1]
+    e2 = two_view.epipoles(flat.F)[1]
     wrong_pole = e2 + np.array([0.0, 0.4, 0.0]) * np.linalg.norm(e2)
-    F = unit_norm(cross_matrix(wrong_pole) @ homography_linear(flat.xy1, flat.xy2))
-    inliers = np.abs(sampson_residuals(F, xy1, xy2)) < 0.75
+    F = unit_norm(cross_matrix(wrong_pole) @ two_view.homography_linear(flat.xy1, flat.xy2))
+    inliers = np.abs(two_view.sampson_residuals(F, xy1, xy2)) < 0.75
     assert inliers[:300].mean() > 0.95
     fit = FundamentalFit(F, inliers, 0.3, 1e-12 * np.eye(9))
     degeneracy = assess_degeneracy(fit, xy1, xy2, rng=np.random.default_rng(0))
     assert not degeneracy.determined
     assert degeneracy.competing_margin < 0.0
-    assert np.mean(np.abs(sampson_residuals(degeneracy.competing_model, xy1, xy2)) < 0.9) > 0.97
+    assert np.mean(np.abs(two_view.sampson_residuals(degeneracy.competing_model, xy1, xy2)) < 0.9) > 0.97
     assert any("another F" in reason for reason in degeneracy.reasons)
 
 
@@ -254,7 +250,7 @@ def test_the_equations_of_a_plane_are_whitened_and_weighted():
     points = np.hstack([xy1, xy2])
     np.testing.assert_allclose(homography.squared_plane_distances(H, points), distances, rtol=1e-9)
     np.testing.assert_allclose(
-        distances, np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2, axis=1), rtol=1e-9
+        distances, np.sum(two_view.homography_sampson_residuals(H, xy1, xy2) ** 2, axis=1), rtol=1e-9
     )
     assert 1 < np.sum(np.array(distances) < 0.05**2) < 29
     G = homography._normal_matrix(H, points, 0.05)
@@ -265,14 +261,14 @@ def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():
     rng = np.random.default_rng(4)
     flat = make_pair(40, rng, planar=True)
     points = PairFrame.of(flat.xy1, flat.xy2).points(flat.xy1, flat.xy2)
-    H = homography_linear(points[:, :2], points[:, 2:])
+    H = two_view.homography_linear(points[:, :2], points[:, 2:])
     away = points[:6].copy()
     away[:, 2:] += rng.uniform(0.2, 0.5, (6, 2))
     pairs = np.array([[0, 1], [2, 5]])
     F, agree, sums = homography.fundamentals_of_plane(H, away, np.ones((1, 6)), pairs, 1e-6)
     for f, pair in zip(F, pairs, strict=True):
         for kept in (points, away[pair]):
-            assert np.abs(sampson_residuals(f.reshape(3, 3), kept[:, :2], kept[:, 2:])).max() < 1e-9
+            assert np.abs(two_view.sampson_residuals(f.reshape(3, 3), kept[:, :2], kept[:, 2:])).max() < 1e-9
     np.testing.assert_array_equal(agree.sum(axis=1), sums[:, 0])
     assert (sums[:, 0] >= 2).all()
 

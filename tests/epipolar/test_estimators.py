@@ -14,15 +14,9 @@ from tests.constants import with_constants
 from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
+from thesisrecon.epipolar import ransac
 from thesisrecon.epipolar.degeneracy import Method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
-from thesisrecon.epipolar.ransac import (
-    INLIER_TESTS,
-    ThesisRansac,
-    discard_outliers,
-    estimate_eight_point,
-    estimate_seven_point,
-)
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure
@@ -40,8 +34,8 @@ seeds = st.integers(0, 2**31)
 
 ROBUST = [
     LocallyOptimisedRansac(),
-    ThesisRansac(samples=300),
-    ThesisRansac(samples=300, epipolar_distance=True),
+    ransac.ThesisRansac(samples=300),
+    ransac.ThesisRansac(samples=300, epipolar_distance=True),
 ]
 
 
@@ -54,7 +48,7 @@ def error_px(F, pair):
 @given(seeds, st.integers(8, 50), st.booleans())
 def test_eight_point_is_exact_without_noise(seed, n, normalized):
     pair = make_pair(n, np.random.default_rng(seed))
-    F = estimate_eight_point(pair.xy1, pair.xy2, normalized=normalized)
+    F = ransac.estimate_eight_point(pair.xy1, pair.xy2, normalized=normalized)
     assert np.linalg.norm(F) == pytest.approx(1.0)
     assert error_px(F, pair) < (1e-6 if normalized else 1e-2)
 
@@ -66,8 +60,10 @@ def test_normalisation_and_rank_matter_under_noise():
         pair = make_pair(100, rng)
         xy1, xy2, _ = spoil(pair, rng, sigma=0.5, outliers=0.0)
         for normalized in errors:
-            errors[normalized].append(error_px(estimate_eight_point(xy1, xy2, normalized=normalized), pair))
-        full = estimate_eight_point(xy1, xy2, rank_two=False)
+            errors[normalized].append(
+                error_px(ransac.estimate_eight_point(xy1, xy2, normalized=normalized), pair)
+            )
+        full = ransac.estimate_eight_point(xy1, xy2, rank_two=False)
         assert np.linalg.matrix_rank(full, tol=1e-15) == 3
     assert np.median(errors[True]) < 0.3 * np.median(errors[False])
 
@@ -76,7 +72,7 @@ def test_normalisation_and_rank_matter_under_noise():
 @given(seeds)
 def test_seven_point_contains_the_truth_and_every_solution_is_valid(seed):
     pair = make_pair(7, np.random.default_rng(seed))
-    F = estimate_seven_point(pair.xy1, pair.xy2)
+    F = ransac.estimate_seven_point(pair.xy1, pair.xy2)
     assert 1 <= len(F) <= 3
     for candidate in F:
         assert np.linalg.norm(candidate) == pytest.approx(1.0)
@@ -129,10 +125,10 @@ def test_both_images_are_treated_alike():
     # The units and the origin of either image do not matter to the normalised eight-point method.
     pair = make_pair(40, np.random.default_rng(3))
     xy1, xy2, _ = spoil(pair, np.random.default_rng(3), sigma=0.5, outliers=0.0)
-    F = estimate_eight_point(xy1, xy2)
+    F = ransac.estimate_eight_point(xy1, xy2)
     for s, t in ((1e-3, 1.0), (1.0, 1e-3)):
         S, T = np.array([[[s, 0, 5.0], [0, s, 3.0], [0, 0, 1]], [[t, 0, -2.0], [0, t, 7.0], [0, 0, 1]]])
-        moved = estimate_eight_point(s * xy1 + [5.0, 3.0], t * xy2 + [-2.0, 7.0])
+        moved = ransac.estimate_eight_point(s * xy1 + [5.0, 3.0], t * xy2 + [-2.0, 7.0])
         assert angle_between(two_view.unit_norm(T.T @ moved @ S), F) < 1e-9
 
 
@@ -154,17 +150,17 @@ def test_parts_and_settings_that_cannot_be_are_refused():
     for kind, changed in (
         (LocallyOptimisedRansac, {"threshold_px": 0.0}), (LocallyOptimisedRansac, {"confidence": 1.0}),
         (LocallyOptimisedRansac, {"starts": 0}), (LocallyOptimisedRansac, {"starts": 11}),
-        (LocallyOptimisedRansac, {"inlier_sigmas": 0.0}), (ThesisRansac, {"threshold_px": np.nan}),
-        (ThesisRansac, {"samples": 0}), (ThesisRansac, {"inlier_test": "both"}),
+        (LocallyOptimisedRansac, {"inlier_sigmas": 0.0}), (ransac.ThesisRansac, {"threshold_px": np.nan}),
+        (ransac.ThesisRansac, {"samples": 0}), (ransac.ThesisRansac, {"inlier_test": "both"}),
     ):  # fmt: skip
         refuses(ValueError, next(iter(changed)), kind, **changed)
     plane = make_pair(30, np.random.default_rng(0), planar=True)
     xy1, xy2 = plane.xy1, plane.xy2
     for wrong in (np.ones((8, 2)), np.full((7, 2), np.nan)):
-        refuses(ValueError, "needs", estimate_seven_point, wrong, np.ones(wrong.shape))
-    refuses(StageFailure, "plane", estimate_eight_point, xy1, xy2)
-    assert estimate_seven_point(xy1[:7], xy2[:7]).shape == (0, 3, 3)
-    assert estimate_seven_point(np.ones((7, 2)), xy2[:7]).shape == (0, 3, 3)
+        refuses(ValueError, "needs", ransac.estimate_seven_point, wrong, np.ones(wrong.shape))
+    refuses(StageFailure, "plane", ransac.estimate_eight_point, xy1, xy2)
+    assert ransac.estimate_seven_point(xy1[:7], xy2[:7]).shape == (0, 3, 3)
+    assert ransac.estimate_seven_point(np.ones((7, 2)), xy2[:7]).shape == (0, 3, 3)
     for F in (np.zeros((3, 3)), np.full((3, 3), np.nan), np.eye(4)):
         refuses(ValueError, "rank 2", refine_fundamental, F, xy1, xy2)
     refuses(ValueError, "unknown criterion .*mean sampson", refine_fundamental, plane.F, xy1, xy2, "samson")
@@ -175,7 +171,7 @@ def test_algorithm_2_minimises_the_chosen_criterion():
     # One image smaller: there the two criteria differ. After ten rounds the inliers stay the same.
     xy1, xy2, _ = spoil(pair, np.random.default_rng(5), sigma=0.5, outliers=0.0)
     xy2 = 0.25 * xy2
-    algorithm = ThesisRansac(threshold_px=3.0, epipolar_distance=True, rounds=10)
+    algorithm = ransac.ThesisRansac(threshold_px=3.0, epipolar_distance=True, rounds=10)
     fit = algorithm.estimate(xy1, xy2, np.random.default_rng(0))
     kept = fit.inliers
     again = refine_fundamental(fit.F, xy1[kept], xy2[kept], "epipolar-distance")
@@ -193,13 +189,13 @@ def test_5_5_and_5_6_the_two_distances_are_multiples_of_one_residual(rng):
     np.testing.assert_allclose(s * symmetric, d[:, 0] * d[:, 1], rtol=1e-9)
 
 
-@pytest.mark.parametrize(("test", "share"), list(zip(INLIER_TESTS, (0.95, 0.95, 0.916), strict=True)))
+@pytest.mark.parametrize(("test", "share"), list(zip(ransac.INLIER_TESTS, (0.95, 0.95, 0.916), strict=True)))
 def test_the_share_of_right_matches_that_pass(test, share):
     rng = np.random.default_rng(1)
     pair = make_pair(4000, rng)
     F = two_view.fundamental_from_cameras(pair.P1, pair.P2)
     xy1, xy2 = (xy + rng.normal(0.0, 0.5, xy.shape) for xy in (pair.xy1, pair.xy2))
-    sigma, inliers = discard_outliers(F, xy1, xy2, test=test)
+    sigma, inliers = ransac.discard_outliers(F, xy1, xy2, test=test)
     assert sigma == pytest.approx(0.5, rel=0.1)
     assert inliers.mean() == pytest.approx(share, abs=0.035)
 
@@ -208,8 +204,8 @@ def test_the_share_of_right_matches_that_pass(test, share):
 def test_algorithm_2_with_the_tests_of_the_text_finds_the_right_matches(inlier_test):
     rng = np.random.default_rng(2)
     xy1, xy2, _ = spoil(make_pair(150, rng), rng, sigma=0.3, outliers=0.3)
-    fit = ThesisRansac(samples=300, inlier_test=inlier_test).estimate(xy1, xy2, rng)
-    usual = ThesisRansac(samples=300).estimate(xy1, xy2, np.random.default_rng(2))
+    fit = ransac.ThesisRansac(samples=300, inlier_test=inlier_test).estimate(xy1, xy2, rng)
+    usual = ransac.ThesisRansac(samples=300).estimate(xy1, xy2, np.random.default_rng(2))
     assert np.mean(fit.inliers == usual.inliers) > 0.9
     assert fit.sigma_px == pytest.approx(usual.sigma_px, rel=0.2)
 

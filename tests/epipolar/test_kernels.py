@@ -11,16 +11,9 @@ from scipy.stats import chisquare, norm
 
 from tests.conftest import refuses
 from tests.epipolar.pairs import angle_between, make_pair, oriented
+from thesisrecon.epipolar import _matches
 from thesisrecon.epipolar import _sampling as kernels
 from thesisrecon.epipolar import refinement as rank2
-from thesisrecon.epipolar._matches import (
-    TAIL,
-    NoiseMixture,
-    PairFrame,
-    _fit_mixture,
-    noise_scale,
-    noise_width,
-)
 from thesisrecon.epipolar._sampling import draw_sample, required_samples
 from thesisrecon.epipolar.locally_optimised import _Candidate
 from thesisrecon.epipolar.ransac import _search, distinct_real_roots, seven_point, singular_members
@@ -37,7 +30,7 @@ def noisy_points(seed, n=60, outliers=0.0):
     """Points in their frame with noise of 1e-3, a share of them wrong, and f."""
     rng = np.random.default_rng(seed)
     pair = make_pair(n, rng)
-    frame = PairFrame.of(pair.xy1, pair.xy2)
+    frame = _matches.PairFrame.of(pair.xy1, pair.xy2)
     points = frame.points(pair.xy1, pair.xy2)
     points += rng.normal(0.0, 1e-3, points.shape)
     wrong = rng.random(n) < outliers
@@ -178,7 +171,7 @@ def test_frame_keeps_sampson_distances_up_to_its_scale():
     pair = make_pair(30, rng)
     xy1, xy2 = pair.xy1 + rng.normal(size=(30, 2)), 3.0 * pair.xy2 + 100.0
     F = rng.normal(size=(3, 3))
-    frame = PairFrame.of(xy1, xy2)
+    frame = _matches.PairFrame.of(xy1, xy2)
     f = frame.matrix_in_frame(F)
     in_frame = kernels.sampson_distances(f, frame.points(xy1, xy2))
     np.testing.assert_allclose(in_frame, frame.scale * np.abs(sampson_residuals(F, xy1, xy2)), rtol=1e-8)
@@ -281,21 +274,21 @@ def test_every_subset_is_equally_likely_and_as_many_are_drawn_as_the_formula_say
 @given(st.floats(0.01, 100.0), st.integers(0, 2**31))
 def test_noise_scale_finds_sigma_and_bears_outliers(sigma, seed):
     residuals = np.random.default_rng(seed).normal(0.0, sigma, 3000)
-    assert noise_scale(residuals, parameters=7) == pytest.approx(sigma, rel=0.12)
+    assert _matches.noise_scale(residuals, parameters=7) == pytest.approx(sigma, rel=0.12)
     residuals[:300] *= 1000.0
-    assert noise_scale(residuals, parameters=7) == pytest.approx(sigma, rel=0.3)
+    assert _matches.noise_scale(residuals, parameters=7) == pytest.approx(sigma, rel=0.3)
 
 
 def test_noise_scale_has_the_small_sample_factor_and_refuses_too_few_residuals():
-    assert noise_scale(np.ones(12), parameters=7) == pytest.approx(2 * 1.4826022)
+    assert _matches.noise_scale(np.ones(12), parameters=7) == pytest.approx(2 * 1.4826022)
     for residuals in (np.ones(7), np.array([np.nan] * 9)):
-        refuses(ValueError, "noise_scale", noise_scale, residuals, parameters=7)
+        refuses(ValueError, "noise_scale", _matches.noise_scale, residuals, parameters=7)
 
 
 def test_consensus_takes_most_inliers_then_the_least_spread():
     rng = np.random.default_rng(1)
     pair = make_pair(40, rng)
-    points = PairFrame.of(pair.xy1, pair.xy2).points(pair.xy1, pair.xy2)
+    points = _matches.PairFrame.of(pair.xy1, pair.xy2).points(pair.xy1, pair.xy2)
     points[:15, 2:] = rng.uniform(-1.5, 1.5, (15, 2))
 
     def distances(f):
@@ -325,16 +318,16 @@ def test_the_noise_is_seen_to_its_end(sigma):
     rng = np.random.default_rng(0)
     wrong = rng.uniform(0.0, 300.0, 500)
     r = np.abs(np.concatenate([rng.normal(0.0, sigma, 1000), wrong]))
-    width = noise_width(r, 1.0)
+    width = _matches.noise_width(r, 1.0)
     assert max(1.0, 2.2 * sigma) <= width <= max(1.0, 5.0 * sigma)
-    found = trimmed_noise_scale(r, noise_scale(r[r < width]))
+    found = trimmed_noise_scale(r, _matches.noise_scale(r[r < width]))
     assert found == pytest.approx(sigma, rel=0.1)
 
 
 def test_wrong_matches_do_not_widen_the_noise():
     r = np.random.default_rng(1).uniform(0.0, 300.0, 20000)
-    assert noise_width(r, 1.0) == 1.0
-    assert noise_width(r[:5], 1.0) == 1.0
+    assert _matches.noise_width(r, 1.0) == 1.0
+    assert _matches.noise_width(r[:5], 1.0) == 1.0
     assert trimmed_noise_scale(r[:10], 0.5) == 0.5
     assert trimmed_noise_scale(np.zeros(50), 0.5) == 0.0
 
@@ -343,18 +336,18 @@ def draw(n, wrong, tail, seed):
     """Absolute residuals in order: noise of 0.5, a tail four times as wide, wrong ones up to 300."""
     rng = np.random.default_rng(seed)
     kind = rng.random(n)
-    r = rng.normal(0.0, 0.5, n) * np.where(kind < tail, TAIL, 1.0)
+    r = rng.normal(0.0, 0.5, n) * np.where(kind < tail, _matches.TAIL, 1.0)
     r[kind > 1.0 - wrong] = rng.uniform(0.0, 300.0, int(np.sum(kind > 1.0 - wrong)))
     return np.sort(np.abs(r))
 
 
 def test_one_round_is_the_textbook_step():
     r, mixture = draw(60, 0.3, 0.2, 0), np.array([0.7, 80.0, 0.5, 0.2, 0.3])
-    p = mixture[2:] * 2.0 * norm.pdf(r[:, None], scale=np.array([0.7, 0.7 * TAIL, 80.0]))
+    p = mixture[2:] * 2.0 * norm.pdf(r[:, None], scale=np.array([0.7, 0.7 * _matches.TAIL, 80.0]))
     posterior = p / p.sum(axis=1, keepdims=True)
     squares, counts = posterior.T @ r**2, posterior.sum(axis=0)
-    likelihood = _fit_mixture(r, 7.0, 50.0, 1, mixture)
-    sigma = np.sqrt((squares[0] + squares[1] / TAIL**2) / (counts[0] + counts[1] - 7.0))
+    likelihood = _matches._fit_mixture(r, 7.0, 50.0, 1, mixture)
+    sigma = np.sqrt((squares[0] + squares[1] / _matches.TAIL**2) / (counts[0] + counts[1] - 7.0))
     assert mixture[0] == pytest.approx(sigma, rel=1e-9)
     assert mixture[1] == pytest.approx(np.sqrt((squares[2] + 50.0**2) / (counts[2] + 1.0)), rel=1e-9)
     np.testing.assert_allclose(mixture[2:], (counts + np.array([1.0, 0.5, 1.0])) / 62.5, rtol=1e-9)
@@ -365,7 +358,7 @@ def test_one_round_is_the_textbook_step():
 @pytest.mark.parametrize(("n", "wrong"), [(100, 0.0), (1000, 0.0), (1000, 0.3), (1000, 0.6), (5000, 0.5)])
 @pytest.mark.parametrize("start", [0.4, 1.0])
 def test_the_noise_is_found_among_wrong_residuals(n, wrong, start):
-    found = NoiseMixture.fit(draw(n, wrong, 0.0, 2), start, spread=150.0, parameters=0)
+    found = _matches.NoiseMixture.fit(draw(n, wrong, 0.0, 2), start, spread=150.0, parameters=0)
     assert found.sigma == pytest.approx(0.5, rel=0.15)
     assert found.wrong == pytest.approx(wrong, abs=0.05)
     assert found.core + found.tail + found.wrong == pytest.approx(1.0)
@@ -373,12 +366,12 @@ def test_the_noise_is_found_among_wrong_residuals(n, wrong, start):
 
 
 def test_heavy_tails_and_exact_residuals_have_a_finite_mixture():
-    light = NoiseMixture.fit(draw(2000, 0.3, 0.02, 3), 0.5, spread=150.0)
-    heavy = NoiseMixture.fit(draw(2000, 0.3, 0.25, 3), 0.5, spread=150.0)
+    light = _matches.NoiseMixture.fit(draw(2000, 0.3, 0.02, 3), 0.5, spread=150.0)
+    heavy = _matches.NoiseMixture.fit(draw(2000, 0.3, 0.25, 3), 0.5, spread=150.0)
     assert heavy.tail > 0.15 > 0.06 > light.tail
     assert heavy.limit > light.limit
     assert heavy.core_limit / heavy.sigma < light.core_limit / light.sigma
-    found = NoiseMixture.fit(np.zeros(40), 1e-9, spread=1.0)
+    found = _matches.NoiseMixture.fit(np.zeros(40), 1e-9, spread=1.0)
     assert 0.0 < found.sigma < 1e-9
     assert np.isfinite([found.limit, found.core_limit, found.log_likelihood]).all()
 
@@ -387,7 +380,10 @@ def test_heavy_tails_and_exact_residuals_have_a_finite_mixture():
 @given(st.floats(-4.0, 4.0), st.integers(0, 1000))
 def test_the_mixture_scales_with_its_residuals(power, seed):
     r, s = draw(80, 0.3, 0.1, seed), 10.0**power
-    one, other = NoiseMixture.fit(r, 0.5, spread=150.0), NoiseMixture.fit(s * r, 0.5 * s, spread=150.0 * s)
+    one, other = (
+        _matches.NoiseMixture.fit(r, 0.5, spread=150.0),
+        _matches.NoiseMixture.fit(s * r, 0.5 * s, spread=150.0 * s),
+    )
     assert other.sigma == pytest.approx(s * one.sigma, rel=1e-6)
     assert other.limit == pytest.approx(s * one.limit, rel=1e-4)
     assert other.log_likelihood == pytest.approx(one.log_likelihood - np.log(s), abs=1e-6)
@@ -396,7 +392,7 @@ def test_the_mixture_scales_with_its_residuals(power, seed):
 def test_a_wider_gate_must_be_more_likely_and_leave_few_matches():
     def of(likelihood, near):
         """A result with noise of 1 px that explains ``near`` of 100 matches."""
-        noise = NoiseMixture(1.0, 100.0, 0.8, 0.1, 0.1, likelihood)
+        noise = _matches.NoiseMixture(1.0, 100.0, 0.8, 0.1, 0.1, likelihood)
         residuals = np.where(np.arange(100) < near, 0.5 * noise.limit, 2.0 * noise.limit)
         return _Candidate(np.ones(9), 1, residuals, noise, (1.0, 1.0), [])
 

@@ -12,14 +12,10 @@ from tests.geometry.properties import holds_for_every, random_camera
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import compose_camera
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry import triangulation
 from thesisrecon.geometry.camera_matrix import camera_centre, orient_signs, project
 from thesisrecon.geometry.homogeneous import homogenize, unit_normals
 from thesisrecon.geometry.polynomial_triangulation import correct_matches, triangulate_polynomial
-from thesisrecon.geometry.triangulation import (
-    _least_singular_vector,
-    pose_from_three_points,
-    triangulate_observations,
-)
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.lens import distort, undistort
 from thesisrecon.optimize.bundle.partial import minimize_reprojection
@@ -271,7 +267,7 @@ def test_6_3_1_any_order_of_observations_and_near_singular_values():
     view, point = np.nonzero(np.isfinite(xy[:, :, 0]))
     shuffled = rng.permutation(len(view))
     view, point = view[shuffled], point[shuffled]
-    found = triangulate_observations(P, view, point, xy[view, point], 14)
+    found = triangulation.triangulate_observations(P, view, point, xy[view, point], 14)
     np.testing.assert_allclose(found[:12], triangulate(P, xy, method="linear"), atol=1e-12)
     assert not found[12:].any()
     rng = np.random.default_rng(0)
@@ -279,7 +275,7 @@ def test_6_3_1_any_order_of_observations_and_near_singular_values():
         U, V = (np.linalg.qr(rng.normal(size=(4, 4)))[0] for _ in range(2))
         R = np.linalg.qr((U * [3.0, 2.0, 1.0, ratio]) @ V.T)[1]
         x = np.empty(4)
-        _least_singular_vector(np.ascontiguousarray(R), x)
+        triangulation._least_singular_vector(np.ascontiguousarray(R), x)
         assert np.linalg.norm(R @ x) == pytest.approx(ratio, abs=1e-14)
         assert np.linalg.norm(x) == pytest.approx(1.0)
 
@@ -327,12 +323,12 @@ def test_three_point_pose_contains_the_truth():
     R = Rotation.random(500, random_state=1).as_matrix()
     t = 0.5 * rng.normal(size=(500, 3)) + [0.0, 0.0, 5.0]
     Y = np.einsum("bij,bkj->bki", R, X) + t[:, None]
-    found = pose_from_three_points(X, Y / np.linalg.norm(Y, axis=2, keepdims=True))
+    found = triangulation.pose_from_three_points(X, Y / np.linalg.norm(Y, axis=2, keepdims=True))
     error = np.abs(found[:, None] - np.concatenate([R, t[:, :, None]], axis=2)).max(axis=(2, 3))
     assert error.min(axis=0).max() < 1e-6
     np.testing.assert_allclose(np.linalg.det(found[:, :, :3]), 1.0)
     collinear = np.array([[[1.0, 0.0, 5.0], [1.0, 0.0, 5.0], [2.0, 0.0, 5.0]]])
-    assert np.isfinite(pose_from_three_points(collinear, collinear)).all()
+    assert np.isfinite(triangulation.pose_from_three_points(collinear, collinear)).all()
 
 
 def test_orientation_makes_depths_positive_to_the_end_of_a_long_row_of_views():

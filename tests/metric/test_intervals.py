@@ -5,16 +5,8 @@ import pytest
 
 from tests.metric.metric_stage import refine, scatter, with_few_points, with_xy
 from tests.synthetic import make_scene
-from thesisrecon.metric import refinement
+from thesisrecon.metric import _uncertainty, refinement
 from thesisrecon.metric._adjustment import tail_width
-from thesisrecon.metric._uncertainty import (
-    FocalShrinkage,
-    PerCameraEstimates,
-    estimate_hierarchical_prior,
-    estimate_spread,
-    find_outliers,
-    lack_of_fit,
-)
 
 
 def test_deviations_and_noise_are_of_the_stated_size_on_normal_noise():
@@ -79,8 +71,8 @@ def test_model_error_and_tails_are_seen():
     for contradiction, misfit, blocks, share in (
         (1.0, 1.0, 32, 0.0), (2.5, 1.0, 32, 1.0), (1.0, 2.5, 32, 1.0), (1.0, 1.0, 1, 1.0),
     ):  # fmt: skip
-        assert lack_of_fit(scatter(contradiction, blocks), misfit) == share
-    assert 0.0 < lack_of_fit(scatter(1.5), 1.0) < 1.0
+        assert _uncertainty.lack_of_fit(scatter(contradiction, blocks), misfit) == share
+    assert 0.0 < _uncertainty.lack_of_fit(scatter(1.5), 1.0) < 1.0
     lengths = np.linalg.norm(np.random.default_rng(0).normal(size=(4000, 2)), axis=1)
     assert tail_width(lengths, 1.0) == pytest.approx(1.0, abs=0.05)
     assert tail_width(10.0 * lengths, 1.0) == 3.0
@@ -103,21 +95,25 @@ def test_other_estimates_have_intervals_that_hold_the_truth():
 def test_the_spread_is_that_of_the_values_beyond_their_noise_and_the_error_of_the_model():
     rng = np.random.default_rng(1)
     std = rng.uniform(0.002, 0.01, 30)
-    same = estimate_spread(std * rng.normal(size=30), std, std)
+    same = _uncertainty.estimate_spread(std * rng.normal(size=30), std, std)
     assert same < 0.004
-    zoomed = estimate_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std, std)
+    zoomed = _uncertainty.estimate_spread(rng.normal(0.0, 0.3, 30) + std * rng.normal(size=30), std, std)
     assert zoomed == pytest.approx(0.3, rel=0.5)
     rng = np.random.default_rng(2)
     std = np.full(12, 0.01)
     values = [0.02 * rng.normal(size=12) + std * rng.normal(size=12) for _ in range(200)]
-    assert np.median([estimate_spread(v, std, std) for v in values]) == pytest.approx(0.02, rel=0.15)
-    assert np.median([estimate_spread(v, std, 5.0 * std) for v in values]) < 0.005
-    assert estimate_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
+    assert np.median([_uncertainty.estimate_spread(v, std, std) for v in values]) == pytest.approx(
+        0.02, rel=0.15
+    )
+    assert np.median([_uncertainty.estimate_spread(v, std, 5.0 * std) for v in values]) < 0.005
+    assert _uncertainty.estimate_spread(np.zeros(1), np.ones(1), np.ones(1)) == np.inf
 
 
 def prior_of(value, kind, shared, std=1e-3):
     std = np.full(value.shape, std)
-    return estimate_hierarchical_prior(PerCameraEstimates(value, std, 0.0 * std, np.array(kind)), shared)
+    return _uncertainty.estimate_hierarchical_prior(
+        _uncertainty.PerCameraEstimates(value, std, 0.0 * std, np.array(kind)), shared
+    )
 
 
 def test_one_zoomed_camera_does_not_pull_the_rest_and_kinds_have_spreads_of_their_own():
@@ -127,7 +123,7 @@ def test_one_zoomed_camera_does_not_pull_the_rest_and_kinds_have_spreads_of_thei
     found = prior_of(value, [0] * 9, np.tile(np.arange(9)[:, None], (1, 8)))
     np.testing.assert_array_equal(found.kind, np.where(np.arange(9) == 4, -1, 0))
     assert found.spread[0, 0] < 0.005
-    assert find_outliers(value[:, 0], np.full(9, 0.001)).sum() == 1
+    assert _uncertainty.find_outliers(value[:, 0], np.full(9, 0.001)).sum() == 1
     rng = np.random.default_rng(5)
     value = np.zeros((12, 8))
     value[:6, 0], value[6:, 0] = 0.001 * rng.normal(size=6), 0.2 * rng.normal(size=6)
@@ -143,9 +139,9 @@ def test_shrinking_needs_several_of_one_kind_and_matches_that_say_less():
     assert prior_of(value, [0] * 4, np.zeros_like(own), std=0.01) is None
     assert prior_of(value, [0, 0, 1, 2], own, std=0.01) is None
     assert prior_of(value, [0] * 4, own, std=0.01) is not None
-    lent = FocalShrinkage(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
+    lent = _uncertainty.FocalShrinkage(np.array([0.02, 0.001, 0.02]), np.array([0.1, 0.1, 0.9]))
     assert [lent.is_shrunk(view, 0.005) for view in range(3)] == [True, False, False]
-    assert "8% (1 sigma)" in FocalShrinkage(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]
+    assert "8% (1 sigma)" in _uncertainty.FocalShrinkage(np.array([0.08]), np.ones(1)).warnings([0], 0.05)[0]
 
 
 def test_a_badly_determined_focal_is_shrunk_and_named():

@@ -8,24 +8,8 @@ import pytest
 from tests.metric.metric_stage import centre_error, run, scatter, with_xy
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
-from thesisrecon.metric._adjustment import (
-    SETTLED,
-    MetricAdjustment,
-    camera_differences,
-    held_out_observations,
-    remaining_cost,
-    richer_models,
-    with_own_values,
-)
+from thesisrecon.metric import _adjustment, _model
 from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
-from thesisrecon.metric._model import (
-    CENTRE,
-    FOCAL,
-    MetricEstimate,
-    camera_rows,
-    reproject_observations,
-    retriangulate_tracks,
-)
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
@@ -45,17 +29,19 @@ STATED = {
 
 
 def true_model(scene, prior):
-    group, shared = camera_rows(prior)
+    group, shared = _model.camera_rows(prior)
     rows = np.zeros((len(shared), 8))
     K = scene.K[[int(np.flatnonzero(group == g)[0]) for g in range(len(shared))]]
     rows[:, 0], rows[:, 1], rows[:, 3:5] = K[:, 0, 0], 1.0, K[:, :2, 2]
     cameras = MetricCameras(scene.R, scene.t, rows, group, shared)
     views, points, seen = (np.ones(len(a), dtype=bool) for a in (scene.R, scene.X, scene.tracks.xy))
-    return found_again(MetricEstimate(scene.tracks, scene.sizes, cameras, views, scene.X, points, seen, 0.5))
+    return found_again(
+        _model.MetricEstimate(scene.tracks, scene.sizes, cameras, views, scene.X, points, seen, 0.5)
+    )
 
 
 def found_again(model):
-    return retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
+    return _model.retriangulate_tracks(model, sigmas=SIGMAS, min_angle=ANGLE)
 
 
 def unshared(scene):
@@ -135,7 +121,7 @@ def test_points_behind_a_camera_are_detected():
 @pytest.mark.parametrize(("off", "deviation", "reported"), [(1.0, 0.01, 0), (1.05, 0.003, 1), (1.05, 0.1, 0)])
 def test_a_focal_that_the_images_contradict_is_reported(off, deviation, reported):
     _, prior, model = setting(focal_px=1500.0 * off, focal_std_rel=deviation)
-    adjustment = MetricAdjustment(prior, 0.0, 0.02)
+    adjustment = _adjustment.MetricAdjustment(prior, 0.0, 0.02)
     model = found_again(adjustment.run(model, iterations=10)[0])
     failed_checks = contradicted_focal_priors(model, adjustment)
     assert len(failed_checks) == reported
@@ -144,12 +130,12 @@ def test_a_focal_that_the_images_contradict_is_reported(off, deviation, reported
 
 def test_a_contradicted_known_focal_is_reported_once_without_advice_on_weights():
     _, prior, model = setting(focal="known", focal_px=1600.0)
-    (only,) = contradicted_focal_priors(model, MetricAdjustment(prior, 0.0, 0.02))
+    (only,) = contradicted_focal_priors(model, _adjustment.MetricAdjustment(prior, 0.0, 0.02))
     assert "shorter" in only
     assert "px" not in only
     assert "focal_std_rel" not in only
     _, without, model = setting()
-    assert contradicted_focal_priors(model, MetricAdjustment(without, 0.0, 0.02)) == []
+    assert contradicted_focal_priors(model, _adjustment.MetricAdjustment(without, 0.0, 0.02)) == []
 
 
 @pytest.mark.parametrize(("far", "fails"), [(0.09, False), (0.11, True), (np.inf, True)])
@@ -169,7 +155,7 @@ def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_d
     model = unshared(scene)
     assert check_views(model, sigmas=SIGMAS).noise_px == pytest.approx(0.5, rel=0.2)
     view, point = model.tracks.view_index[model.inlier], model.tracks.point_index[model.inlier]
-    xy, _ = reproject_observations(model, view, point)
+    xy, _ = _model.reproject_observations(model, view, point)
     left = np.linalg.norm(xy - model.tracks.xy[model.inlier], axis=1)
     kept = [np.median(left[view == v]) for v in range(3)]
     assert kept[1] > 1.3 * min(kept[0], kept[2])
@@ -198,7 +184,7 @@ def test_two_images_from_one_place_are_not_rejected_for_points_only_they_share()
 def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself_too():
     scene = make_scene(sigma_px=0.3, principal_shift=(140.0, 0.0), seed=3)
     prior = prior_for(projective_reconstruction(scene))
-    adjustment = MetricAdjustment(prior, 0.0, 0.02)
+    adjustment = _adjustment.MetricAdjustment(prior, 0.0, 0.02)
     off, middle = true_model(scene, prior), true_model(make_scene(seed=3), prior)
     for model, contradiction, doubts in ((off, 3.0, 0), (off, 12.0, 1), (middle, 12.0, 0)):
         assert len(inconsistent_principal_point(model, adjustment, scatter(contradiction))) == doubts
@@ -207,7 +193,7 @@ def test_a_principal_point_far_off_is_doubted_where_the_scene_contradicts_itself
 def settled(scene, **options):
     """The model as the metric stage ends with it: adjusted and triangulated by turns."""
     prior = prior_for(projective_reconstruction(scene), IntrinsicsOptions(**options))
-    adjustment = MetricAdjustment(prior, 0.0, 0.02)
+    adjustment = _adjustment.MetricAdjustment(prior, 0.0, 0.02)
     model = replace(true_model(scene, adjustment.prior), sigma_px=30.0)
     for _ in range(3):
         model = adjustment.run(found_again(model), iterations=10)[0]
@@ -252,7 +238,7 @@ def test_deviations_of_few_images_are_learned_from_their_residuals(views):
             shift = own * scene.sizes[0].max() * np.random.default_rng(seed).normal(size=(views, 2))
             model, adjustment = settled(changed(scene, np.ones(views), shift))
             adjustment = replace(adjustment, inflation=block_scatter(adjustment.linearised(model)).inflation)
-            model = adjustment.run(model, settled=SETTLED, keep_noise=True)[0]
+            model = adjustment.run(model, settled=_adjustment.SETTLED, keep_noise=True)[0]
             widths.append(focal_std_of_deviations(model, adjustment, critical=False, contradicted=False))
             noise = np.sqrt(block_scatter(adjustment.linearised(model)).variance[0, 0])
             focal = model.cameras.intrinsics[0, 0] / scene.K[0, 0, 0]
@@ -361,7 +347,7 @@ def test_what_no_intrinsic_explains_is_named_and_widens_the_interval():
 
 def test_held_out_blocks_and_differences_of_models():
     _, _, model = setting()
-    held = held_out_observations(model)
+    held = _adjustment.held_out_observations(model)
     t = model.tracks
     assert 0.1 < len(held) / model.inlier.sum() < 0.3
     left = model.inlier.copy()
@@ -376,11 +362,11 @@ def test_held_out_blocks_and_differences_of_models():
     assert mine[nearest[mine]].mean() > 2 * mine.mean()
     cameras = model.cameras
     same = replace(model, cameras=replace(cameras, t=3.0 * cameras.t))
-    assert camera_differences(model, same).centre < 1e-9
-    longer = cameras.intrinsics * np.where(np.arange(8) == FOCAL, 1.02, 1.0)
+    assert _adjustment.camera_differences(model, same).centre < 1e-9
+    longer = cameras.intrinsics * np.where(np.arange(8) == _model.FOCAL, 1.02, 1.0)
     zoomed = replace(model, cameras=replace(cameras, intrinsics=longer))
-    assert camera_differences(model, zoomed).focal == pytest.approx(np.log(1.02))
-    assert camera_differences(model, zoomed).harmless
+    assert _adjustment.camera_differences(model, zoomed).focal == pytest.approx(np.log(1.02))
+    assert _adjustment.camera_differences(model, zoomed).harmless
 
 
 def test_a_richer_model_of_one_camera_predicts_no_better_and_one_of_crops_far_better():
@@ -388,19 +374,21 @@ def test_a_richer_model_of_one_camera_predicts_no_better_and_one_of_crops_far_be
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
     for images, low, high in ((scene, 0.9, 1.3), (changed(scene, np.ones(8), shift), 0.0, MAX_REMAINING)):
         simple = settled(images)
-        model, adjustment = with_own_values(*simple, (FOCAL, *CENTRE))
+        model, adjustment = _adjustment.with_own_values(*simple, (_model.FOCAL, *_model.CENTRE))
         model = adjustment.run(model, iterations=25)[0]
-        assert low < remaining_cost(simple, (model, adjustment)) < high
+        assert low < _adjustment.remaining_cost(simple, (model, adjustment)) < high
 
 
 def test_each_model_is_tried_once_and_known_intrinsics_stay_known():
     free = setting()[1]
     known = setting(principal_point="known")[1]
-    focal = np.arange(8) == FOCAL
-    assert list(richer_models(focal, free)) == [(FOCAL,), (FOCAL, *CENTRE)]
-    assert list(richer_models(focal, known)) == [(FOCAL,)]
-    assert list(richer_models(np.zeros(8, bool), free)) == []
+    focal = np.arange(8) == _model.FOCAL
+    assert list(_adjustment.richer_models(focal, free)) == [(_model.FOCAL,), (_model.FOCAL, *_model.CENTRE)]
+    assert list(_adjustment.richer_models(focal, known)) == [(_model.FOCAL,)]
+    assert list(_adjustment.richer_models(np.zeros(8, bool), free)) == []
     # Known in some images only: the others may have been zoomed.
-    some = replace(free, std=np.where((np.arange(8) < 4)[:, None] & (np.arange(6) == FOCAL), 0.0, free.std))
-    assert list(richer_models(focal, some)) == [(FOCAL,), (FOCAL, *CENTRE)]
-    assert list(richer_models(focal, setting(focal="known", focal_px=1500.0)[1])) == []
+    some = replace(
+        free, std=np.where((np.arange(8) < 4)[:, None] & (np.arange(6) == _model.FOCAL), 0.0, free.std)
+    )
+    assert list(_adjustment.richer_models(focal, some)) == [(_model.FOCAL,), (_model.FOCAL, *_model.CENTRE)]
+    assert list(_adjustment.richer_models(focal, setting(focal="known", focal_px=1500.0)[1])) == []

@@ -19,12 +19,7 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, whitened_frame
 from thesisrecon.geometry.three_view import cameras_from_tensor
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.optimize.bundle.partial import (
-    minimize_reprojection,
-    refine_camera,
-    refine_points,
-    refine_pose,
-)
+from thesisrecon.optimize.bundle import partial
 from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.least_squares import minimize_residuals
@@ -137,11 +132,11 @@ def test_resection_of_a_projective_and_a_calibrated_camera(seed):
     moved, _ = perturbed(block, seed=seed, size=OFFS[seed % 2])
     one = block.view == 1
     X, xy, loss = block.X[block.point[one]], noisy(block, seed)[one], 1.0
-    P, _ = refine_camera(moved.P[1], homogenize(X), xy, loss_px=loss)
+    P, _ = partial.refine_camera(moved.P[1], homogenize(X), xy, loss_px=loss)
     start = P.ravel() / np.linalg.norm(P)
     assert sigmas_to_minimum(lambda x: project(x.reshape(3, 4), X) - xy, start, loss) < 0.1
     free = np.array([True, False, False, False, False, True])
-    found = refine_pose(moved.R[1], moved.t[1], moved.intrinsics[0], X, xy, free=free, loss_px=loss)
+    found = partial.refine_pose(moved.R[1], moved.t[1], moved.intrinsics[0], X, xy, free=free, loss_px=loss)
 
     def of_pose(x):
         R = Rotation.from_rotvec(x[:3]).as_matrix() @ found.R
@@ -160,8 +155,8 @@ def test_points_with_fixed_cameras(seed):
     xy, P = noisy(block, seed), block.cameras.P
     start = block.Xh + np.random.default_rng(seed).normal(0.0, 0.1, block.Xh.shape) * [1.0, 1.0, 1.0, 0.0]
     for loss, found in (
-        (np.inf, minimize_reprojection(P, start, block.view, block.point, xy)),
-        (1.0, refine_points(P, start, block.view, block.point, xy, loss_px=1.0, iterations=50)),
+        (np.inf, partial.minimize_reprojection(P, start, block.view, block.point, xy)),
+        (1.0, partial.refine_points(P, start, block.view, block.point, xy, loss_px=1.0, iterations=50)),
     ):
         for j in range(len(start)):
             k = block.point == j
@@ -333,10 +328,10 @@ def test_exact_points_and_cameras_stay_where_they_are(kind):
     scene = _Scene(**kind)
     P, X, view, point, xy = scene.P, scene.X, scene.view, scene.point, scene.xy
     several = refine_projective_bundle(P, X, Observations(view, point, xy), max_iterations=20)
-    each = np.stack([refine_camera(P[k], *scene.of_view(k)[:2])[0] for k in range(len(P))])
+    each = np.stack([partial.refine_camera(P[k], *scene.of_view(k)[:2])[0] for k in range(len(P))])
     found = {
-        "refine_points": (P, refine_points(P, X, view, point, xy, iterations=10)),
-        "minimize_reprojection": (P, minimize_reprojection(P, X, view, point, xy)),
+        "refine_points": (P, partial.refine_points(P, X, view, point, xy, iterations=10)),
+        "minimize_reprojection": (P, partial.minimize_reprojection(P, X, view, point, xy)),
         "refine_projective_bundle": (several.P, several.X),
         "refine_camera": (each, X),
     }
@@ -358,11 +353,11 @@ def test_the_cost_of_what_is_returned_falls_and_is_the_one_reported(kind):
     left = 1.0 - (11 * len(scene.P) + 3 * len(scene.X) - 15) / (2 * len(gap))
     assert reached < NOISE * np.sqrt(left) * (1.0 + 4.0 / np.sqrt(4 * left * len(gap)))
     for loss_px in (1.0, 1e6):
-        X = refine_points(scene.P, scene.X, scene.view, scene.point, scene.noisy, loss_px=loss_px)
+        X = partial.refine_points(scene.P, scene.X, scene.view, scene.point, scene.noisy, loss_px=loss_px)
         assert scene.rms(scene.P, X) < start
     for k, P in enumerate(scene.P):
         X, _, xy = scene.of_view(k)
-        before, after = (project(p, X) - xy for p in (P, refine_camera(P, X, xy, loss_px=1e6)[0]))
+        before, after = (project(p, X) - xy for p in (P, partial.refine_camera(P, X, xy, loss_px=1e6)[0]))
         assert np.sum(after**2) < np.sum(before**2)
 
 

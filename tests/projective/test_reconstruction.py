@@ -16,27 +16,10 @@ from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.optimize.ransac import Budget, resect_projective
-from thesisrecon.projective._model import (
-    ProjectiveModel,
-    consistent_observations,
-    coverage_of_views,
-    initial_cameras,
-    observation_cells,
-    rank_initial_pairs,
-    retriangulate_points,
-    select_tracks,
-    select_tracks_with_parallax,
-    update_inliers,
-)
-from thesisrecon.projective.incremental import (
-    IncrementalProjective,
-    SequentialProjective,
-    _find_inconsistent_view,
-    _projection_std_px,
-)
+from thesisrecon.projective import _model, incremental
 from thesisrecon.records import DegeneracyReport, Tracks
 
-VARIANTS = [IncrementalProjective(), SequentialProjective()]
+VARIANTS = [incremental.IncrementalProjective(), incremental.SequentialProjective()]
 
 
 def residuals(found):
@@ -73,7 +56,7 @@ def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out():
     t, rng = scene.tracks, np.random.default_rng(5)
     wrong = rng.random(len(t.xy)) < 0.05
     xy = t.xy + np.where(wrong[:, None], rng.uniform(-200, 200, t.xy.shape), 0.0)
-    method = IncrementalProjective()
+    method = incremental.IncrementalProjective()
     found = method.reconstruct(replace(t, xy=xy), true_pairs(scene), scene.sizes, rng=rng)
     assert found.registered.all()
     assert found.sigma_px == pytest.approx(0.5, rel=0.25)
@@ -97,10 +80,10 @@ def test_initial_cameras_have_the_fundamental_matrix_they_came_from():
     scene = make_scene()
     pair = true_pairs(scene)[0]
     for sign in (1.0, -1.0):
-        P = np.stack(initial_cameras(replace(pair, F=sign * pair.F), scene.sizes[:2]))
+        P = np.stack(_model.initial_cameras(replace(pair, F=sign * pair.F), scene.sizes[:2]))
         X = triangulate(P, np.stack([pair.xy1, pair.xy2]), method="linear")
         assert (np.sign(X @ P[0, 2]) == np.sign(X @ P[1, 2])).all()
-    F = fundamental_from_cameras(*initial_cameras(pair, scene.sizes[:2]))
+    F = fundamental_from_cameras(*_model.initial_cameras(pair, scene.sizes[:2]))
     np.testing.assert_allclose(F * np.sign(np.sum(F * pair.F)), pair.F, atol=1e-9)
 
 
@@ -113,7 +96,7 @@ def test_initial_cameras_put_infinity_beyond_the_scene_however_the_camera_is_hel
     turn, middle = Rotation.from_euler("z", roll_deg, degrees=True).as_matrix(), (scene.sizes[1] - 1) / 2.0
     turn[:2, 2] = middle - turn[:2, :2] @ middle
     held = replace(pair, xy2=pair.xy2 @ turn[:2, :2].T + turn[:2, 2], F=np.linalg.inv(turn).T @ pair.F)
-    P = np.stack(initial_cameras(held, scene.sizes[:2]))
+    P = np.stack(_model.initial_cameras(held, scene.sizes[:2]))
     X = triangulate(P, np.stack([held.xy1, held.xy2]), method="linear")
     assert abs(np.sign(X[:, 3] * (X @ P[0, 2])).mean()) > 0.97
     # In unit-free pixels the left part is near a rotation.
@@ -137,12 +120,12 @@ def test_resection_among_wrong_points_and_the_spread_of_the_gate():
     draws = P + (rng.normal(size=(20000, 12)) @ A.T).reshape(-1, 3, 4)
     seen = dehomogenize(np.einsum("dab,nb->dna", draws, X))
     measured = np.sqrt(seen.var(axis=0).mean(axis=1))
-    np.testing.assert_allclose(_projection_std_px(P, A @ A.T, X), measured, rtol=0.05)
+    np.testing.assert_allclose(incremental._projection_std_px(P, A @ A.T, X), measured, rtol=0.05)
 
 
 def test_selected_tracks_are_the_longest_of_every_view_and_have_parallax():
     scene = make_scene(points=2000)
-    keep = select_tracks(scene.tracks, np.ones(2000, dtype=bool), points_per_view=100)
+    keep = _model.select_tracks(scene.tracks, np.ones(2000, dtype=bool), points_per_view=100)
     seen = np.bincount(scene.tracks.view_index[keep[scene.tracks.point_index]], minlength=8)
     length = np.bincount(scene.tracks.point_index)
     assert seen.min() >= 100
@@ -154,8 +137,10 @@ def test_selected_tracks_are_the_longest_of_every_view_and_have_parallax():
     ]
     t = scene.tracks
     only = np.bincount(t.point_index[t.view_index >= 2], minlength=200) == 0
-    np.testing.assert_array_equal(select_tracks_with_parallax(t, pairs), ~only)
-    assert select_tracks_with_parallax(t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]).all()
+    np.testing.assert_array_equal(_model.select_tracks_with_parallax(t, pairs), ~only)
+    assert _model.select_tracks_with_parallax(
+        t, [replace(p, homography_inlier_ratio=0.3) for p in pairs]
+    ).all()
 
 
 NOISE_PX = 0.3
@@ -177,7 +162,7 @@ def observe(scene, R, centres):
 
 
 def reconstruct(scene, pairs, seed=0, **changes):
-    variant = with_constants(IncrementalProjective, **changes)()
+    variant = with_constants(incremental.IncrementalProjective, **changes)()
     return variant.reconstruct(scene.tracks, pairs, scene.sizes, rng=np.random.default_rng(seed))
 
 
@@ -239,12 +224,15 @@ def test_a_camera_that_wrong_matches_placed_is_discarded_with_its_reason():
 def test_the_view_that_contradicts_its_pairs_is_named():
     scene = make_scene(seed=6)
     pairs, registered = true_pairs(scene), np.ones(8, dtype=bool)
-    assert _find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
+    assert (
+        incremental._find_inconsistent_view(scene.P, registered, pairs, threshold_px=1.0, min_ratio=1.0)
+        is None
+    )
     P = scene.P.copy()
     P[3] = P[3] + 0.05 * np.random.default_rng(0).normal(size=(3, 4)) * np.abs(P[3])
-    assert _find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=0.5)[0] == 3
+    assert incremental._find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=0.5)[0] == 3
     registered[3] = False
-    assert _find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
+    assert incremental._find_inconsistent_view(P, registered, pairs, threshold_px=1.0, min_ratio=1.0) is None
 
 
 def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
@@ -253,7 +241,7 @@ def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
     view, point = np.append(t.view_index, 6 + s.view_index), np.append(t.point_index, 300 + s.point_index)
     tracks = Tracks(view, point, np.concatenate([t.xy, s.xy]), 9, 1200)
     pairs = true_pairs(big) + [replace(p, i=p.i + 6, j=p.j + 6) for p in true_pairs(small)]
-    assert rank_initial_pairs(tracks, pairs)[0].i >= 6
+    assert _model.rank_initial_pairs(tracks, pairs)[0].i >= 6
     both = replace(big, tracks=tracks, sizes=np.tile(big.sizes[0], (9, 1)))
     assert reconstruct(both, pairs, max_initial_pairs=1).registered.sum() == 3
     found = reconstruct(both, pairs)
@@ -263,14 +251,14 @@ def test_a_beginning_in_a_corner_gives_way_to_one_that_reaches_more():
 
 def test_each_attempt_starts_differently_and_neither_planar_nor_with_an_open_f():
     scene = make_scene(views=6)
-    ranked = rank_initial_pairs(scene.tracks, true_pairs(scene))
+    ranked = _model.rank_initial_pairs(scene.tracks, true_pairs(scene))
     assert len({(pair.i, pair.j) for pair in ranked}) == 15
     assert sorted(view for pair in ranked[:3] for view in (pair.i, pair.j)) == list(range(6))
     pairs = true_pairs(scene)
     flat = [replace(p, homography_inlier_ratio=1.0 if (p.i, p.j) != (2, 5) else 0.3) for p in pairs]
     opened = [replace(p, degeneracy=DegeneracyReport(determined=(p.i, p.j) == (1, 4))) for p in pairs]
     for doubtful, expected in ((flat, (2, 5)), (opened, (1, 4))):
-        best = rank_initial_pairs(scene.tracks, doubtful)[0]
+        best = _model.rank_initial_pairs(scene.tracks, doubtful)[0]
         assert (best.i, best.j) == expected
 
 
@@ -283,11 +271,11 @@ def test_right_and_wrong_observations_of_a_point_are_separated():
     wrong[(first + rng.integers(0, length))[length >= 4]] = True
     off = rng.choice([-1, 1], t.xy.shape) * rng.uniform(60, 400, t.xy.shape)
     tracks = replace(t, xy=t.xy + np.where(wrong[:, None], off, 0))
-    model = ProjectiveModel.empty(tracks, scene.sizes, sigma_px=NOISE_PX, noise_floor_px=NOISE_PX)
+    model = _model.ProjectiveModel.empty(tracks, scene.sizes, sigma_px=NOISE_PX, noise_floor_px=NOISE_PX)
     model.P, model.registered = scene.P.copy(), np.ones(8, dtype=bool)
     chosen = (length >= 4)[t.point_index]
-    agree = consistent_observations(model, chosen, 12 * NOISE_PX)
-    retriangulate_points(model, 12.0)
+    agree = _model.consistent_observations(model, chosen, 12 * NOISE_PX)
+    _model.retriangulate_points(model, 12.0)
     for kept in (agree, model.inlier):
         assert kept[chosen & ~wrong].mean() > 0.97
         assert not kept[wrong].any()
@@ -296,13 +284,13 @@ def test_right_and_wrong_observations_of_a_point_are_separated():
 def test_points_get_the_signs_of_their_cameras_and_far_observations_are_marked():
     scene = make_scene(views=5, points=80, sigma_px=0.0, seed=2)
     t = scene.tracks
-    model = ProjectiveModel.empty(t, scene.sizes, sigma_px=0.5, noise_floor_px=0.3)
+    model = _model.ProjectiveModel.empty(t, scene.sizes, sigma_px=0.5, noise_floor_px=0.3)
     rng = np.random.default_rng(4)
     signs = rng.choice([-1.0, 1.0], t.n_points)
     model.P, model.X = scene.P.copy(), signs[:, None] * np.column_stack([scene.X, np.ones(len(scene.X))])
     model.registered[:4] = True
     t.xy[::7] += 10.0
-    update_inliers(model, 4.0)
+    _model.update_inliers(model, 4.0)
     assert (model.X[:, 3] > 0.0)[np.bincount(t.point_index[t.view_index < 4], minlength=t.n_points) > 0].all()
     near = (np.arange(len(t.xy)) % 7 > 0) & (t.view_index < 4)
     twice = np.bincount(t.point_index[near], minlength=t.n_points) >= 2
@@ -311,9 +299,11 @@ def test_points_get_the_signs_of_their_cameras_and_far_observations_are_marked()
 
 def test_points_all_over_a_view_count_more_than_a_crowd_in_a_corner():
     t = make_scene(views=3, points=400, sigma_px=0.5, seed=5).tracks
-    cell = observation_cells(t)
+    cell = _model.observation_cells(t)
     assert (cell // 64 == t.view_index).all()
     few = np.flatnonzero(t.view_index == 0)[:100]
     corner = np.flatnonzero(t.view_index == 0)[np.argsort(t.xy[t.view_index == 0].sum(axis=1))[:100]]
-    spread = [coverage_of_views(cell, np.isin(np.arange(len(t.xy)), k), t.n_views)[0] for k in (few, corner)]
+    spread = [
+        _model.coverage_of_views(cell, np.isin(np.arange(len(t.xy)), k), t.n_views)[0] for k in (few, corner)
+    ]
     assert spread[0] > 1.3 * spread[1]

@@ -25,16 +25,9 @@ from thesisrecon.optimize.bundle.identifiability import (
     projective_infinity_shifts,
 )
 from thesisrecon.records import Tracks, Upgrade
+from thesisrecon.selfcalibration import _upgrade
 from thesisrecon.selfcalibration._frame import normalized_frame
 from thesisrecon.selfcalibration._refinement import RotationCriterion
-from thesisrecon.selfcalibration._upgrade import (
-    _biased_focal,
-    _no_candidate_failure,
-    _with_virtual_points,
-    check_identifiability,
-    gherardi_fusiello_planes,
-    identifiability_without_calibration,
-)
 from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement, quadric_hypotheses
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 
@@ -105,7 +98,7 @@ def test_missing_tilt_is_detected_from_projective_cameras():
         estimate = projective_reconstruction(some, seed=2)
         frame = normalized_frame(estimate, prior_for(estimate))
         assert (projective_infinity_shifts(frame.A, frame.a)["infinity_shift"] < 1e-9) == small
-        identifiability = identifiability_without_calibration(estimate, prior_for(estimate))
+        identifiability = _upgrade.identifiability_without_calibration(estimate, prior_for(estimate))
         assert not identifiability.identifiable
         assert (identifiability.motion == "pure translation") == small
         assert any("pure translation" in sentence for sentence in identifiability.sentences) == small
@@ -131,7 +124,7 @@ def test_the_counting_argument(known, views, spare):
 def test_missing_equations_are_reported_with_their_number():
     estimate = projective_reconstruction(make_scene(views=3))
     unknown = IntrinsicsOptions(cameras="per-image", principal_point_std_rel=None)
-    sentences = identifiability_without_calibration(estimate, prior_for(estimate, unknown)).sentences
+    sentences = _upgrade.identifiability_without_calibration(estimate, prior_for(estimate, unknown)).sentences
     assert any("2 equations are missing" in sentence for sentence in sentences)
 
 
@@ -182,7 +175,7 @@ def test_a_general_motion_needs_no_words_and_large_residuals_are_not_identifiabl
     prior = prior_for(estimate)
     G = np.eye(4)
     G[3, :3] = np.linalg.svd(estimate.X[estimate.valid])[2][3][:3]
-    identifiability = check_identifiability(estimate, Upgrade(G, scene.K, 0.0, "made up"), prior)
+    identifiability = _upgrade.check_identifiability(estimate, Upgrade(G, scene.K, 0.0, "made up"), prior)
     assert not identifiability.identifiable
     assert identifiability.sentences
 
@@ -208,7 +201,7 @@ def test_noise_is_compared_with_the_projective_residual_not_a_floor():
     estimate = replace(projective_estimate(scene, np.random.default_rng(0)), sigma_px=0.3)
     upgrade = Upgrade(metric_frame(estimate, scene), scene.K, 0.0, "truth")
     shared, own = (
-        check_identifiability(estimate, upgrade, prior_for(estimate, IntrinsicsOptions(cameras=how)))
+        _upgrade.check_identifiability(estimate, upgrade, prior_for(estimate, IntrinsicsOptions(cameras=how)))
         for how in ("shared", "per-image")
     )
     assert shared.evidence["noise_ratio_to_projective"] > 3.0
@@ -230,7 +223,7 @@ def test_noise_is_compared_with_the_projective_residual_not_a_floor():
 def test_advice_never_asks_for_a_given_focal_length(given, advice):
     scene = make_sequence(Motion.TRANSLATION, np.random.default_rng(5))
     estimate = projective_estimate(scene, np.random.default_rng(0))
-    sentences = identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences
+    sentences = _upgrade.identifiability_without_calibration(estimate, prior_for(estimate, given)).sentences
     assert next(s for s in sentences if "rotate the camera" in s).endswith(advice)
 
 
@@ -268,7 +261,7 @@ def test_virtual_points_lie_where_optical_axes_meet_and_are_seen_exactly():
     scene = make_scene(seed=2)
     given = projective_reconstruction(scene)
     H = metric_frame(given, scene)
-    found = _with_virtual_points(given, Upgrade(H, scene.K, 0.0, "truth"))
+    found = _upgrade._with_virtual_points(given, Upgrade(H, scene.K, 0.0, "truth"))
     X, t, axes, C = dehomogenize(found.X @ H.T), found.tracks, scene.R[:, 2], scene.centres
     # The point of least squared distances from the axes, and a cube about it.
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
@@ -326,7 +319,7 @@ def test_each_closed_form_contains_the_truth():
     log_f = np.full((1, 1), np.log(f))
     assert criterion.cost(frame, planes, log_f)[0] < 1e-12
     other = 0 if frame.reference != 0 else 1
-    both_signs = gherardi_fusiello_planes(frame, other, np.array([f]), np.array([f]))
+    both_signs = _upgrade.gherardi_fusiello_planes(frame, other, np.array([f]), np.array([f]))
     assert criterion.cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
 
 
@@ -366,7 +359,7 @@ def test_a_failure_near_given_focal_lengths_states_them(focal, words):
     mean = frame.prior.mean.copy()
     mean[:, 0] = [*focal, *focal]
     frame = replace(frame, prior=replace(frame.prior, mean=mean))
-    failure = _no_candidate_failure(frame, given, 40)
+    failure = _upgrade._no_candidate_failure(frame, given, 40)
     assert str(failure.reason).endswith("near the given focal length")
     assert failure.evidence.startswith(f"{words} (+- 2.0%) at working size was given")
 
@@ -375,9 +368,9 @@ def test_a_focal_length_off_that_of_bundle_adjustment_is_reported():
     scene = make_scene(views=5)
     found, given = calibrate(scene), projective_reconstruction(scene)
     frame, best = normalized_frame(given, prior_for(given, IntrinsicsOptions())), found.candidates[0]
-    assert _biased_focal(frame, best, found.identifiability) == ()
+    assert _upgrade._biased_focal(frame, best, found.identifiability) == ()
     for factor, words in ((1.2, "+20%"), (0.8, "-20%")):
         off = replace(best, K=best.K * [[[factor], [factor], [1.0]]])
-        (sentence,) = _biased_focal(frame, off, found.identifiability)
+        (sentence,) = _upgrade._biased_focal(frame, off, found.identifiability)
         assert f"the focal length of this method is {words} from that of bundle adjustment" in sentence
         assert "bundle adjustment, 1500 px" in sentence

@@ -20,7 +20,7 @@ from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.least_squares import central_differences, soft_l1
 from thesisrecon.records import IntrinsicsPrior
-from thesisrecon.selfcalibration import _refinement
+from thesisrecon.selfcalibration import _refinement, _upgrade, kruppa
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration._refinement import (
     RotationCriterion,
@@ -28,22 +28,7 @@ from thesisrecon.selfcalibration._refinement import (
     minimize_batch,
     refine_hypotheses,
 )
-from thesisrecon.selfcalibration._upgrade import (
-    Candidate,
-    _projective_noise,
-    distinct_candidates,
-    square_pixel_calibrations,
-)
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
-from thesisrecon.selfcalibration.kruppa import (
-    KruppaEquations,
-    _kruppa_cost,
-    _kruppa_residuals,
-    _overlapping_pairs,
-    _pair_residuals,
-    _Pairs,
-    _plane_for_focals,
-)
 from thesisrecon.selfcalibration.quadric import (
     HypothesesAndRefinement,
     LinearQuadric,
@@ -54,7 +39,7 @@ from thesisrecon.selfcalibration.quadric import (
 from thesisrecon.selfcalibration.stratified import Stratified
 
 FREE = RotationCriterion(focal_weight=0.0)
-EXACT = [with_constants(kind, criterion=FREE)() for kind in (NonlinearQuadric, KruppaEquations)]
+EXACT = [with_constants(kind, criterion=FREE)() for kind in (NonlinearQuadric, kruppa.KruppaEquations)]
 ALONE = [LinearQuadric(), *EXACT]
 
 
@@ -152,7 +137,7 @@ def test_given_focals_are_kept_by_cameras_on_a_sphere(method, focal_std):
     np.testing.assert_allclose(calibrated(method, scene, prior, seed=2).K, scene.K, rtol=1e-4)
 
 
-@pytest.mark.parametrize("method", [NonlinearQuadric(), KruppaEquations()], ids=name)
+@pytest.mark.parametrize("method", [NonlinearQuadric(), kruppa.KruppaEquations()], ids=name)
 def test_estimates_have_stds_of_the_size_of_their_errors(method):
     scaled = []
     for seed in range(4):
@@ -169,7 +154,7 @@ def test_estimates_have_stds_of_the_size_of_their_errors(method):
 
 def test_the_noise_of_projective_cameras_is_that_of_the_matches():
     scene = make_scene(sigma_px=0.5, seed=1)
-    found = _projective_noise(adjusted(scene, 1), np.arange(len(scene.tracks.xy)))
+    found = _upgrade._projective_noise(adjusted(scene, 1), np.arange(len(scene.tracks.xy)))
     assert found == pytest.approx(0.5, rel=0.05)
 
 
@@ -263,7 +248,7 @@ def random_pair(seed, K1, K2):
 
 
 def kruppa_of(F, *calibrations):
-    return _kruppa_residuals(F[None], *((K @ K.T)[None, None] for K in calibrations))
+    return kruppa._kruppa_residuals(F[None], *((K @ K.T)[None, None] for K in calibrations))
 
 
 @settings(max_examples=60, derandomize=True, deadline=None)
@@ -281,11 +266,13 @@ def test_the_kruppa_equations_hold_at_the_truth_and_not_beside_it(seed, square):
 def test_the_kruppa_cost_is_the_square_of_small_residuals_and_linear_in_large_ones():
     K1, K2 = np.diag([1.5, 1.5, 1.0]), np.diag([0.9, 0.9, 1.0])
     F, wrong = random_pair(7, K1, K2), K1 @ np.diag([1.2, 1.2, 1.0])
-    pairs, K = _Pairs(np.array([0]), np.array([1]), F[None]), np.stack([wrong, K2])[None]
+    pairs, K = kruppa._Pairs(np.array([0]), np.array([1]), F[None]), np.stack([wrong, K2])[None]
     size = np.linalg.norm(kruppa_of(F, wrong, K2))
     assert size > 1e-3
-    np.testing.assert_allclose(_kruppa_cost(pairs, K, loss_scale=1e3 * size), [size**2], rtol=1e-5)
-    np.testing.assert_allclose(_kruppa_cost(pairs, K, loss_scale=1e-3 * size), [2e-3 * size**2], rtol=2e-3)
+    np.testing.assert_allclose(kruppa._kruppa_cost(pairs, K, loss_scale=1e3 * size), [size**2], rtol=1e-5)
+    np.testing.assert_allclose(
+        kruppa._kruppa_cost(pairs, K, loss_scale=1e-3 * size), [2e-3 * size**2], rtol=2e-3
+    )
 
 
 @settings(max_examples=25, derandomize=True, deadline=None)
@@ -295,14 +282,14 @@ def test_all_criteria_vanish_at_the_truth_in_every_frame(seed):
     given = projective_reconstruction(scene, seed=seed)
     frame = normalized_frame(given, prior_for(scene))
     log_f = np.log(scene.K[:1, 0, 0] / 1536.0)
-    plane, cost = _plane_for_focals(frame, FREE, log_f)
+    plane, cost = kruppa._plane_for_focals(frame, FREE, log_f)
     assert cost < 1e-20
-    K = square_pixel_calibrations(np.full((1, 4), log_f[0]))
+    K = _upgrade.square_pixel_calibrations(np.full((1, 4), log_f[0]))
     residuals = dual_image_residuals(frame, K, plane[None])
     assert np.abs(residuals).max() < 1e-9
-    pairs = _overlapping_pairs(frame, given, 8)
+    pairs = kruppa._overlapping_pairs(frame, given, 8)
     assert len(pairs.i) == 6
-    assert np.abs(_pair_residuals(pairs, K)).max() < 1e-7
+    assert np.abs(kruppa._pair_residuals(pairs, K)).max() < 1e-7
 
 
 @settings(max_examples=15, derandomize=True, deadline=None)
@@ -375,11 +362,11 @@ def test_crops_with_a_principal_point_far_off_are_calibrated_when_it_is_left_ope
 def test_candidates_are_distinct_minima_of_the_loss():
     scene = make_scene(views=4, points=40, seed=6)
     frame = normalized_frame(projective_reconstruction(scene, seed=6), prior_for(scene))
-    K, plane = square_pixel_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])
+    K, plane = _upgrade.square_pixel_calibrations(np.zeros(4)), np.array([0.1, 0.2, 0.3])
     places = ((plane, 2.0, "a"), (1.001 * plane, 1.0, "b"), (-plane, 3.0, "c"))
-    answers = [Candidate(p, K, cost, name) for p, cost, name in places]
+    answers = [_upgrade.Candidate(p, K, cost, name) for p, cost, name in places]
     for most, kept in ((9, ["b", "c"]), (1, ["b"])):
-        assert [a.method for a in distinct_candidates(frame, answers, most)] == kept
+        assert [a.method for a in _upgrade.distinct_candidates(frame, answers, most)] == kept
     data, width = np.array([-3.0, -0.1, 0.0, 0.2, 0.3, 5.0, 9.0]), 0.3
     x, cost = minimize_batch(lambda x: x - data, np.array([[0.7], [-2.0]]), iterations=200, loss_scale=width)
     grid = np.linspace(-1.0, 1.0, 200_001)

@@ -14,20 +14,9 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import calibration_from_image
-from thesisrecon.selfcalibration._frame import (
-    infinite_homographies,
-    square_pixel_constraints,
-)
-from thesisrecon.selfcalibration.absolute_conic import (
-    FixedPlaneQuadric,
-    LinearAbsoluteConic,
-    _largest_rotation,
-    _undetermined_failure,
-    dual_conic_of_constant_camera,
-    solve_conic_batch,
-)
+from thesisrecon.selfcalibration import _frame, absolute_conic
 
-WAYS = [LinearAbsoluteConic(), FixedPlaneQuadric()]
+WAYS = [absolute_conic.LinearAbsoluteConic(), absolute_conic.FixedPlaneQuadric()]
 
 
 def pixels(found, K):
@@ -38,9 +27,9 @@ def pixels(found, K):
 def test_the_dual_image_is_carried_exactly_by_homographies_of_determinant_one(seed):
     scene = make_scene(seed=seed, principal_shift=(60.0, -45.0))
     found, plane = scenes.setup(scene, scenes.NOTHING_BUT_CONSTANT, seed=seed)
-    H = infinite_homographies(found.frame, plane[None])[0]
+    H = _frame.infinite_homographies(found.frame, plane[None])[0]
     np.testing.assert_allclose(np.linalg.det(H), 1.0, atol=1e-12)
-    dual, s = dual_conic_of_constant_camera(H)
+    dual, s = absolute_conic.dual_conic_of_constant_camera(H)
     np.testing.assert_allclose(H @ dual @ H.swapaxes(1, 2), np.tile(dual, (len(H), 1, 1)), atol=1e-9)
     K = pixels(found, calibration_from_image(dual, is_dual=True)[None])[0]
     np.testing.assert_allclose(K, scene.K[0], rtol=1e-8, atol=1e-5)
@@ -65,7 +54,7 @@ def test_the_true_plane_gives_the_true_calibrations(way, options, zoom, seed):
 def test_rough_principal_points_and_right_angles_help():
     scene = make_scene(seed=3, principal_shift=(12.0, -9.0))
     found, plane = scenes.setup(scene, IntrinsicsOptions(), seed=3)
-    K = pixels(found, LinearAbsoluteConic().calibrations(found, plane))
+    K = pixels(found, absolute_conic.LinearAbsoluteConic().calibrations(found, plane))
     np.testing.assert_allclose(K[:, 0, 0], scene.K[:, 0, 0], rtol=2e-3)
     assert np.linalg.norm(K[0, :2, 2] - scene.K[0, :2, 2]) < 5.0
 
@@ -82,10 +71,10 @@ def test_the_score_of_the_right_plane_is_zero_and_grows_away_from_it():
     scene = make_scene(seed=1)
     found, plane = scenes.setup(scene, seed=1)
     planes = plane + np.array([0.0, 0.01, 0.05])[:, None] * [1.0, -0.5, 0.3]
-    H = infinite_homographies(found.frame, planes)
+    H = _frame.infinite_homographies(found.frame, planes)
     small = replace(found.frame, A=1e-8 * found.frame.A, a=1e-8 * found.frame.a)
-    np.testing.assert_allclose(infinite_homographies(small, planes), H, atol=1e-9)
-    f2, residuals = solve_conic_batch(H, square_pixel_constraints(found.frame))
+    np.testing.assert_allclose(_frame.infinite_homographies(small, planes), H, atol=1e-9)
+    f2, residuals = absolute_conic.solve_conic_batch(H, _frame.square_pixel_constraints(found.frame))
     score = np.linalg.norm(residuals, axis=1)
     assert score[0] < 1e-7
     assert score[0] < score[1] < score[2]
@@ -97,7 +86,7 @@ def test_motions_and_planes_without_a_calibration_are_named():
     scene = make_scene(seed=0)
     turned = scenes.turned_about_one_axis(scene, np.linspace(-20.0, 20.0, 8))
     K, R = turned.K[0], turned.R
-    angle, axis = _largest_rotation(K @ R @ R[0].T @ np.linalg.inv(K))
+    angle, axis = absolute_conic._largest_rotation(K @ R @ R[0].T @ np.linalg.inv(K))
     assert angle == pytest.approx(40.0)
     seen = K @ R[0] @ [0.0, 1.0, 0.0]
     assert np.linalg.norm(np.cross(axis, seen / np.linalg.norm(seen))) < 1e-9
@@ -105,7 +94,7 @@ def test_motions_and_planes_without_a_calibration_are_named():
     found, _ = scenes.setup(with_poses(turned, tilted, turned.centres), scenes.NOTHING_BUT_CONSTANT)
     unit = np.linalg.inv(found.frame.pixel_from_unit[found.frame.views]) @ K
     H = unit @ tilted @ tilted[found.frame.reference].T @ np.linalg.inv(unit[found.frame.reference])
-    evidence = _undetermined_failure(found.frame, H, None).evidence
+    evidence = absolute_conic._undetermined_failure(found.frame, H, None).evidence
     (place,) = re.findall(r"axis at \((-?\d+), (-?\d+)\) px", evidence)
     seen = dehomogenize(K @ tilted[found.frame.reference] @ [0.0, 1.0, 0.0])
     np.testing.assert_allclose(np.array(place, dtype=float), seen, atol=1.0)
@@ -128,7 +117,7 @@ def test_a_wrong_plane_without_a_real_camera_is_refused_with_its_eigenvalues():
     refused = 0
     for shift in np.random.default_rng(0).normal(0.0, 2.0, (20, 3)):
         try:
-            LinearAbsoluteConic().calibrations(found, plane + shift)
+            absolute_conic.LinearAbsoluteConic().calibrations(found, plane + shift)
         except StageFailure as failure:
             refused += "eigenvalues" in str(failure)
     assert refused > 0

@@ -21,22 +21,13 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
 from thesisrecon.pipeline.outputs import write_affine
+from thesisrecon.selfcalibration import cheirality
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
-from thesisrecon.selfcalibration.cheirality import (
-    CheiralityRegion,
-    CheiralitySearch,
-    ModulusConstraint,
-    _local_minima,
-    _modulus_coefficients,
-    _modulus_residuals,
-    _pairs_of_constant_cameras,
-    _plane_box,
-)
 from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
 
 PAIRS = [
     (plane, way)
-    for plane in (CheiralitySearch(), ModulusConstraint())
+    for plane in (cheirality.CheiralitySearch(), cheirality.ModulusConstraint())
     for way in (LinearAbsoluteConic(), FixedPlaneQuadric())
 ]
 
@@ -45,7 +36,7 @@ def test_the_coefficients_are_those_of_the_characteristic_polynomial():
     rng = np.random.default_rng(0)
     A, a, p = rng.normal(size=(3, 3, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
     pairs = np.array([[0, 1], [1, 2], [2, 0]])
-    c = _modulus_coefficients(A, a, pairs)
+    c = cheirality._modulus_coefficients(A, a, pairs)
     H = A - a[:, :, None] * p
     for m, (i, j) in enumerate(pairs):
         for x in (-1.3, 0.2, 0.7, 2.0):
@@ -57,13 +48,13 @@ def test_the_coefficients_are_those_of_the_characteristic_polynomial():
 def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed):
     scene = make_scene(seed=seed, principal_shift=(80.0, -60.0))
     found, plane = setup(scene, NOTHING_BUT_CONSTANT, seed=seed)
-    pairs = _pairs_of_constant_cameras(found.constraints.first)
+    pairs = cheirality._pairs_of_constant_cameras(found.constraints.first)
     assert len(pairs) == 28
-    c = _modulus_coefficients(found.frame.A, found.frame.a, pairs)
+    c = cheirality._modulus_coefficients(found.frame.A, found.frame.a, pairs)
     l0, l1, l2, l3 = (c[:, :, :3] @ plane + c[:, :, 3]).T
     left, right = l3 * l1**3, l2**3 * l0
     assert np.abs((left - right) / (np.abs(left) + np.abs(right))).max() < 1e-9
-    r, t = _modulus_residuals(c, plane[None])
+    r, t = cheirality._modulus_residuals(c, plane[None])
     assert np.abs(r).max() < 1e-9
     R = scene.R
     angles = np.trace(R[pairs[:, 0]] @ R[pairs[:, 1]].swapaxes(1, 2), axis1=1, axis2=2)
@@ -72,7 +63,7 @@ def test_the_true_plane_satisfies_the_quartics_for_any_constant_calibration(seed
 
 def region_of(found):
     rng = np.random.default_rng(0)
-    return CheiralityRegion.of(found.frame, found.reconstruction, rng)
+    return cheirality.CheiralityRegion.of(found.frame, found.reconstruction, rng)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -96,12 +87,12 @@ def test_local_minima_of_a_grid_are_those_of_a_search_of_all_neighbours():
         return np.isfinite(score[cell]) and all(score[cell] <= score[n] for n in beside)
 
     expected = [k for k, cell in enumerate(np.ndindex(5, 5, 5)) if is_least(cell)]
-    assert _local_minima(score).tolist() == sorted(expected, key=lambda k: score.flat[k])
+    assert cheirality._local_minima(score).tolist() == sorted(expected, key=lambda k: score.flat[k])
 
 
 def test_samples_of_the_bounds_are_inside_them():
     rows = np.column_stack([np.vstack([np.eye(3), -np.eye(3)]), [1.0] * 3 + [2.0] * 3])
-    np.testing.assert_allclose(_plane_box(rows), [[-1.0, 2.0]] * 3)
+    np.testing.assert_allclose(cheirality._plane_box(rows), [[-1.0, 2.0]] * 3)
     region = region_of(setup(make_scene(seed=2))[0])
     for part in region.polytopes:
         v = part.sample(100, np.random.default_rng(1))
@@ -122,14 +113,17 @@ def test_exact_cameras_give_the_exact_solution_in_closed_form(plane, way, seed):
 
 def test_an_unknown_constant_calibration_comes_out_whole_from_copies_of_a_point_too():
     scene = make_scene(seed=4, principal_shift=(70.0, -50.0))
-    method, prior = Stratified(ModulusConstraint(), refine=False), prior_for(scene, NOTHING_BUT_CONSTANT)
+    method, prior = (
+        Stratified(cheirality.ModulusConstraint(), refine=False),
+        prior_for(scene, NOTHING_BUT_CONSTANT),
+    )
     np.testing.assert_allclose(calibrated(method, scene, prior, seed=4).K, scene.K, rtol=1e-7, atol=1e-4)
     scene = make_scene(seed=0)
     scene.X[:] = [0.1, 0.2, 0.3]
     one, prior = with_poses(scene, scene.R, scene.centres), prior_for(scene, NOTHING_BUT_CONSTANT)
-    search = Stratified(CheiralitySearch())
+    search = Stratified(cheirality.CheiralitySearch())
     refuses(StageFailure, "found no plane at infinity", calibrated, search, one, prior)
-    found = calibrated(Stratified(ModulusConstraint()), one, prior)
+    found = calibrated(Stratified(cheirality.ModulusConstraint()), one, prior)
     np.testing.assert_allclose(found.K, scene.K, rtol=1e-6, atol=1e-3)
 
 
@@ -137,16 +131,16 @@ def test_an_unknown_constant_calibration_comes_out_whole_from_copies_of_a_point_
 def test_three_views_of_a_constant_camera_suffice(seed):
     scene = make_scene(views=3, seed=seed, seen_share=1.0)
     found, plane = setup(scene, seed=seed)
-    candidates = ModulusConstraint().locate(found, np.random.default_rng(0))
+    candidates = cheirality.ModulusConstraint().locate(found, np.random.default_rng(0))
     assert np.linalg.norm(candidates - plane, axis=1).min() < 1e-6
-    method = with_constants(Stratified, max_candidates=21)(ModulusConstraint())
+    method = with_constants(Stratified, max_candidates=21)(cheirality.ModulusConstraint())
     answer = calibrated(method, scene, prior_for(scene), seed=seed)
     assert answer.K[0, 0, 0] == pytest.approx(1500.0, rel=1e-6)
 
 
 def test_zooming_cameras_are_found_by_the_search_and_refused_by_the_modulus_constraint():
     scene = make_scene(seed=6, zoom=0.3)
-    prior, modulus = prior_for(scene, CENTRED_ZOOM), Stratified(ModulusConstraint())
+    prior, modulus = prior_for(scene, CENTRED_ZOOM), Stratified(cheirality.ModulusConstraint())
     answer = calibrated(Stratified(refine=False), scene, prior, seed=6)
     np.testing.assert_allclose(answer.K[:, 0, 0], scene.K[:, 0, 0], rtol=1e-8)
     refuses(StageFailure, "three images of one camera", calibrated, modulus, scene, prior, seed=6)
@@ -167,13 +161,15 @@ def test_noise_moves_the_focal_by_little(plane, way):
 
 def test_the_same_seed_gives_the_same_bytes():
     scene = make_scene(seed=9)
-    for plane in (CheiralitySearch(), ModulusConstraint()):
+    for plane in (cheirality.CheiralitySearch(), cheirality.ModulusConstraint()):
         first, second = (calibrated(Stratified(plane), scene, prior_for(scene), seed=9) for _ in range(2))
         assert first.metric_from_projective.tobytes() == second.metric_from_projective.tobytes()
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("plane", [CheiralitySearch(), ModulusConstraint()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    "plane", [cheirality.CheiralitySearch(), cheirality.ModulusConstraint()], ids=lambda p: type(p).__name__
+)
 def test_the_located_plane_leaves_an_affine_map_to_the_scene(plane, seed):
     scene = make_scene(seed=seed)
     config = PipelineConfig(selfcalibration=Stratified(plane), intrinsics=CENTRED)
@@ -192,7 +188,7 @@ def test_parallels_stay_parallel_and_ratios_are_kept():
     start, step, ratio = rng.uniform(-1, 1, (50, 3)), np.array([0.3, -0.5, 0.4]), rng.uniform(0.2, 0.8, 50)
     points = np.concatenate([start, start + step, start + ratio[:, None] * step, scene.X[150:]])
     given = projective_reconstruction(replace(scene, X=points), seed=1)
-    answer = Stratified(ModulusConstraint()).calibrate(given, prior=prior_for(scene), rng=rng)
+    answer = Stratified(cheirality.ModulusConstraint()).calibrate(given, prior=prior_for(scene), rng=rng)
     affine = upgrade_to_affine(given, answer.plane_at_infinity)
     a, b, c = affine.X[:150, :3].reshape(3, 50, 3)
     np.testing.assert_allclose(b - a, np.tile(b[0] - a[0], (50, 1)), atol=1e-6)

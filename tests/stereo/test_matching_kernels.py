@@ -7,15 +7,8 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.stereo import _postprocessing
+from thesisrecon.stereo import _depth_fusion, _postprocessing
 from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
-from thesisrecon.stereo._depth_fusion import (
-    InverseDepth,
-    fit_planes,
-    fuse_inverse_depths,
-    inverse_depths,
-    update_kalman,
-)
 from thesisrecon.stereo.correspondence import Correspondence
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, _solve_row
 from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
@@ -262,7 +255,7 @@ def test_inverse_depths_equal_least_squares_on_the_line():
     q = homogenize(pixels()) @ H.T + truth[..., None] * e
     xy = (q[..., :2] / q[..., 2:] + rng.normal(0.0, 0.1, (*SHAPE, 2))).astype(np.float32)
     sigma = holes(rng, np.full(SHAPE, 0.3))
-    rho, std = inverse_depths(np.eye(3, 4), np.column_stack([H, e]), Correspondence(xy, sigma))
+    rho, std = _depth_fusion.inverse_depths(np.eye(3, 4), np.column_stack([H, e]), Correspondence(xy, sigma))
     h = homogenize(pixels()) @ H.T
     a, b = e[:2] - xy * e[2], xy * h[..., 2:] - h[..., :2]
     wanted = (a * b).sum(-1) / (a * a).sum(-1)
@@ -281,7 +274,7 @@ def test_fusion_is_the_weighted_mean_of_the_largest_party():
     rho = truth + std * rng.normal(size=std.shape)
     rho[rng.random(std.shape) < 0.25] += 0.7
     rho = holes(rng, rho)
-    found = fuse_inverse_depths(list(zip(rho, std, strict=True)), SHAPE)
+    found = _depth_fusion.fuse_inverse_depths(list(zip(rho, std, strict=True)), SHAPE)
     apart = np.abs(rho[:, None].astype(float) - rho[None])
     agree = apart <= 3.0 * np.hypot(std[:, None].astype(float), std[None])
     weight = 1.0 / std.astype(float) ** 2
@@ -306,7 +299,7 @@ def test_the_filter_ends_at_the_first_outlier():
     new, new_std = holes(rng, rng.uniform(0.8, 1.3, SHAPE)), np.full(SHAPE, 0.03, np.float32)
     alive, support = rng.random(SHAPE) < 0.8, (~np.isnan(rho)).astype(np.uint8)
     before, was = rho.copy(), alive.copy()
-    update_kalman(InverseDepth(rho, std, support, support), (new, new_std), alive)
+    _depth_fusion.update_kalman(_depth_fusion.InverseDepth(rho, std, support, support), (new, new_std), alive)
     inside = np.abs(new - before) <= 3.0 * np.hypot(0.05, 0.03)
     first, measured = np.isnan(before), np.isfinite(new)
     taken = was & measured & (first | inside)
@@ -324,7 +317,7 @@ def test_planes_are_fitted_to_similar_pixels():
     rho = (1.0 + 1e-3 * xy[..., 0] - 2e-3 * xy[..., 1]).astype(np.float32)
     rho[:, 20:] += 0.5
     rho = holes(rng, rho)
-    planes, known = fit_planes(rho, 3), np.isfinite(rho)
+    planes, known = _depth_fusion.fit_planes(rho, 3), np.isfinite(rho)
     np.testing.assert_array_equal(planes[..., 0], rho)
     np.testing.assert_allclose(planes[known, 1], 1e-3, atol=2e-6)
     np.testing.assert_allclose(planes[known, 2], -2e-3, atol=2e-6)

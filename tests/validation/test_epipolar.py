@@ -15,17 +15,7 @@ from validation.metrics.fundamental_precision import rms_epipolar_distance
 from validation.references.fundamental import MINIMAL, SOLVERS, estimate_with
 from validation.scenes.real import data_root
 from validation.scenes.real_pairs import exact_correspondences, kusvod2_pairs
-from validation.studies.epipolar_methods import (
-    DEFAULT,
-    GOLD,
-    METHODS,
-    Method,
-    Setting,
-    make_trial,
-    measure,
-    report,
-    run_methods,
-)
+from validation.studies import epipolar_methods
 
 
 def precision_recall(inliers, right):
@@ -92,12 +82,12 @@ def test_inliers_are_the_matches_labelled_right(name):
 @pytest.fixture(scope="module")
 def clean():
     """Every method at 1 px and 60 matches, 25 trials, by its label."""
-    return run_methods(Setting(1.0, 60), METHODS, 25)
+    return epipolar_methods.run_methods(epipolar_methods.Setting(1.0, 60), epipolar_methods.METHODS, 25)
 
 
 def test_the_gold_standard_is_at_the_bound_and_nothing_is_far_below_it(clean):
-    assert clean[GOLD].rms_ratio < 1.15
-    assert clean[f"{DEFAULT}, 3 sigma"].rms_ratio < 1.15
+    assert clean[epipolar_methods.GOLD].rms_ratio < 1.15
+    assert clean[f"{epipolar_methods.DEFAULT}, 3 sigma"].rms_ratio < 1.15
     assert min(r.rms_ratio for r in clean.values()) > 0.85
     assert all(r.failures == 0 and r.time_ms > 0.0 for r in clean.values())
 
@@ -106,8 +96,10 @@ def test_a_method_without_a_result_is_counted():
     def refuse(*_):
         raise StageFailure("no")
 
-    setting = Setting(1.0, 20)
-    result = measure(Method("none", refuse), [make_trial(setting, 0)], setting)
+    setting = epipolar_methods.Setting(1.0, 20)
+    result = epipolar_methods.measure(
+        epipolar_methods.Method("none", refuse), [epipolar_methods.make_trial(setting, 0)], setting
+    )
     assert result.failures == 1
     assert np.isinf(result.rms_ratio)
-    assert "1 none" in report({setting: {"none": result}}, 1)
+    assert "1 none" in epipolar_methods.report({setting: {"none": result}}, 1)

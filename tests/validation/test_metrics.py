@@ -10,12 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.synthetic import reconstruction_of
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
-from validation.metrics.cameras import (
-    interval_scores,
-    measure_cameras,
-    measure_reprojection,
-    relative_centre_error,
-)
+from validation.metrics import cameras
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
 from validation.scenes.real import load_fixture_scene
 from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
@@ -35,7 +30,7 @@ def test_deviations_are_counted_in_stated_sigmas():
         }
         for value, std in ((1003.0, 1.0), (1011.0, 1.0), (1001.0, 10.0))
     ]
-    scores = interval_scores(MetricResult(model, (*intervals, {}), {}, True), np.tile(K, (4, 1, 1)))
+    scores = cameras.interval_scores(MetricResult(model, (*intervals, {}), {}, True), np.tile(K, (4, 1, 1)))
     assert scores[:3, 0] == pytest.approx([2.0, 10.0, 0.0], abs=1e-3)
     assert np.isnan(scores[3]).all()
     assert np.isnan(scores[:, 2]).all()
@@ -68,10 +63,10 @@ def _reconstruction(truth, *, k1=0.0):
 
 def test_the_truth_in_another_frame_has_no_error():
     truth = _truth()
-    errors = measure_cameras(_reconstruction(truth, k1=-0.1), truth)
+    errors = cameras.measure_cameras(_reconstruction(truth, k1=-0.1), truth)
     assert max(errors.focal_error_pct, errors.rotation_error_deg, errors.centre_error) < 1e-9
     assert errors.principal_point_error_px == 0
-    assert measure_reprojection(_reconstruction(truth, k1=-0.1)).rms_px < 1e-9
+    assert cameras.measure_reprojection(_reconstruction(truth, k1=-0.1)).rms_px < 1e-9
 
 
 def test_known_errors_are_measured_in_their_units():
@@ -79,17 +74,17 @@ def test_known_errors_are_measured_in_their_units():
     K, R, C = (part.copy() for part in truth)
     K[:, [0, 1], [0, 1]] *= 1.004
     K[:, :2, 2] += [3.0, -4.0]
-    errors = measure_cameras(_reconstruction((K, *truth[1:])), truth)
+    errors = cameras.measure_cameras(_reconstruction((K, *truth[1:])), truth)
     assert errors.focal_error_pct == pytest.approx(0.4)
     assert errors.principal_point_error_px == pytest.approx(5.0)
     R[::2] = Rotation.from_rotvec([0, 0, np.radians(0.02)]).as_matrix() @ R[::2]
-    turned = measure_cameras(_reconstruction((truth[0], R, truth[2])), truth)
+    turned = cameras.measure_cameras(_reconstruction((truth[0], R, truth[2])), truth)
     assert turned.rotation_error_deg == pytest.approx(0.01, rel=0.05)
     C[0] += [0.0, 0.0, 0.06]
     # The alignment takes part of one camera's 60 mm away and spreads the rest over all six.
-    assert 0.004 < measure_cameras(_reconstruction((*truth[:2], C)), truth).centre_error < 0.02
+    assert 0.004 < cameras.measure_cameras(_reconstruction((*truth[:2], C)), truth).centre_error < 0.02
     errors = replace(errors, centre_error=0.1)
-    assert relative_centre_error(errors, np.array([[0.0, 0, 0], [4.0, 0, 0]])) == pytest.approx(0.025)
+    assert cameras.relative_centre_error(errors, np.array([[0.0, 0, 0], [4.0, 0, 0]])) == pytest.approx(0.025)
 
 
 def test_only_registered_views_count():
@@ -97,13 +92,13 @@ def test_only_registered_views_count():
     ours = _reconstruction(truth)
     P, K = (np.where(registered[:, None, None], a, 0.0) for a in (ours.P, ours.K))
     partial = replace(ours, P=P, K=K, registered=registered)
-    assert measure_cameras(partial, truth).focal_error_pct < 1e-12
-    assert measure_reprojection(partial).observations == (V - 1) * N
+    assert cameras.measure_cameras(partial, truth).focal_error_pct < 1e-12
+    assert cameras.measure_reprojection(partial).observations == (V - 1) * N
     two = replace(partial, registered=np.arange(V) < 2)
-    assert measure_cameras(two, truth).centre_error is None
-    assert np.isnan(relative_centre_error(measure_cameras(two, truth), truth[2]))
+    assert cameras.measure_cameras(two, truth).centre_error is None
+    assert np.isnan(cameras.relative_centre_error(cameras.measure_cameras(two, truth), truth[2]))
     with pytest.raises(ValueError, match="at least one registered"):
-        measure_cameras(replace(partial, registered=np.zeros(V, bool)), truth)
+        cameras.measure_cameras(replace(partial, registered=np.zeros(V, bool)), truth)
 
 
 def test_reprojection_is_recomputed_from_inliers_alone():
@@ -112,7 +107,7 @@ def test_reprojection_is_recomputed_from_inliers_alone():
     xy[:, 0] += 0.5
     xy[0] += 100.0
     inlier = np.arange(V * N) > 0
-    measured = measure_reprojection(replace(ours, tracks=replace(ours.tracks, xy=xy), inlier=inlier))
+    measured = cameras.measure_reprojection(replace(ours, tracks=replace(ours.tracks, xy=xy), inlier=inlier))
     assert (measured.median_px, measured.rms_px) == pytest.approx((0.5, 0.5))
     assert measured.observations == V * N - 1
 
@@ -134,7 +129,7 @@ def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
     assert model.registered.sum() == 5
     assert set(seconds) == {"extract", "match", "map"}
     K = np.diag([0.5, 0.5, 1.0]) @ scene.K[views]
-    errors = measure_cameras(model, (K, scene.R[views], scene.C[views]))
+    errors = cameras.measure_cameras(model, (K, scene.R[views], scene.C[views]))
     # A focal length of 300 mm in EXIF would have been believed and barely refined.
     assert errors.focal_error_pct < 5
     assert errors.rotation_error_deg < 1

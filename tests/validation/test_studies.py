@@ -20,31 +20,21 @@ from validation.ablation.plan import STUDIES
 from validation.runs.processes import call_apart
 from validation.runs.study import MODULES, OF_PAGES, load_study, run_studies, run_study, study_parser
 from validation.runs.tables import Metric
-from validation.studies import benchmark_against, benchmark_table
+from validation.studies import benchmark_against, benchmark_table, subsets
 from validation.studies import growth_of_cost as growth
 from validation.studies.growth_of_cost import Meter, exponent
 from validation.studies.robustness import different, outputs
-from validation.studies.subsets import (
-    OUTCOMES,
-    CoverageTrial,
-    Matched,
-    Trial,
-    coverage_row,
-    draw_neighbours,
-    table_row,
-    take_views,
-)
 
 
 def matched_scene():
     scene = make_scene(views=9, points=400, sigma_px=0.3, seed=4)
-    return Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
+    return subsets.Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
 
 
 def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see():
     whole, views = matched_scene(), np.array([1, 4, 7])
     kept = np.arange(400) < 250
-    part = take_views(whole, views, kept)
+    part = subsets.take_views(whole, views, kept)
     assert part.tracks.n_views == 3
     assert np.bincount(part.tracks.point_index).min() >= 2
     assert {(pair.i, pair.j) for pair in part.pairs} == {(0, 1), (0, 2), (1, 2)}
@@ -58,7 +48,7 @@ def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_se
 
 
 def test_outcomes_of_a_trial_are_distinguished():
-    wrong = Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
+    wrong = subsets.Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
     shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
     trials = {
         "right": replace(wrong, median_pct=1.0),
@@ -69,11 +59,11 @@ def test_outcomes_of_a_trial_are_distinguished():
         "wrong": wrong,
         "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
     }
-    assert tuple(trials) == OUTCOMES
-    assert [trial.outcome for trial in trials.values()] == list(OUTCOMES)
+    assert tuple(trials) == subsets.OUTCOMES
+    assert [trial.outcome for trial in trials.values()] == list(subsets.OUTCOMES)
     assert replace(wrong, failed_checks=("no",)).outcome == "refused"
     assert shifted.outcome == "wrong"
-    assert table_row("s", "shared", [*trials.values()])[:10] == ["s", "shared", 7, *[1] * 7]
+    assert subsets.table_row("s", "shared", [*trials.values()])[:10] == ["s", "shared", 7, *[1] * 7]
 
 
 def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path):
@@ -252,9 +242,9 @@ def test_files_of_the_user_in_an_output_folder_survive(arguments, tmp_path, caps
 
 def test_subsets_of_images_are_connected_by_verified_matches():
     pairs = [SimpleNamespace(i=i, j=i + 1, accepted=i != 3, inliers=100) for i in range(7)]
-    matched = Matched("row", None, pairs, np.full((8, 2), 100), np.ones(8))
+    matched = subsets.Matched("row", None, pairs, np.full((8, 2), 100), np.ones(8))
     for seed in range(20):
-        drawn = draw_neighbours(matched, np.random.default_rng(seed), 3)
+        drawn = subsets.draw_neighbours(matched, np.random.default_rng(seed), 3)
         assert len(set(drawn)) == 3
         assert drawn[-1] - drawn[0] == 2
         assert not {3, 4} <= set(drawn)
@@ -263,6 +253,8 @@ def test_subsets_of_images_are_connected_by_verified_matches():
 def test_coverage_counts_trusted_results_only():
     right = np.array([0.5]), np.array([1.5, -3.0]), np.array([0.1, 2.2]), np.array([-0.2, 0.3])
     wrong = tuple(np.full(len(z), 9.0) for z in right)
-    trials = [CoverageTrial("a", 3, 9.0, trusted, z) for trusted, z in ((True, right), (False, wrong))]
-    row = coverage_row("a", trials)
+    trials = [
+        subsets.CoverageTrial("a", 3, 9.0, trusted, z) for trusted, z in ((True, right), (False, wrong))
+    ]
+    row = subsets.coverage_row("a", trials)
     assert row == ["a", 2, 1, "100 100 100", "0 50 50", "50 50 100", "100 100 100", "0.5 3.0 2.2 0.3"]

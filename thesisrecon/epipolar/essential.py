@@ -13,14 +13,8 @@ from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multip
 from thesisrecon.epipolar._sampling import squared_distances
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
 from thesisrecon.errors import StageFailure, counted
+from thesisrecon.geometry import relative_pose
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
-from thesisrecon.geometry.relative_pose import (
-    depths_of_matches,
-    essential_five_points,
-    essential_from_pose,
-    pose_in_front,
-    poses_from_essential,
-)
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.optimize.bundle.projection import move_poses
 from thesisrecon.optimize.least_squares import INLIER_SIGMAS, trimmed_noise_scale
@@ -95,7 +89,7 @@ class _Pair:
 
     def pose(self, E: F64, rows: I64) -> Pose:
         """R and t of E that place most matches in front of both cameras."""
-        return pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
+        return relative_pose.pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
 
     def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
         """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
@@ -134,7 +128,7 @@ def fit_essential(
                 f"{inliers.sum()} of {n} matches agree with the best of {samples} samples",
             )
         pose = _refined(pair, pose, np.flatnonzero(inliers))
-        distance = np.sqrt(pair.squared(essential_from_pose(*pose)[None], every)[0])
+        distance = np.sqrt(pair.squared(relative_pose.essential_from_pose(*pose)[None], every)[0])
         if threshold_px is None:
             break
         near = distance[distance < max(2.0 * gate, float(np.median(distance[inliers])))]
@@ -154,18 +148,18 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
         if len(rows) <= _SAMPLE:
             return E
         # All poses of E have the same distances.
-        R, t = poses_from_essential(E)
+        R, t = relative_pose.poses_from_essential(E)
         pose = R[0], t[0]
         for wide in _GATES:
-            distance = pair.squared(essential_from_pose(*pose)[None], some)[0]
+            distance = pair.squared(relative_pose.essential_from_pose(*pose)[None], some)[0]
             inside = some[distance < (wide * gate) ** 2]
             if len(inside) <= _SAMPLE:
                 return E
             pose = _refined(pair, pose, inside, iterations=3)
-        return unit_norm(essential_from_pose(*pose))
+        return unit_norm(relative_pose.essential_from_pose(*pose))
 
     found = search_models(
-        lambda samples: essential_five_points(pair.x1[samples], pair.x2[samples]),
+        lambda samples: relative_pose.essential_five_points(pair.x1[samples], pair.x2[samples]),
         lambda E, rows: pair.squared(E, rows) / gate**2,
         refit, rng, len(pair.points), _SAMPLE, budget, near=_NEAR,
     )  # fmt: skip
@@ -291,10 +285,10 @@ def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: fl
     the right ones, and pulls the fit to itself (high leverage: Hoaglin and Welsch, The American Statistician
     32, 1978). Where the parallax is within the noise, depths have any sign.
     """
-    R, t = pair.pose(essential_from_pose(*pose), np.flatnonzero(inliers))
+    R, t = pair.pose(relative_pose.essential_from_pose(*pose), np.flatnonzero(inliers))
     with np.errstate(divide="ignore", invalid="ignore"):
         parallax = np.linalg.norm(dehomogenize(pair.x1 @ R.T) - pair.x2[:, :2], axis=1) / pair.inverse2[0, 0]
-    front = (depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
+    front = (relative_pose.depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
     front |= parallax < 2.0 * max(INLIER_SIGMAS * noise, _EXACT)
     if (inliers & front).sum() <= _SAMPLE:
         return inliers
@@ -306,7 +300,7 @@ def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: fl
 def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFit:
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
-    R, t = pair.pose(essential_from_pose(*pose), rows)
+    R, t = pair.pose(relative_pose.essential_from_pose(*pose), rows)
     D, H, g = np.empty((2, 3)), np.empty((5, 5)), np.empty(5)
     cost = _linearize_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, D, H, g)
     sigma = float(np.sqrt(2.0 * cost / max(len(rows) - _UNKNOWN, 1)))
@@ -314,9 +308,9 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     half = np.zeros((6, 5))
     half[:3, :3], half[3:, 3:] = np.eye(3), D.T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
-    front = np.asarray((depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
+    front = np.asarray((relative_pose.depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(
-        unit_norm(essential_from_pose(R, t)), R, t, inliers, front, sigma / scale, half @ half.T
+        unit_norm(relative_pose.essential_from_pose(R, t)), R, t, inliers, front, sigma / scale, half @ half.T
     )
 
 

@@ -15,13 +15,8 @@ from thesisrecon.epipolar._matches import MIN_PX, PairFrame, as_matches, check_m
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
-from thesisrecon.geometry.two_view import (
-    enforce_rank_two,
-    epipolar_distances,
-    sampson_residuals,
-    symmetric_residuals,
-)
 from thesisrecon.optimize.ransac import draw_samples, watched
 from thesisrecon.records import FundamentalFit
 
@@ -43,7 +38,7 @@ def estimate_eight_point(xy1: F64, xy2: F64, *, normalized: bool = True, rank_tw
     if not s[7] > (1e-12 if normalized else 1e-16) * s[0]:
         raise StageFailure.of("undetermined-fundamental", len(xy1))
     F = Vt[8].reshape(3, 3)
-    return unit_norm(T2.T @ (enforce_rank_two(F) if rank_two else F) @ T1)
+    return unit_norm(T2.T @ (two_view.enforce_rank_two(F) if rank_two else F) @ T1)
 
 
 def estimate_seven_point(xy1: F64, xy2: F64) -> F64:
@@ -122,20 +117,20 @@ class _InlierTest(NamedTuple):
 
 
 def _larger_epipolar_distance(F: F64, xy1: F64, xy2: F64) -> F64:
-    return np.asarray(epipolar_distances(F, xy1, xy2).max(axis=1))
+    return np.asarray(two_view.epipolar_distances(F, xy1, xy2).max(axis=1))
 
 
 InlierTest = Literal["sampson", "epipolar-distance", "symmetric-distance"]
 INLIER_TESTS = {
     # Chi-square with one degree of freedom: 95 % of the right matches pass.
-    "sampson": _InlierTest(sampson_residuals, 1.0, CHI2_1_95),
+    "sampson": _InlierTest(two_view.sampson_residuals, 1.0, CHI2_1_95),
     # First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2)
     # sigma. If the images have equal weight the distances are equal: the test by the Sampson distance.
     "epipolar-distance": _InlierTest(_larger_epipolar_distance, 1.4142135623730951, 2.0 * CHI2_1_95),
     # Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. Both are
     # multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not of
     # two: 92 % of the right matches pass, not the 95 % of the thesis.
-    "symmetric-distance": _InlierTest(symmetric_residuals, 2.0, 2.0 * CHI2_2_95),
+    "symmetric-distance": _InlierTest(two_view.symmetric_residuals, 2.0, 2.0 * CHI2_2_95),
 }
 
 

@@ -15,14 +15,7 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_normals, unit_tensor
 from thesisrecon.geometry.three_view import cameras_from_tensor, tensor_epipoles, tensor_from_cameras
-from thesisrecon.optimize.least_squares import (
-    DenseSystem,
-    central_differences,
-    huber,
-    invert_information,
-    minimize_residuals,
-    run_levenberg_marquardt,
-)
+from thesisrecon.optimize import least_squares
 
 NEEDED_EQUATIONS = 26  # seven points, thirteen lines, or a mixture (HZ 16.1)
 # Largest relative standard deviation of T. Planes, rotations and random matches give 0.5 to 1.5 at any noise;
@@ -117,7 +110,7 @@ def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
         # The sign of the start keeps the residuals continuous.
         return T * (1.0 if np.sum(T * start) >= 0.0 else -1.0)
 
-    found = minimize_residuals(
+    found = least_squares.minimize_residuals(
         lambda e: equations.A @ tensor(e).ravel(), np.concatenate(tensor_epipoles(start))
     )
     return tensor(found.x)
@@ -135,7 +128,9 @@ class _ReprojectionProblem:
         self.per_pixel, self.loss_px = transforms[:, 0, 0], loss_px
         self.P, self.moves = np.stack(cameras_from_tensor(T)), np.eye(24)
         # T does not depend on six of 24 directions: the scales of P2 and P3 and the frame of space.
-        self.moves = np.linalg.svd(central_differences(self.tensor, np.zeros(24)).reshape(27, 24))[2][:18]
+        self.moves = np.linalg.svd(
+            least_squares.central_differences(self.tensor, np.zeros(24)).reshape(27, 24)
+        )[2][:18]
         # A line is where the planes of its image lines meet, a point where those of axis-parallel lines meet.
         axes = np.eye(3)[:2] - self.x[..., :2, None] * np.eye(3)[2]
         lines = unit_normals(np.cross(self.y[:, :, :1], self.y[:, :, 1:]))
@@ -166,25 +161,25 @@ class _ReprojectionProblem:
 
     def losses(self, residual: F64) -> tuple[F64, F64]:
         """Huber's loss and weight (N + M, 3) of each image of a point or line."""
-        return huber(np.sum(residual**2, axis=2), self.loss_px)
+        return least_squares.huber(np.sum(residual**2, axis=2), self.loss_px)
 
     def cost(self, state: _State) -> float:
         return 0.5 * float(self.losses(self.residual(*state))[0].sum())
 
-    def linearize(self, state: _State) -> DenseSystem:
+    def linearize(self, state: _State) -> least_squares.DenseSystem:
         """The normal equations of the cameras, points and lines eliminated."""
         c, f = state
-        r, B = self._weighted(state, central_differences(lambda f: self.residual(c, f), f))
-        _, A = self._weighted(state, central_differences(lambda c: self.residual(c, f), c))
+        r, B = self._weighted(state, least_squares.central_differences(lambda f: self.residual(c, f), f))
+        _, A = self._weighted(state, least_squares.central_differences(lambda c: self.residual(c, f), c))
         A = A - B @ (np.linalg.pinv(B) @ A)
         H, g = np.einsum("nri,nrj->ij", A, A), np.einsum("nri,nrj->i", A, r)
-        return DenseSystem(self.cost(state), H, g)
+        return least_squares.DenseSystem(self.cost(state), H, g)
 
     def retract(self, state: _State, step: F64) -> _State:
         """Move the cameras, then points and lines by Gauss-Newton steps that lower their cost."""
         c, f = state[0] + step, state[1]
         for _ in range(3):
-            r, B = self._weighted((c, f), central_differences(lambda f: self.residual(c, f), f))
+            r, B = self._weighted((c, f), least_squares.central_differences(lambda f: self.residual(c, f), f))
             moved = f - (np.linalg.pinv(B) @ r)[..., 0]
             before, after = (self.losses(self.residual(c, g))[0].sum(axis=1) for g in (f, moved))
             f = np.where((after < before)[:, None], moved, f)
@@ -201,19 +196,21 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
     """The fit; whether the matches determine it is not tested."""
     n, m = len(problem.X), len(problem.L)
     start = problem.retract((np.zeros(18), np.zeros((n + m, 4))), np.zeros(18))
-    found = run_levenberg_marquardt(
+    found = least_squares.run_levenberg_marquardt(
         problem.linearize, problem.retract, problem.cost, start,
         max_iterations=50, tolerance=1e-9, initial_damping=1e-3,
     )  # fmt: skip
     c, f = found.state
     residual = problem.residual(c, f)
     sigma = float(np.sqrt(np.sum(residual**2) / max(3 * n + 2 * m - 18, 1)))
-    of_cameras = sigma**2 * invert_information(problem.linearize((c, f)).hessian)
+    of_cameras = sigma**2 * least_squares.invert_information(problem.linearize((c, f)).hessian)
 
     def tensor_px(c: F64) -> F64:
         return equations.in_pixels(problem.tensor(c))
 
-    J, J_px = (central_differences(tensor, c).reshape(27, 18) for tensor in (problem.tensor, tensor_px))
+    J, J_px = (
+        least_squares.central_differences(tensor, c).reshape(27, 18) for tensor in (problem.tensor, tensor_px)
+    )
     return TrifocalFit(
         T=tensor_px(c),
         point_residuals_px=np.linalg.norm(residual[:n], axis=2).T,

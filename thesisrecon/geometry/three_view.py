@@ -10,18 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from thesisrecon.arrays import F64, require_finite
+from thesisrecon.geometry import homogeneous
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import (
-    checked_unit,
-    cross_matrix,
-    dehomogenize,
-    homogenize,
-    unit_norm,
-    unit_tensor,
-)
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 
-_SKEW = cross_matrix(np.array([0.31, 0.17, 0.53]))
+_SKEW = homogeneous.cross_matrix(np.array([0.31, 0.17, 0.53]))
 _TURN = np.linalg.solve(np.eye(3) - _SKEW, np.eye(3) + _SKEW)
 """A rotation without symmetry: its rows are not the epipoles of usual camera positions."""
 
@@ -31,7 +24,7 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
 
     For P1 = [I 0], P2 = [A a], P3 = [B b] it is A_ji b_k - a_j B_ki; zero if all three centres coincide.
     """
-    P1, P2, P3 = (checked_unit(P, "tensor_from_cameras") for P in (P1, P2, P3))
+    P1, P2, P3 = (homogeneous.checked_unit(P, "tensor_from_cameras") for P in (P1, P2, P3))
     T, centre = np.zeros((3, 3, 3)), camera_centre(P1)
     # The determinants of one centre are rounding errors.
     least = 1e-12 * float(np.linalg.norm(centre))
@@ -42,7 +35,7 @@ def tensor_from_cameras(P1: F64, P2: F64, P3: F64) -> F64:
         rows[:, :, :2] = np.delete(P1, i, axis=0)
         rows[:, :, 2], rows[:, :, 3] = P2[:, None], P3[None]
         T[i] = (-1.0) ** i * np.linalg.det(rows)
-    return unit_tensor(T)
+    return homogeneous.unit_tensor(T)
 
 
 def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
@@ -53,7 +46,7 @@ def transfer_lines(T: F64, l1: F64, l2: F64) -> F64:
     require_finite("transfer_lines", T, l1, l2)
     M = np.einsum("...j,ijk->...ik", l2, T)
     scaled = l1 / np.maximum(np.linalg.norm(l1, axis=-1, keepdims=True), 1e-300)
-    return np.asarray(np.linalg.svd(cross_matrix(scaled) @ M)[2][..., 2, :])
+    return np.asarray(np.linalg.svd(homogeneous.cross_matrix(scaled) @ M)[2][..., 2, :])
 
 
 def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
@@ -64,10 +57,10 @@ def transfer_points(T: F64, xy1: F64, xy2: F64) -> F64:
     """
     F21, _ = fundamentals_from_tensor(T)
     xy1, xy2 = correct_matches(F21, xy1, xy2)
-    x1, x2 = homogenize(xy1), homogenize(xy2)
+    x1, x2 = homogeneous.homogenize(xy1), homogeneous.homogenize(xy2)
     epipolar = x1 @ F21.T
     across = np.cross(x2, np.column_stack([epipolar[:, :2], np.zeros(len(x2))]))
-    return dehomogenize(np.einsum("nki,ni->nk", np.einsum("nj,ijk->nki", across, T), x1))
+    return homogeneous.dehomogenize(np.einsum("nki,ni->nk", np.einsum("nj,ijk->nki", across, T), x1))
 
 
 def tensor_epipoles(T: F64) -> tuple[F64, F64]:
@@ -85,9 +78,9 @@ def tensor_epipoles(T: F64) -> tuple[F64, F64]:
 def fundamentals_from_tensor(T: F64) -> tuple[F64, F64]:
     """F21 = [e2]x [T_1, T_2, T_3] e3 and F31 = [e3]x [T_1', T_2', T_3'] e2 of unit norm (HZ 15.1)."""
     e2, e3 = tensor_epipoles(T)
-    F21 = cross_matrix(e2) @ np.einsum("ijk,k->ji", T, e3)
-    F31 = cross_matrix(e3) @ np.einsum("ijk,j->ki", T, e2)
-    return unit_norm(F21), unit_norm(F31)
+    F21 = homogeneous.cross_matrix(e2) @ np.einsum("ijk,k->ji", T, e3)
+    F31 = homogeneous.cross_matrix(e3) @ np.einsum("ijk,j->ki", T, e2)
+    return homogeneous.unit_norm(F21), homogeneous.unit_norm(F31)
 
 
 def cameras_from_tensor(T: F64) -> tuple[F64, F64, F64]:

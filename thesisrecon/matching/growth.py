@@ -11,6 +11,7 @@ from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_at_least
 from thesisrecon.geometry.two_view import epipolar_distance_std
+from thesisrecon.matching import _seeds
 from thesisrecon.matching._prepared import (
     SAMPLES,
     SIDE,
@@ -27,13 +28,6 @@ from thesisrecon.matching._prepared import (
     sample_window,
     select_found,
     window_raster,
-)
-from thesisrecon.matching._seeds import (
-    SeedSet,
-    corners_of_seeds,
-    map_support,
-    nearest_neighbours,
-    seed_matches,
 )
 from thesisrecon.matching.track_alignment import align_corners, align_matches, strongest_distinct
 from thesisrecon.records import Features, FundamentalFit, Image, Matches
@@ -323,7 +317,7 @@ class SeedsAndGrowth:
         # Faint and blurred images have seeds at the coarse levels only.
         if not (len(features1.xy) and len(features2.xy)):
             return empty_matches(pair)
-        sets = seed_matches(features1, features2, pair, ratio=self.ratio)
+        sets = _seeds.seed_matches(features1, features2, pair, ratio=self.ratio)
         start = _verified_seeds(sets, estimate_fundamental, rng)
         if start is None:
             return empty_matches(pair)
@@ -331,7 +325,7 @@ class SeedsAndGrowth:
             grow = self._grow_in_rounds if features1.oblique is None else self._grow_around_seeds
             matches = grow(view1, view2, start, estimate_fundamental, rng)
         else:
-            matches = corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
+            matches = _seeds.corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
         if not self.align:
             return select_found(matches, strongest_distinct(matches))
         return align_matches(view1, view2, matches, affine_std=self.affine_std)
@@ -383,7 +377,7 @@ class SeedsAndGrowth:
         F is uncertain far from its matches: a narrow band would keep those that confirm its error.
         """
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
-        near = nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
+        near = _seeds.nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)
         long_side = view2.long_side
         radius = np.clip(3.0 * spread, 0.004 * long_side, 0.025 * long_side)
@@ -401,7 +395,7 @@ class SeedsAndGrowth:
 
 
 def _verified_seeds(
-    sets: Iterable[SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
+    sets: Iterable[_seeds.SeedSet], estimate: EstimateFundamental, rng: np.random.Generator
 ) -> tuple[Matches, FundamentalFit] | None:
     """The largest set of seeds that agree with one F, and F; tries later sets only if few agree."""
     best: tuple[Matches, FundamentalFit] | None = None
@@ -421,7 +415,7 @@ def _verified_seeds(
 
 def _trials(seeds: Matches, support: Callable[[Matches], F64]) -> tuple[Matches, ...]:
     """Sets of seeds to estimate F from; none if there are too few."""
-    wide = support is map_support
+    wide = support is _seeds.map_support
     # Of a strength of 10 at most; seeds whose maps are affine need less.
     supported = support(seeds) >= (1.0 if wide else 2.0)
     if supported.sum() < MIN_SEEDS:

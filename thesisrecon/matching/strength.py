@@ -10,14 +10,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
-from thesisrecon.matching._prepared import (
-    SIDE,
-    EstimateFundamental,
-    PreparedImage,
-    empty_matches,
-    one_to_one,
-    prepare_image,
-)
+from thesisrecon.matching import _prepared
 from thesisrecon.matching.track_alignment import align_matches
 from thesisrecon.records import Features, Image, Matches
 
@@ -155,7 +148,7 @@ class StrengthOfMatch:
     radius_rel: float = 0.16
     candidates: int = 10
     neighbours: int = 10
-    window: int = SIDE
+    window: int = _prepared.SIDE
     colour: bool = False
     weight: Literal["product", "relative-difference"] = "product"
     min_correlation: float = 0.0
@@ -173,18 +166,18 @@ class StrengthOfMatch:
         if not 0.0 <= self.min_strength < 1.0:
             raise ValueError(f"min_strength must lie in [0, 1); got {self.min_strength}")
 
-    def prepare(self, image: Image, features: Features) -> PreparedImage:
+    def prepare(self, image: Image, features: Features) -> _prepared.PreparedImage:
         """See `thesisrecon.config.Matcher.prepare`."""
-        return prepare_image(image, features, window=self.window, colour=self.colour)
+        return _prepared.prepare_image(image, features, window=self.window, colour=self.colour)
 
     def match(
-        self, view1: PreparedImage, view2: PreparedImage, *, pair: tuple[int, int],
-        estimate_fundamental: EstimateFundamental, rng: np.random.Generator,
+        self, view1: _prepared.PreparedImage, view2: _prepared.PreparedImage, *, pair: tuple[int, int],
+        estimate_fundamental: _prepared.EstimateFundamental, rng: np.random.Generator,
     ) -> Matches:  # fmt: skip
         """See `thesisrecon.config.Matcher.match`."""
         del estimate_fundamental, rng
         if min(len(view1.features.xy), len(view2.features.xy)) < 2:
-            return empty_matches(pair)
+            return _prepared.empty_matches(pair)
         xy1, xy2 = view1.features.xy, view2.features.xy
         correlation = view1.patches @ view2.patches.T
         radius = self.radius_rel * max(view1.long_side, view2.long_side)
@@ -195,7 +188,7 @@ class StrengthOfMatch:
             TOLERANCE if self.weight == "relative-difference" else 0.0,
         )  # fmt: skip
         index[strength < self.min_strength * self.neighbours] = -1
-        rows = one_to_one(index, strength)
+        rows = _prepared.one_to_one(index, strength)
         two = index[rows]
         maps = np.tile(np.eye(2), (len(rows), 1, 1))
         matches = Matches(*pair, rows, two, xy1[rows], xy2[two], correlation[rows, two], maps)

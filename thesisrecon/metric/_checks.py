@@ -17,14 +17,8 @@ import scipy
 
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.errors import Notice
+from thesisrecon.metric import _model
 from thesisrecon.metric._adjustment import MetricAdjustment
-from thesisrecon.metric._model import (
-    FOCAL,
-    MetricEstimate,
-    inlier_mask,
-    reproject_observations,
-    residual_norms,
-)
 from thesisrecon.metric._shared_camera import runs_of_views, subsample_inliers
 from thesisrecon.metric._uncertainty import USUAL_INFLATION, Intervals
 from thesisrecon.optimize.bundle import identifiability
@@ -73,17 +67,17 @@ class PerViewChecks(NamedTuple):
         return np.asarray(np.abs(self.focal_off) / np.maximum(USUAL_INFLATION * self.focal_off_std, 1e-9))
 
 
-def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
+def check_views(model: _model.MetricEstimate, *, sigmas: float) -> PerViewChecks:
     """Measure every registered view; ``sigmas`` is the gate of inliers in noise sigmas."""
     t, n = model.tracks, model.tracks.n_views
-    agree = inlier_mask(model, sigmas=sigmas)
+    agree = _model.inlier_mask(model, sigmas=sigmas)
     near = triangulable_observations(model)
     # Points that are inliers in two or more other views.
     count = np.bincount(t.point_index[agree], minlength=t.n_points)
     fixed = count[t.point_index] - agree >= 2
     # Points of wrong two-view matches lie behind the views as often as in front of them.
     known = near & fixed & (np.abs(model.X[t.point_index]).sum(axis=1) > 0)
-    _, depth = reproject_observations(model, t.view_index, t.point_index)
+    _, depth = _model.reproject_observations(model, t.view_index, t.point_index)
     rows = rows_of_views(t.view_index, n)
     own = [_own_camera(model, view, k[agree[k]]) for view, k in enumerate(rows)]
     return PerViewChecks(
@@ -93,7 +87,7 @@ def check_views(model: MetricEstimate, *, sigmas: float) -> PerViewChecks:
     )  # fmt: skip
 
 
-def triangulable_observations(model: MetricEstimate) -> B8:
+def triangulable_observations(model: _model.MetricEstimate) -> B8:
     """Observations (K,) of points seen by two or more registered views with a baseline between them."""
     t = model.tracks
     near = model.registered[t.view_index]
@@ -101,7 +95,7 @@ def triangulable_observations(model: MetricEstimate) -> B8:
     return np.asarray(near & (seen >= 2)[t.point_index] & _from_two_places(model, near)[t.point_index])
 
 
-def _from_two_places(model: MetricEstimate, near: B8) -> B8:
+def _from_two_places(model: _model.MetricEstimate, near: B8) -> B8:
     """(N,) whether the views of a point have a baseline above 0.002 of the distance, a usable parallax."""
     t = model.tracks
     centres = model.cameras.centres
@@ -135,7 +129,7 @@ class Join(NamedTuple):
         return self.inliers / max(self.tracks, 1)
 
 
-def weakest_join(model: MetricEstimate, near: B8) -> Join | None:
+def weakest_join(model: _model.MetricEstimate, near: B8) -> Join | None:
     """Find the two parts of the images whose common tracks agree least with the model; None without any.
 
     Matches between similar sides of an object can join two parts whose own matches are right: an edge of the
@@ -167,12 +161,12 @@ def _on_both_sides(side: B8, point: I64) -> int:
     return int((here & there).sum())
 
 
-def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
+def _noise_per_view(model: _model.MetricEstimate, agree: B8) -> F64:
     """Estimate the noise of one coordinate in each view."""
     t, cameras = model.tracks, model.cameras
     k = np.flatnonzero(agree)
     view, point = t.view_index[k], t.point_index[k]
-    seen, depth = reproject_observations(model, view, point)
+    seen, depth = _model.reproject_observations(model, view, point)
     R = cameras.R[view]
     x = np.einsum("kab,kb->ka", R[:, :2], model.X[point]) + cameras.t[view, :2]
     B = (R[:, :2] - (x / depth[:, None])[:, :, None] * R[:, 2:]) / depth[:, None, None]
@@ -192,14 +186,14 @@ def _noise_per_view(model: MetricEstimate, agree: B8) -> F64:
     return noise
 
 
-def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, float]:
+def _own_camera(model: _model.MetricEstimate, view: int, index: I64) -> tuple[float, float]:
     """Own log focal offset of a view and its standard deviation; NaN with few observations."""
     if not model.registered[view] or len(index) < MIN_OBSERVATIONS:
         return np.nan, np.nan
     index = index[:: int(np.ceil(len(index) / 1500))]
     t, cameras = model.tracks, model.cameras
     X, xy = model.X[t.point_index[index]], t.xy[index]
-    seen, _ = reproject_observations(model, t.view_index[index], t.point_index[index])
+    seen, _ = _model.reproject_observations(model, t.view_index[index], t.point_index[index])
     noise = max(noise_from_distances(np.linalg.norm(seen - xy, axis=1)), 1e-3)
     intrinsics = cameras.intrinsics[cameras.group[view]]
     free = np.arange(len(intrinsics)) < 2  # focal and aspect
@@ -212,7 +206,7 @@ def _own_camera(model: MetricEstimate, view: int, index: I64) -> tuple[float, fl
 
 
 def self_check(
-    model: MetricEstimate, calibration: SelfCalibration, intervals: Intervals, *, sigmas: float
+    model: _model.MetricEstimate, calibration: SelfCalibration, intervals: Intervals, *, sigmas: float
 ) -> tuple[dict[str, float], list[str], list[str]]:
     """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
 
@@ -225,7 +219,7 @@ def self_check(
     before = calibration.K[views, 0, 0]
     both = before > 0
     focals = [intervals[v]["focal_px"] for v in views]
-    agree, noise = inlier_mask(model, sigmas=sigmas), residual_norms(model)
+    agree, noise = _model.inlier_mask(model, sigmas=sigmas), _model.residual_norms(model)
     shift = np.linalg.norm(rows[:, 3:5] - (model.sizes[views] - 1) / 2, axis=1) / longest
     centres = [(intervals[v]["principal_x_px"].std, intervals[v]["principal_y_px"].std) for v in views]
     uncertain = np.max(centres, axis=1) / longest
@@ -262,7 +256,7 @@ def self_check(
     return check, [*failed, *_failed_model(check)], limitations
 
 
-def _failed_views(views: PerViewChecks, model: MetricEstimate) -> tuple[list[str], list[str]]:
+def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> tuple[list[str], list[str]]:
     """A sentence for the views with each failure, the most severe one of each view, and for noisy views."""
     left = model.registered.copy()
 
@@ -328,15 +322,18 @@ def _failed_model(check: Mapping[str, float]) -> list[str]:
     return [sentence for sentence, ok in passed.items() if not ok]
 
 
-def returned_cameras(model: MetricEstimate) -> UpgradedCameras:
+def returned_cameras(model: _model.MetricEstimate) -> UpgradedCameras:
     """Return the registered cameras and valid points, from which the motion is measured."""
     v, cameras = np.flatnonzero(model.registered), model.cameras
-    focal = cameras.intrinsics[cameras.group[v], FOCAL] / model.sizes[v].max(axis=1)
+    focal = cameras.intrinsics[cameras.group[v], _model.FOCAL] / model.sizes[v].max(axis=1)
     return UpgradedCameras(focal, cameras.R[v], cameras.centres[v], model.X[model.valid])
 
 
 def check_returned(
-    model: MetricEstimate, adjustment: MetricAdjustment, motion: Mapping[str, float], intervals: Intervals
+    model: _model.MetricEstimate,
+    adjustment: MetricAdjustment,
+    motion: Mapping[str, float],
+    intervals: Intervals,
 ) -> IdentifiabilityReport:
     """Check whether images and prior determine a model; the ``intervals`` say how well focals are known."""
     part = runs_of_views(model)
@@ -360,6 +357,6 @@ def check_returned(
     std = np.array([focal.std / focal.value for focal in focals])
     excess = identifiability.excess_equations(adjustment.prior, model.registered)
     everywhere = np.flatnonzero(model.registered)
-    focal = c.intrinsics[c.group[everywhere], FOCAL] / model.sizes[everywhere].max(axis=1)
+    focal = c.intrinsics[c.group[everywhere], _model.FOCAL] / model.sizes[everywhere].max(axis=1)
     motion = {**motion, "focal_long_sides": float(np.median(focal))}
     return identifiability.identifiability_report(problem, excess, motion=motion, focal_std=std)

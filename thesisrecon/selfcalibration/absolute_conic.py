@@ -16,14 +16,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.geometry.strata import calibration_from_image
 from thesisrecon.optimize.least_squares import central_differences
-from thesisrecon.selfcalibration import _frame
-from thesisrecon.selfcalibration._refinement import (
-    ENTRY_WEIGHT,
-    UPPER,
-    dual_image_residuals,
-    minimize_batch,
-    quadratic_rows,
-)
+from thesisrecon.selfcalibration import _frame, _refinement
 
 _PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _REWEIGHTINGS = 4
@@ -35,14 +28,18 @@ def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
     Also singular values (6,): the last is 0 for exact homographies, the fifth too for a family of w*.
     """
     equations = _transfer_matrix(H.swapaxes(-1, -2)) - np.eye(6)
-    _, s, Vt = np.linalg.svd((ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False)
+    _, s, Vt = np.linalg.svd(
+        (_refinement.ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False
+    )
     w = Vt[5][_PLACE]
     return (w if np.trace(w) > 0 else -w), s
 
 
 def _transfer_matrix(M: F64) -> F64:
     """Return the matrices (..., 6, 6) from the entries of a symmetric w to those of M' w M."""
-    return quadratic_rows(M[..., UPPER[0]].swapaxes(-1, -2), M[..., UPPER[1]].swapaxes(-1, -2))
+    return _refinement.quadratic_rows(
+        M[..., _refinement.UPPER[0]].swapaxes(-1, -2), M[..., _refinement.UPPER[1]].swapaxes(-1, -2)
+    )
 
 
 def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) -> F64:
@@ -69,7 +66,7 @@ def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) 
     constant[bad[:, later] | bad[:, constraints.first[later]]] = 0.0
     return np.concatenate(
         [(known * weight[..., None]).reshape(len(H), 4 * H.shape[1], 6),
-         (constant * ENTRY_WEIGHT[:, None]).reshape(len(H), 6 * len(later), 6)], axis=1,
+         (constant * _refinement.ENTRY_WEIGHT[:, None]).reshape(len(H), 6 * len(later), 6)], axis=1,
     )  # fmt: skip
 
 
@@ -190,11 +187,11 @@ class FixedPlaneQuadric:
 
         def residuals(batch: F64) -> F64:
             K = unknown.calibrations(batch)
-            data = dual_image_residuals(frame, K, plane[None]).reshape(len(batch), -1)
+            data = _refinement.dual_image_residuals(frame, K, plane[None]).reshape(len(batch), -1)
             return np.concatenate([data, _frame.HOMOGRAPHY_NOISE * unknown.prior_residuals(batch)], axis=1)
 
         nearest = np.argsort(np.sum(residuals(starts) ** 2, axis=1), kind="stable")[:_DESCENTS]
-        found, cost = minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
+        found, cost = _refinement.minimize_batch(residuals, starts[nearest], iterations=60, loss_scale=0.05)
         best = found[cost.argmin()]
         s = np.linalg.svd(central_differences(residuals, best[None])[0], compute_uv=False)
         if len(s) and not s[-1] > 1e-5 * s[0]:

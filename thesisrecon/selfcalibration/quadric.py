@@ -15,14 +15,8 @@ import numpy as np
 from thesisrecon.arrays import F64
 from thesisrecon.optimize.least_squares import huber, minimize_residuals
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration import _frame, _upgrade
+from thesisrecon.selfcalibration import _frame, _refinement, _upgrade
 from thesisrecon.selfcalibration._frame import ReferenceFrame, SolverUnknowns
-from thesisrecon.selfcalibration._refinement import (
-    RotationCriterion,
-    dual_image_residuals,
-    quadratic_rows,
-    refine_hypotheses,
-)
 from thesisrecon.selfcalibration._upgrade import Candidate
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch
 
@@ -41,10 +35,10 @@ def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
     P = frame.P[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= focals[:, None, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
-    w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
+    w11, w22, w33 = (_refinement.quadratic_rows(p, p) for p in (p1, p2, p3))
     rows = np.stack(
-        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, quadratic_rows(p1, p2) / 0.01,
-         quadratic_rows(p1, p3) / 0.1, quadratic_rows(p2, p3) / 0.1], axis=2,
+        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, _refinement.quadratic_rows(p1, p2) / 0.01,
+         _refinement.quadratic_rows(p1, p3) / 0.1, _refinement.quadratic_rows(p2, p3) / 0.1], axis=2,
     )  # fmt: skip
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
@@ -110,7 +104,7 @@ def _minimize(
 ) -> tuple[F64, float, F64, float]:
     def residuals(batch: F64) -> F64:
         K = unknown.calibrations(batch[:, 3:])
-        data = dual_image_residuals(frame, K, batch[:, :3]).reshape(len(batch), -1)
+        data = _refinement.dual_image_residuals(frame, K, batch[:, :3]).reshape(len(batch), -1)
         return np.concatenate([data, noise * unknown.prior_residuals(batch[:, 3:])], axis=1)
 
     found = minimize_residuals(
@@ -151,7 +145,7 @@ class LinearQuadric:
 
     normalising_focal: float = 1.67
 
-    criterion = RotationCriterion()  # criterion that orders the candidates
+    criterion = _refinement.RotationCriterion()  # criterion that orders the candidates
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -186,7 +180,7 @@ class NonlinearQuadric:
     focal_steps = 45  # number of these focal lengths
     starts = 5  # number of hypotheses to refine over all unknown intrinsics
     loss_scale = 0.05  # residual beyond which an entry counts linearly (Huber)
-    criterion = RotationCriterion()  # criterion that selects the starts
+    criterion = _refinement.RotationCriterion()  # criterion that selects the starts
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -239,7 +233,7 @@ class HypothesesAndRefinement:
     max_refined, max_full_refined = 40, 8
     max_candidates = 3  # maximum number of candidates for bundle adjustment
     min_in_front_ratio = 0.95  # required share of observations with positive depth
-    criterion = RotationCriterion()
+    criterion = _refinement.RotationCriterion()
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -251,7 +245,7 @@ class HypothesesAndRefinement:
         cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
         best = np.argsort(cost, kind="stable")[: self.max_refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
-        theta, cost = refine_hypotheses(self.criterion, frame, theta)
+        theta, cost = _refinement.refine_hypotheses(self.criterion, frame, theta)
         candidates = _upgrade.candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
         unknown = _frame.solver_unknowns(frame, prior)
         others = np.setdiff1d(np.arange(len(unknown.std)), unknown.focals)

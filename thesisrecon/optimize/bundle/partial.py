@@ -13,13 +13,7 @@ import numpy as np
 
 from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.homogeneous import (
-    SpaceFrame,
-    centring_transform,
-    pixel_conditioning,
-    unit_norm,
-    whitened_frame,
-)
+from thesisrecon.geometry import homogeneous
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
 from thesisrecon.geometry.small_matrices import solve_damped
 from thesisrecon.geometry.triangulation import PASSES, sort_by_point, triangulate_linear, triangulate_midpoint
@@ -185,7 +179,7 @@ def refine_points(
     if not used.any():
         return X
     options = _PointOptions(loss_px, iterations, 1e-9, 1, True)
-    return _refine_in_frame(P, X, o, used, whitened_frame(X[used]), options)
+    return _refine_in_frame(P, X, o, used, homogeneous.whitened_frame(X[used]), options)
 
 
 def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy: F64) -> F64:
@@ -193,15 +187,15 @@ def minimize_reprojection(P: F64, X: F64, view_index: I64, point_index: I64, xy:
     o, used = _usable_points(P, X, Observations(view_index, point_index, xy))
     if not used.any():
         return X
-    N = centring_transform(X[used])
-    cameras = unit_norm(pixel_conditioning(o.seen.xy) @ P @ np.linalg.inv(N))
+    N = homogeneous.centring_transform(X[used])
+    cameras = homogeneous.unit_norm(homogeneous.pixel_conditioning(o.seen.xy) @ P @ np.linalg.inv(N))
     S = np.asarray(np.linalg.qr(cameras.reshape(-1, 4))[1])
     # Cameras with one centre leave a direction of space undetermined.
     if len(S) < 4 or not np.abs(np.diag(S)).min() > 1e-13 * np.abs(S).max():
         S = np.eye(4)
     # The median point takes four or five iterations.
     options = _PointOptions(np.inf, 200, 1e-14, 2, False)
-    return _refine_in_frame(P, X, o, used, SpaceFrame(N, S), options)
+    return _refine_in_frame(P, X, o, used, homogeneous.SpaceFrame(N, S), options)
 
 
 def triangulate_points(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -> F64:
@@ -228,12 +222,12 @@ def _usable_points(P: F64, X: F64, observations: Observations) -> tuple[SortedOb
 
 
 def _refine_in_frame(
-    P: F64, X: F64, o: SortedObservations, used: B8, frame: SpaceFrame, options: _PointOptions
+    P: F64, X: F64, o: SortedObservations, used: B8, frame: homogeneous.SpaceFrame, options: _PointOptions
 ) -> F64:
     """Refine the ``used`` points in conditioned pixels and a frame of space; norms and signs are kept."""
-    norms, T = np.linalg.norm(X, axis=1), pixel_conditioning(o.seen.xy)
+    norms, T = np.linalg.norm(X, axis=1), homogeneous.pixel_conditioning(o.seen.xy)
     # The scale of a camera has no effect on its projections, but must not push depths below rounding.
-    cameras = np.ascontiguousarray(unit_norm(frame.cameras(T @ P)))
+    cameras = np.ascontiguousarray(homogeneous.unit_norm(frame.cameras(T @ P)))
     moved = frame.points(np.where(used[:, None], X, 0.0))
     moved[used] /= np.linalg.norm(moved[used], axis=1, keepdims=True)
     xy = o.seen.xy * T[0, 0] + T[:2, 2]
@@ -272,7 +266,7 @@ def refine_camera(P: F64, X: F64, xy: F64, *, loss_px: float = 1.0, iterations: 
     huge variances in undetermined directions.
     """
     size = float(np.linalg.norm(P))
-    T, frame = pixel_conditioning(xy), whitened_frame(X)
+    T, frame = homogeneous.pixel_conditioning(xy), homogeneous.whitened_frame(X)
     points = frame.points(X)
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     start, scale = frame.cameras(T @ P).reshape(1, 12), float(T[0, 0])

@@ -19,15 +19,7 @@ import scipy
 from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
-from thesisrecon.optimize.bundle.elimination import (
-    BlockIndex,
-    ByView,
-    PointSums,
-    ReducedSums,
-    eliminate_points,
-    sort_by_view,
-    substitute_points,
-)
+from thesisrecon.optimize.bundle import elimination
 from thesisrecon.optimize.bundle.projection import Jacobians, Observations, SortedObservations
 
 CHUNK = 4096
@@ -35,7 +27,7 @@ CHUNK = 4096
 Answer = TypeVar("Answer")
 
 
-def add_diagonal(sums: ReducedSums, pair: I64, values: F64) -> None:
+def add_diagonal(sums: elimination.ReducedSums, pair: I64, values: F64) -> None:
     """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) is the block of two views."""
     (b, C, e), c = sums.border.shape, np.arange(sums.border.shape[1])
     sums.blocks[np.diag(pair)[:, None], c, c] += values[: b * C].reshape(b, C)
@@ -48,7 +40,7 @@ class ReducedSystem:
 
     row: I64
     column: I64
-    sums: ReducedSums
+    sums: elimination.ReducedSums
 
     def dense(self) -> F64:
         """Return the upper triangle of the matrix; (D, D)."""
@@ -137,13 +129,13 @@ class BundleLayout:
     """
 
     observations: SortedObservations
-    index: BlockIndex
+    index: elimination.BlockIndex
     width: int
     border: int
     row: I64
     column: I64
     chunks: tuple[tuple[int, int], ...]
-    by_view: tuple[ByView, ...]
+    by_view: tuple[elimination.ByView, ...]
     solver: BandedCholesky | None
     threads: int = 1
 
@@ -179,11 +171,11 @@ class BundleLayout:
         """Allocate the buffers of one linearisation."""
         return Jacobians.empty(len(self.observations.seen.xy), self.width, self.index.common.shape[1])
 
-    def sums(self) -> ReducedSums:
+    def sums(self) -> elimination.ReducedSums:
         """Return a reduced system of zeros."""
         C, b, e, D = self.width, len(self.index.pair), self.border, self.size
         shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
-        return ReducedSums(*(np.zeros(shape) for shape in shapes))
+        return elimination.ReducedSums(*(np.zeros(shape) for shape in shapes))
 
 
 def build_layout(
@@ -204,9 +196,9 @@ def build_layout(
     count = int(np.clip(len(seen.xy) // CHUNK, 1, most))
     bounds = np.searchsorted(start, np.linspace(0, len(seen.xy), count + 1)[1:-1])
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
-    index = BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
+    index = elimination.BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
     solver = choose_solver(row, column, n, width, border)
-    by_view = tuple(sort_by_view(*chunk, index) for chunk in chunks)
+    by_view = tuple(elimination.sort_by_view(*chunk, index) for chunk in chunks)
     return BundleLayout(observations, index, width, border, row, column, chunks, by_view, solver, threads)
 
 
@@ -227,15 +219,17 @@ class BundleSystem:
     jacobians: Jacobians
     prior: CameraPrior | None = None
 
-    def reduce(self, damping: float) -> tuple[ReducedSystem, PointSums, F64]:
+    def reduce(self, damping: float) -> tuple[ReducedSystem, elimination.PointSums, F64]:
         """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
         N, layout = len(self.layout.observations.start) - 1, self.layout
-        points = PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
+        points = elimination.PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
 
-        def eliminate(n: int) -> ReducedSums:
+        def eliminate(n: int) -> elimination.ReducedSums:
             part = layout.sums()
             by_view = layout.by_view[n]
-            eliminate_points(*layout.chunks[n], damping, self.jacobians, layout.index, by_view, part, points)
+            elimination.eliminate_points(
+                *layout.chunks[n], damping, self.jacobians, layout.index, by_view, part, points
+            )
             return part
 
         total, *others = layout.map_chunks(eliminate)
@@ -265,7 +259,9 @@ class BundleSystem:
 
         def substitute(n: int) -> None:
             index = self.layout.index
-            substitute_points(*self.layout.chunks[n], cameras, self.jacobians, index, points, moves)
+            elimination.substitute_points(
+                *self.layout.chunks[n], cameras, self.jacobians, index, points, moves
+            )
 
         self.layout.map_chunks(substitute)
         if not np.isfinite(moves).all():
@@ -276,7 +272,7 @@ class BundleSystem:
         return (cameras, moves), gain, 0.5 * float(reduced.sums.rhs @ cameras) if len(cameras) else gain
 
 
-def _add_prior(pair: I64, total: ReducedSums, prior: CameraPrior) -> None:
+def _add_prior(pair: I64, total: elimination.ReducedSums, prior: CameraPrior) -> None:
     """Add the information and gradient of the prior."""
     size, border = len(total.rhs), len(total.corner)
     (i, j, w, gradient), edge = prior, size - border
