@@ -127,19 +127,13 @@ class KruppaEquations:
     few pairs leave false solutions without residual. Solutions that do not determine a focal length that is
     not given are rejected: those near 0, and all of cameras on a sphere that look at its centre [1]_.
 
-    Parameters
-    ----------
-    focal_range : (float, float)
-        Range of the scanned focal lengths in long sides.
-
     References
     ----------
     .. [1] P. Sturm, "A case against Kruppa's equations for camera self-calibration", PAMI 22(10), 2000.
     """
 
-    focal_range: tuple[float, float] = (0.2, 40.0)
-
-    focal_steps = 90  # number of scanned focal lengths
+    # Range in long sides and number of the scanned focal lengths.
+    focal_range, focal_steps = (0.2, 40.0), 90
     starts = 4  # number of minima to refine
     loss_scale = 0.02  # residual of a pair beyond which it counts linearly (soft L1)
     min_common_points = 20  # minimum number of common observations of a pair

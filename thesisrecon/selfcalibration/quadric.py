@@ -167,17 +167,10 @@ class LinearQuadric:
 
 @dataclass(frozen=True)
 class NonlinearQuadric:
-    """Self-calibration by the nonlinear quadric, started from scanned linear quadrics.
+    """Self-calibration by the nonlinear quadric, started from scanned linear quadrics."""
 
-    Parameters
-    ----------
-    focal_range : (float, float)
-        Range of the normalizing focal lengths of the linear quadrics, in long sides.
-    """
-
-    focal_range: tuple[float, float] = (0.2, 40.0)
-
-    focal_steps = 45  # number of these focal lengths
+    # Range and number of the normalizing focal lengths of the linear quadrics, in long sides.
+    focal_range, focal_steps = (0.2, 40.0), 45
     starts = 5  # number of hypotheses to refine over all unknown intrinsics
     loss_scale = 0.05  # residual beyond which an entry counts linearly (Huber)
     criterion = _refinement.RotationCriterion()  # criterion that selects the starts
