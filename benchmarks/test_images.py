@@ -19,7 +19,7 @@ from thesisrecon.records import Image
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.rectification import PlanarRectification, hartley, rectify
 from thesisrecon.stereo.scanline import MaximumLikelihoodScanline
-from thesisrecon.stereo.semi_global import PUBLISHED, SemiGlobalMatching
+from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.references.opencv import OpenCVSemiGlobal, harris_corners
 from validation.references.sift import compute_sift, grey_of, sift_front_end
 from validation.scenes.two_views import make_two_views
@@ -28,7 +28,6 @@ DISPARITIES = 64
 MATCHERS: dict[str, SemiGlobalMatching | MaximumLikelihoodScanline] = {
     "ours": SemiGlobalMatching(),
     "ours (thesis)": MaximumLikelihoodScanline(),
-    "ours (semi-global)": PUBLISHED,
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -12,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.geometry.strata import Group
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
 from validation.scenes.cube import SIZE, make_cube
 from validation.scenes.pose import look_at
+
+Group = Literal["projective", "affine", "metric", "euclidean"]
 
 
 @dataclass(frozen=True)

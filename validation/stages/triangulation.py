@@ -15,13 +15,12 @@ import numpy as np
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.strata import Group
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from validation.references.fundamental import colmap_points, opencv_linear, opencv_polynomial
 from validation.runs.records import Judgement, Outcome, ReportOptions, Stage, Task, read_arrays
 from validation.runs.tables import Metric, Plot, each, plot, row, scatter
-from validation.scenes.rigs import SCENES, DrawnRig, draw_rig, squared_distances
+from validation.scenes.rigs import SCENES, DrawnRig, Group, draw_rig, squared_distances
 
 OURS = "ours (polynomial, optimal)"
 DESCENT = 40  # Iterations to the minimum reprojection error

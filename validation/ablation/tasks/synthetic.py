@@ -15,7 +15,6 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.errors import StageFailure, unknown_word
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.geometry.strata import Group
 from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
 from thesisrecon.records import IntrinsicsPrior, Reconstruction
 from validation.ablation.statistics import Sample
@@ -26,6 +25,7 @@ from validation.references.fundamental import colmap_points, opencv_linear, open
 from validation.scenes.cube import OFF_FACE, K, cube_pairs, make_cube
 from validation.scenes.rigs import SCENES as RIGS
 from validation.scenes.rigs import (
+    Group,
     Rig,
     cube_rig,
     draw_rig,
