@@ -151,34 +151,6 @@ def read_openmvs(folder):
     return found
 
 
-def read_bundler(folder):
-    words = iter((folder / "bundle.out").read_text().split("\n", 1)[1].split())
-    names = (folder / "list.txt").read_text(encoding="utf-8").splitlines()
-    cameras, points = int(next(words)), int(next(words))
-    parameters = np.array([[float(next(words)) for _ in range(15)] for _ in range(cameras)])
-    found = {}
-    for name, (f, k1, k2, *pose) in zip(names, parameters, strict=True):
-        width, height = pixels_of(folder / name).shape[1::-1]
-        assert (k1, k2) == (0.0, 0.0)
-
-        def project(X, f=f, pose=pose, middle=((width - 1) / 2, (height - 1) / 2)):
-            P = X @ np.reshape(pose[:9], (3, 3)).T + pose[9:]
-            return -f * P[:, :2] / P[:, 2:] * [1, -1] + middle
-
-        found[name.removeprefix("images/")] = project, (width, height)
-    for _ in range(points):
-        X = np.array([[float(next(words)) for _ in range(3)]])
-        assert all(0 <= int(next(words)) < 256 for _ in range(3))
-        for i in range(int(next(words))):
-            assert int(next(words)) == i
-            next(words)
-            project, (width, height) = found[names[i].removeprefix("images/")]
-            seen = [float(next(words)) + (width - 1) / 2, (height - 1) / 2 - float(next(words))]
-            np.testing.assert_allclose(project(X)[0], seen, atol=1e-6, rtol=0)
-    assert next(words, None) is None
-    return found
-
-
 def read_opencv(folder):
     import cv2
 
@@ -205,7 +177,6 @@ def read_opencv(folder):
         pytest.param("colmap-undistorted", read_colmap, 3.0, marks=pytest.mark.references),
         ("nerfstudio", read_nerfstudio, 0.0),
         ("openmvs", read_openmvs, 0.0),
-        ("bundler", read_bundler, 0.0),
     ],
 )
 def test_undistorted_exports_project_known_points(tmp_path, images, to, read, skew):
@@ -213,18 +184,12 @@ def test_undistorted_exports_project_known_points(tmp_path, images, to, read, sk
     export(model, tmp_path / "out", to=to, images=images)
     found = read(tmp_path / "out")
     for view in model.views:
-        name = WRITTEN[view.name].replace(" ", "_") if to == "bundler" else WRITTEN[view.name]
+        name = WRITTEN[view.name]
         project, (width, height) = found[name]
         xy = project(model.X)
         pinhole = Camera(view.K * [[1, skew == 0, 1], [1, 1, 1], [1, 1, 1]], view.R, view.t, view.size)
-        if to == "bundler":
-            # One focal length and another principal point.
-            centred = (pinhole.project(model.X) - view.K[:2, 2]) * view.K[0, 0] / np.diag(view.K)[:2]
-            middle = np.array([width - 1, height - 1]) / 2
-            np.testing.assert_allclose(xy, centred + middle, atol=1e-6, rtol=0)
-        else:
-            offset = pinhole.project(model.X) - xy
-            np.testing.assert_allclose(offset, np.tile(np.rint(offset[0]), (40, 1)), atol=1e-6, rtol=0)
+        offset = pinhole.project(model.X) - xy
+        np.testing.assert_allclose(offset, np.tile(np.rint(offset[0]), (40, 1)), atol=1e-6, rtol=0)
         # The image content is where the distorted camera sees it, and no pixel is outside of the original.
         pixels = pixels_of(tmp_path / "out" / "images" / name)
         assert pixels.shape == (height, width, 3)
@@ -304,7 +269,6 @@ def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
     report = export(out, tmp_path / "a", to="colmap-undistorted")
     assert report.notes == ()
     assert all((pixels_of(tmp_path / "a" / "masks" / f"{name}.png")[:, 0] == 0).all() for name in names)
-    assert "Bundler has none" in export(out, tmp_path / "b", to="bundler").notes[0]
     command = ["export", str(out), "--to", "nerfstudio", "-o"]
     assert run_command([*command, str(tmp_path / "e")]) == 0
     assert "note" not in capsys.readouterr().out
@@ -431,10 +395,10 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
         (model, "nerfstdio", images, "did you mean nerfstudio"),
         (model, "nerfstudio", None, "give it with --images"),
         (model, "openmvs", tmp_path / "run", "4 of the 4 images of the model are not in"),
-        (other, "kalibr", None, "lens model of image a b.png is unknown"),
+        (other, "opencv", None, "lens model of image a b.png is unknown"),
         (lost, "colmap", None, "no intrinsics"),
-        (twice, "bundler", images, "two images of the model would be written as a_b.png"),
-        (small, "bundler", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
+        (twice, "nerfstudio", images, "two images of the model would be written as a b.png"),
+        (small, "openmvs", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
         (wild, "openmvs", images, "the camera is not plausible"),
         (replace(model, views=[]), "opencv", None, "no camera"),
         (make_model(PINCUSHION, BARREL, skew=3.0), "opencv", None, "opencv has no camera model with skew"),

@@ -85,7 +85,7 @@ COMMANDS = {
     ) and 0,
     "demo": lambda _, out, *more: cli("demo", "-o", out, *more),
     "save": save,
-    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "opencv", "bundler")},
+    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "opencv", "openmvs")},
     "render": lambda place, out, *more: cli(
         "render", place / "same", "-o", out, "--frames", "2", "--size", "24x20", *more
     ),
@@ -128,8 +128,7 @@ KNOWN = (
     *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json", "tiles/tile-0000.glb",
     "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
     "frames.json", "strip.html", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
-    "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "bundle.out",
-    "list.txt",
+    "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "scene.mvs",
 )  # fmt: skip
 """Files that --overwrite may replace; the following survive it, too."""
 UNKNOWN = (

@@ -118,7 +118,7 @@ def test_known_cameras_give_a_model_and_four_exports(place, monkeypatch):
     assert len(names["mesh"].faces) > 2000
     assert (place / "model.glb").stat().st_size > 50_000
     written = {path.relative_to(place / "exported").parts[0] for path in (place / "exported").rglob("*.*")}
-    assert written == {"colmap-undistorted", "nerfstudio", "openmvs", "bundler"}
+    assert written == {"colmap-undistorted", "nerfstudio", "openmvs", "opencv"}
 
 
 def test_an_own_variant_is_compared_by_a_script(place):

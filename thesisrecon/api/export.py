@@ -65,14 +65,12 @@ _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
     "nerfstudio": lambda folder, model, masked: formats.write_nerfstudio(folder, model, masked=masked),
     "openmvs": lambda folder, model, _: formats.write_openmvs(folder, model),
-    "bundler": lambda folder, model, _: formats.write_bundler(folder, model),
 }
 """Formats with undistorted images, perhaps with masks."""
 _FILES: Mapping[str, Sequence[str]] = {
     **dict.fromkeys(("colmap", "colmap-undistorted"), COLMAP_FILES),
     "nerfstudio": ("transforms.json", "points.ply"),
     "openmvs": ("scene.mvs",),
-    "bundler": ("bundle.out", "list.txt"),
     "opencv": ("poses.yml", "camera_[0-9]*.yml"),
     "kalibr": ("camchain.yaml",),
 }
@@ -94,8 +92,8 @@ def export(
     out : path
         Folder of the export; created if missing.
     to : str
-        ``"colmap-undistorted"``, ``"nerfstudio"``, ``"openmvs"`` and ``"bundler"`` write undistorted images
-        of pinhole cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
+        ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
+        cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
     images : path, optional
         Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
         are used as stored, without EXIF rotation.
@@ -152,9 +150,9 @@ def export(
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
             file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
-    undistorted = _undistorted(model, bundler=to == "bundler")
+    undistorted = _undistorted(model)
     may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
-    names = [formats.mask_name(to, name) for name in undistorted.names if may_mask and to != "bundler"]
+    names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
     _require_distinct(names, "have the mask")
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
     paths = _image_paths(images, model)
@@ -163,7 +161,6 @@ def export(
         has_mask = _write_images(folder, model, undistorted, paths, found, names, threads)
         masked = masks is not None or any(has_mask)
         notes += [_images.USELESS_MASKS] if masked and not any(has_mask) else []
-        notes += ["no masks are written: Bundler has none"] if masked and not names else []
         # Programs want a mask for every image or for none.
         for view, name, there in zip(undistorted.views, names if masked else (), has_mask, strict=False):
             if not there:
@@ -239,7 +236,7 @@ def _recorded(model: Model, name: str) -> Path | None:
     return Path(folder) if isinstance(folder, str) else None
 
 
-def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
+def _undistorted(model: SparseModel) -> SparseModel:
     """The model with pinhole views, observations in their pixels, and names of files that can be written."""
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
     views, xy = list[SparseView](), model.xy.copy()
@@ -248,9 +245,9 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
         K, size, distortion = view.intrinsics
         key = (K.tobytes(), distortion.tobytes(), size)
         if key not in frames:
-            frames[key] = _pinhole_frame(view, centred=bundler)
+            frames[key] = _pinhole_frame(view)
         K, size = frames[key]
-        here, name = rows[i], _file_name(view.name, plain=bundler)
+        here, name = rows[i], _file_name(view.name)
         xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
         views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
     _require_distinct([view.name for view in views], "be written as")
@@ -258,17 +255,15 @@ def _undistorted(model: SparseModel, *, bundler: bool) -> SparseModel:
 
 
 def _require_distinct(names: Sequence[str], what: str) -> None:
-    twice = first_repeated(names, as_files=True)
-    if twice is not None:
+    if (twice := first_repeated(names, as_files=True)) is not None:
         message = f"two images of the model would {what} {twice} (regardless of case); rename one of them"
         raise UsageError(message)
 
 
-def _file_name(name: str, *, plain: bool) -> str:
-    """Relative name of a JPEG or PNG file, for list files of names (``plain``) without blanks."""
+def _file_name(name: str) -> str:
+    """Relative name of a JPEG or PNG file."""
     path = PurePath(name)
-    text = path.as_posix() if path.suffix.lower() in (".jpg", ".jpeg", ".png") else f"{path.as_posix()}.png"
-    return "_".join(text.split()) if plain else text
+    return path.as_posix() if path.suffix.lower() in (".jpg", ".jpeg", ".png") else f"{path.as_posix()}.png"
 
 
 def _normalized(view: SparseView, xy: F64) -> F64:
@@ -285,30 +280,25 @@ def _normalized(view: SparseView, xy: F64) -> F64:
     return np.where(ahead[:, None], plane, outside)
 
 
-def _pinhole_frame(view: SparseView, *, centred: bool) -> tuple[F64, tuple[int, int]]:
+def _pinhole_frame(view: SparseView) -> tuple[F64, tuple[int, int]]:
     """K of the same focal lengths, without skew, and size of the largest pinhole image in the original."""
     original, sides, distortion = view.intrinsics
     x, y = (np.arange(float(side)) for side in sides)
     borders = [(np.full_like(y, side), y) for side in (0.0, x[-1])]
     borders += [(x, np.full_like(x, side)) for side in (0.0, y[-1])]
     left, right, top, bottom = (_normalized(view, np.column_stack(border)) for border in borders)
-    focal = np.array([original[0, 0], original[0, 0] if centred else original[1, 1]])
+    focal = np.array([original[0, 0], original[1, 1]])
     low, high = focal * [left[:, 0].max(), top[:, 1].max()], focal * [right[:, 0].min(), bottom[:, 1].min()]
     corner = float(np.hypot(*(np.maximum(-low, high) / focal)))
     inner = min(1.0, 0.99 * growing_radius(distortion) / corner)
     low, high, K = low * inner, high * inner, np.diag([*focal, 1.0])
     # The image extends beyond the original by at most half of each side.
     growth, rounding_px = 0.5 * np.array(sides), 1e-6
-    if centred:
-        reach = np.minimum(np.minimum(-low, high), 2.0 * growth)
-        size = np.floor(2.0 * reach + rounding_px).astype(np.int64) + 1
-        K[:2, 2] = (size - 1) / 2
-    else:
-        centre = original[:2, 2]
-        first = np.ceil(np.maximum(low + centre, -growth) - rounding_px)
-        last = np.floor(np.minimum(high + centre, np.array(sides) - 1 + growth) + rounding_px)
-        size = (last - first).astype(np.int64) + 1
-        K[:2, 2] = centre - first
+    centre = original[:2, 2]
+    first = np.ceil(np.maximum(low + centre, -growth) - rounding_px)
+    last = np.floor(np.minimum(high + centre, np.array(sides) - 1 + growth) + rounding_px)
+    size = (last - first).astype(np.int64) + 1
+    K[:2, 2] = centre - first
     if not (np.isfinite(K).all() and size.min() >= 16):
         k = ", ".join(f"{value:.3g}" for value in distortion)
         place = f"distortion {k}, principal point {original[0, 2]:.0f}, {original[1, 2]:.0f}"

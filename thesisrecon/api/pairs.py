@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import colorsys
 from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from PIL import ImageDraw
 
 from thesisrecon import arrays
 from thesisrecon.api.cameras import require_threshold, search_budget
-from thesisrecon.arrays import F32, F64, I64, U8
+from thesisrecon.arrays import F64, U8
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
@@ -21,7 +22,7 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
 from thesisrecon.errors import Notice, StageFailure, require_word
 from thesisrecon.geometry.homogeneous import unit_norm
-from thesisrecon.geometry.two_view import lines_of_points
+from thesisrecon.geometry.two_view import clip_line, lines_of_points
 from thesisrecon.io._images import eight_bit_images, read_image, read_pixels
 from thesisrecon.pipeline.matching import ImageInput, match_images
 from thesisrecon.records import Image, TwoView
@@ -370,43 +371,18 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 
 
 def _drawn(image: U8, lines: F64, xy: F64) -> U8:
-    """An image with unit-normal lines (N, 3) and points (N, 2); number k always has the same colour."""
-    canvas, thick = image.astype(np.float32), float(max(1, round(max(image.shape) / 400)))
-    for k, (line, point) in enumerate(zip(lines, xy, strict=True)):
+    """An image with lines (N, 3) and points (N, 2); number k always has the same colour."""
+    height, width = image.shape[:2]
+    thick = max(1, round(max(height, width) / 400))
+    # At twice the size, then reduced for smooth edges; other pixels do not change.
+    picture = PillowImage.fromarray(image).resize((2 * width, 2 * height), PillowImage.Resampling.NEAREST)
+    draw = ImageDraw.Draw(picture)
+    for k, (line, point) in enumerate(zip(lines, 2.0 * xy + 0.5, strict=True)):
         # The golden ratio spreads hues evenly for any number of matches.
-        colour = 255.0 * np.array(colorsys.hsv_to_rgb(0.618034 * k % 1.0, 1.0, 1.0), dtype=np.float32)
-        _draw_line(canvas, line, thick, colour)
-        _draw_circle(canvas, point, 4.0 * thick, thick, colour)
-    return np.rint(canvas).astype(np.uint8)
-
-
-def _draw_line(canvas: F32, line: F64, thick: float, colour: F32) -> None:
-    """Draw a line with unit normal; a pixel takes the share of its width that the line covers."""
-    if not np.isfinite(line).all():
-        return
-    if np.abs(line[1]) < np.abs(line[0]):
-        canvas, line = canvas.transpose(1, 0, 2), line[[1, 0, 2]]
-    if not line[1]:
-        return
-    along = np.arange(canvas.shape[1])
-    middle = -(line[0] * along + line[2]) / line[1]
-    reach = int(np.ceil(0.75 * thick + 1.0))
-    # Clipped so that far lines stay within the range of integers.
-    across = np.rint(np.clip(middle, -1e6, 1e6)).astype(np.int64) + np.arange(-reach, reach + 1)[:, None]
-    inside = (across >= 0) & (across < canvas.shape[0])
-    y, x = across[inside], np.broadcast_to(along, across.shape)[inside]
-    _blend(canvas, (y, x), 0.5 * thick + 0.5 - np.abs(line[0] * x + line[1] * y + line[2]), colour)
-
-
-def _draw_circle(canvas: F32, centre: F64, radius: float, thick: float, colour: F32) -> None:
-    reach = radius + thick
-    low = np.clip(np.floor(centre - reach), 0, 1e6).astype(np.int64)
-    high = np.clip(np.ceil(centre + reach) + 1, 0, canvas.shape[1::-1]).astype(np.int64)
-    y, x = (part.ravel() for part in np.mgrid[low[1] : high[1], low[0] : high[0]])
-    apart = np.abs(np.hypot(x - centre[0], y - centre[1]) - radius)
-    _blend(canvas, (y, x), 0.5 * thick + 0.5 - apart, colour)
-
-
-def _blend(canvas: F32, pixels: tuple[I64, I64], coverage: F64, colour: F32) -> None:
-    share = np.clip(coverage, 0.0, 1.0)[:, None].astype(np.float32)
-    canvas[pixels] += share * (colour - canvas[pixels])
+        colour = f"hsv({222.4922 * k % 360.0:.3f}, 100%, 100%)"
+        if (ends := clip_line(line, width, height)) is not None:
+            draw.line([tuple(2.0 * end + 0.5) for end in ends], colour, 2 * thick)
+        radius = 9 * thick - 0.5
+        low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
+        draw.ellipse((*low, *high), outline=colour, width=2 * thick)
+    return np.asarray(picture.reduce(2))

@@ -67,6 +67,16 @@ def lines_of_points(F: F64, xy1: F64) -> F64:
     return unit_normals(lines)
 
 
+def clip_line(line: F64, width: float, height: float) -> F64 | None:
+    """The ends (2, 2) of a line a x + b y + c = 0 in an image, left first; None if it misses the image."""
+    a, b, c = (float(v) for v in line)
+    hits = [(x, -(a * x + c) / b) for x in (-0.5, width - 0.5) if b != 0]
+    hits += [(-(b * y + c) / a, y) for y in (-0.5, height - 0.5) if a != 0]
+    low = -0.5 - 1e-6 * max(width, height)
+    inside = [(x, y) for x, y in hits if low <= x <= width - 1 - low and low <= y <= height - 1 - low]
+    return np.array([min(inside), max(inside)]) if len(inside) >= 2 else None
+
+
 def epipolar_distances(F: F64, xy1: F64, xy2: F64) -> F64:
     """Distances (N, 2) of x1 to the line F' x2 and of x2 to F x1 (5.5); both are multiples of x2' F x1."""
     of_first = np.sum(homogenize(xy1) * lines_of_points(F.T, xy2), axis=1)

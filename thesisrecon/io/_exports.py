@@ -1,9 +1,8 @@
 """Point clouds, images, animations, ``cameras.json``, and sparse models in the formats of other programs.
 
-These are nerfstudio, OpenMVS, Bundler, OpenCV and Kalibr. Here the centre of the top-left pixel is (0, 0). It
-is (0.5, 0.5) in nerfstudio, and (0, 0) in OpenMVS, OpenCV and Kalibr; Bundler counts from the centre of the
-image with y up. nerfstudio and Bundler cameras look along -z with y up. Each writer of a format returns its
-main file; images lie in ``images/`` beside it, masks in ``masks/``.
+These are nerfstudio, OpenMVS, OpenCV and Kalibr. The centre of the top-left pixel is (0, 0) here and in
+all of them but nerfstudio, where it is (0.5, 0.5) and cameras look along -z with y up. Each writer of a
+format returns its main file; images lie in ``images/`` beside it, masks in ``masks/``.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F64, U8, rows_of_views
+from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
@@ -93,29 +92,6 @@ def _matrices(*values: F64) -> bytes:
     return b"".join(np.ascontiguousarray(value, dtype="<f8").tobytes() for value in values)
 
 
-def write_bundler(folder: Path, model: SparseModel) -> Path:
-    """Write ``bundle.out`` (v0.3) and ``list.txt`` of pinhole views with one focal, centred, y up."""
-    lines = ["# Bundle file v0.3", f"{len(model.views)} {len(model.X)}"]
-    centre = np.zeros((len(model.views), 2))
-    for i, view in enumerate(model.views):
-        K, *_ = view.intrinsics
-        centre[i] = K[:2, 2]
-        rows = [[K[0, 0], 0.0, 0.0], *(LOOKS_BACK @ view.R), LOOKS_BACK @ view.t]
-        lines += [_numbers(row) for row in rows]
-    xy = (model.xy - centre[model.view_index]) * [1.0, -1.0]
-    # Number of each observation among those of its view.
-    keys = np.zeros(len(model.view_index), np.int64)
-    for here in rows_of_views(model.view_index, len(model.views)):
-        keys[here] = np.arange(len(here))
-    points = zip(model.X, model.point_colors.tolist(), _observations_of_points(model), strict=True)
-    for X, rgb, seen in points:
-        entries = [f"{model.view_index[k]} {keys[k]} {_numbers(xy[k])}" for k in seen]
-        lines += [_numbers(X), " ".join(map(str, rgb)), " ".join([str(len(entries)), *entries])]
-    write_text(folder / "list.txt", "".join(f"images/{view.name}\n" for view in model.views))
-    write_text(folder / "bundle.out", "\n".join(lines) + "\n")
-    return folder / "bundle.out"
-
-
 def write_opencv(folder: Path, model: SparseModel) -> Path:
     """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images."""
     cameras, number = _distinct_cameras(model)
@@ -159,8 +135,8 @@ def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
             notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
         lines += [
             f"cam{i}:", "  camera_model: pinhole",
-            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]], ', ')}]", f"  distortion_model: {kind}",
-            f"  distortion_coeffs: [{_numbers(known[:4], ', ')}]",
+            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]])}]", f"  distortion_model: {kind}",
+            f"  distortion_coeffs: [{_numbers(known[:4])}]",
             f"  resolution: [{width}, {height}]", f"  rostopic: /cam{i}/image_raw",
         ]  # fmt: skip
     write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
@@ -201,8 +177,8 @@ def _observations_of_points(model: SparseModel) -> list[list[int]]:
     return [part.tolist() for part in np.split(order, np.cumsum(counts)[:-1])] if len(model.X) else []
 
 
-def _numbers(values: F64 | list[float], separator: str = " ") -> str:
-    return separator.join(repr(float(value)) for value in values)
+def _numbers(values: F64) -> str:
+    return ", ".join(repr(float(value)) for value in values)
 
 
 def write_point_cloud(path: Path, xyz: F64, rgb: U8) -> None:

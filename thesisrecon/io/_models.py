@@ -32,7 +32,7 @@ def read_model(path: str | Path) -> SparseModel:
     A path is the folder of a run or of a COLMAP model (itself, or the parent of ``0`` or ``sparse/0``), a
     ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
     named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000); a transforms.json,
-    bundle.out, scene.mvs, camchain.yaml or par.txt; a folder with NAME_cam.txt or P of each image.
+    camchain.yaml or par.txt; a folder with NAME_cam.txt or P of each image.
     UsageError for anything else.
     """
     path = Path(path)
@@ -50,8 +50,8 @@ def read_model(path: str | Path) -> SparseModel:
 
 _KNOWN = (
     "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, a "
-    "transforms.json, bundle.out, scene.mvs, camchain.yaml or par.txt, a folder with NAME_cam.txt or a "
-    "matrix P of each image, or a trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
+    "transforms.json, camchain.yaml or par.txt, a folder with NAME_cam.txt or a matrix P of each image, or a "
+    "trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
 )
 
 

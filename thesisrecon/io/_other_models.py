@@ -1,8 +1,6 @@
-"""Models in the formats of other programs: transforms.json (NeRF, nerfstudio), Bundler, OpenMVS and Kalibr.
+"""Cameras in the formats of other programs: transforms.json (NeRF, nerfstudio) and Kalibr.
 
-Cameras of data sets: par.txt (Middlebury), NAME_cam.txt (MVSNet, BlendedMVS, DTU), a matrix P for each image.
-
-The inverse of the writers of :mod:`thesisrecon.io._exports`, with what other writers of these formats add.
+Of data sets: par.txt (Middlebury), NAME_cam.txt (MVSNet, BlendedMVS, DTU), a matrix P for each image.
 """
 
 from __future__ import annotations
@@ -10,8 +8,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import struct
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,13 +19,12 @@ from thesisrecon.camera import decompose_camera
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.io._colmap import PIXEL_CENTRE
-from thesisrecon.io._files import read_bytes, read_json, read_text
+from thesisrecon.io._files import read_json, read_text
 from thesisrecon.lens import simplest_row
 from thesisrecon.results import SparseModel, SparseView
 
 LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
 """From axes x right, y down, z forward to x right, y up, z back."""
-_MVS_VERSIONS = range(1, 7)
 _MOST_OF_A_MATRIX = 2000  # bytes
 
 
@@ -38,11 +33,6 @@ def read_other(path: Path) -> SparseModel | None:
     if path.suffix == ".json" and isinstance(content := read_json(path), dict) and "frames" in content:
         rule = "must hold frames with file_path and transform_matrix (nerfstudio, NeRF)"
         read = read_transforms
-    elif path.suffix == ".mvs":
-        read, rule = read_openmvs, "must be an OpenMVS scene"
-    elif path.suffix == ".out":
-        rule = "must be a Bundler file v0.3, a camera in five lines and a point in three"
-        read = read_bundler
     elif path.suffix in (".yaml", ".yml"):
         read, rule = read_kalibr, "must be a camchain.yaml of pinhole cameras cam0, cam1, ..."
     elif path.name.endswith("par.txt"):
@@ -59,7 +49,7 @@ def read_other(path: Path) -> SparseModel | None:
         raise
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (LookupError, ArithmeticError, TypeError, ValueError, AttributeError, struct.error) as error:
+    except (LookupError, ArithmeticError, TypeError, ValueError, AttributeError) as error:
         raise UsageError(f"{path} {rule} ({in_words(str(error))})") from None
     if not model.views:
         raise UsageError(f"{path} holds no camera; {rule}")
@@ -142,127 +132,6 @@ def _nerf_camera(
     middle = (np.nan, np.nan) if size is None else (0.5 * size[0], 0.5 * size[1])
     cx, cy = (float(given.get(k, at)) - PIXEL_CENTRE for k, at in zip(("cx", "cy"), middle, strict=True))
     return _calibration(fx, fy, cx, cy), size, lens
-
-
-def read_bundler(path: Path) -> SparseModel:
-    """Read ``bundle.out`` (v0.3): f, k1, k2, R and t of cameras that look along -z with y up, and points.
-
-    Names are those of ``list.txt`` beside it; sizes, and with them K and pixels, those of the images there.
-    """
-    words = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
-    n, points = (int(word) for word in words[0])
-    names = _bundler_names(path.parent / "list.txt", n)
-    views: list[SparseView] = []
-    centres, kept = np.full((n, 2), np.nan), np.full(n, -1)
-    for i in range(n):
-        (f, k1, k2), *rows = (np.array(row, dtype=np.float64) for row in words[1 + 5 * i : 6 + 5 * i])
-        if not f > 0.0:
-            continue  # a camera that Bundler did not register
-        R, t = checked_pose(LOOKS_BACK @ np.array(rows[:3]), LOOKS_BACK @ rows[3])
-        size = _size_of(path.parent, names[i])
-        K = None
-        if size is not None:
-            centres[i] = (np.array(size) - 1.0) / 2.0
-            K = _calibration(f, f, *centres[i].tolist())
-        kept[i] = len(views)
-        views.append(SparseView(_name(names[i]), R, t, K, size, np.array([k1, k2, 0.0]), i))
-    return _bundler_points(words[1 + 5 * n :], points, views, (centres, kept))
-
-
-def _bundler_names(path: Path, n: int) -> list[str]:
-    if not path.is_file():
-        return [f"{i:06d}" for i in range(n)]
-    names = [line.split()[0] for line in read_text(path).splitlines() if line.strip()]
-    if len(names) < n:
-        raise ValueError(f"list.txt names {len(names)} of {n} images")
-    return names
-
-
-def _bundler_points(
-    lines: Sequence[list[str]], n: int, views: list[SparseView], of_camera: tuple[F64, Any]
-) -> SparseModel:
-    """The model with points, colours and the observations in images of known size."""
-    if len(lines) < 3 * n:
-        raise ValueError(f"it ends before its {n} points")
-    X = np.array([lines[3 * j] for j in range(n)], dtype=np.float64).reshape(n, 3)
-    colors = np.array([lines[3 * j + 1] for j in range(n)], dtype=np.float64).reshape(n, 3).astype(np.uint8)
-    seen = [np.array(lines[3 * j + 2][1:], dtype=np.float64).reshape(-1, 4) for j in range(n)]
-    point = np.repeat(np.arange(n), [len(rows) for rows in seen])
-    rows = np.concatenate([np.zeros((0, 4)), *seen])
-    centres, kept = of_camera
-    camera = rows[:, 0].astype(np.int64)
-    xy = centres[camera] + rows[:, 2:] * [1.0, -1.0]
-    known = np.isfinite(xy).all(axis=1) & (kept[camera] >= 0)
-    return SparseModel(views, X, colors, kept[camera[known]], point[known], xy[known])
-
-
-class _Bytes:
-    """Numbers, texts and arrays of a binary file, one after another."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content, self._at = content, 0
-
-    def take(self, form: str) -> tuple[Any, ...]:
-        values = struct.unpack_from(form, self._content, self._at)
-        self._at += struct.calcsize(form)
-        return values
-
-    def count(self) -> int:
-        (n,) = self.take("<Q")
-        if n > len(self._content):
-            raise ValueError(f"it claims {n} elements in {len(self._content)} bytes")
-        return int(n)
-
-    def text(self) -> str:
-        (value,) = self.take(f"{self.count()}s")
-        return str(value.decode("utf-8", "surrogateescape"))
-
-    def array(self, *shape: int) -> F64:
-        return np.array(self.take(f"<{math.prod(shape)}d")).reshape(shape)
-
-
-def read_openmvs(path: Path) -> SparseModel:
-    """Read ``scene.mvs`` ("MVSI", versions 1 to 6): cameras and points; their views have no pixels."""
-    b = _Bytes(read_bytes(path, largest=2**31))
-    magic, version, _ = b.take("<4sII")
-    if magic != b"MVSI" or version not in _MVS_VERSIONS:
-        known = f"MVSI {_MVS_VERSIONS[0]} to {_MVS_VERSIONS[-1]}"
-        raise ValueError(f"its format is {magic!r} {version}; known are {known}")
-    platforms = [_platform(b, version) for _ in range(b.count())]
-    views = []
-    for _ in range(b.count()):
-        name = b.text()
-        if version > 4:
-            b.text()  # mask
-        platform, camera, pose = b.take("<III")
-        if version > 2:
-            b.take("<I")
-        if pose == 2**32 - 1:
-            continue  # an image without a pose
-        cameras, poses = platforms[platform]
-        (K, size, R_camera, C_camera), (R, C) = cameras[camera], poses[pose]
-        R, centre = checked_pose(R_camera @ R, R.T @ C_camera + C)
-        views.append(SparseView(_name(name), R, -R @ centre, K, size, np.zeros(3), camera))
-    X = []
-    for _ in range(b.count()):
-        X.append(b.take("<3f"))
-        b.take(f"<{2 * b.count()}I")
-    return SparseModel(views, np.array(X, dtype=np.float64).reshape(-1, 3))
-
-
-def _platform(b: _Bytes, version: int) -> tuple[list[tuple[F64, tuple[int, int], F64, F64]], list[Any]]:
-    """Cameras (K, size, R, centre) and poses (R, centre) of a platform."""
-    b.text()
-    cameras = []
-    for _ in range(b.count()):
-        b.text()
-        if version > 3:
-            b.text()  # band
-        width, height = b.take("<II")
-        K, R, C = b.array(3, 3), b.array(3, 3), b.array(3)
-        # Without a size K is in units of the long side.
-        cameras.append((_calibration(K[0, 0], K[1, 1], K[0, 2], K[1, 2]), (width, height), R, C))
-    return cameras, [(b.array(3, 3), b.array(3)) for _ in range(b.count())]
 
 
 def read_middlebury(path: Path) -> SparseModel:

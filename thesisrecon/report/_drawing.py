@@ -12,6 +12,7 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.geometry.two_view import clip_line
 from thesisrecon.records import HeldOut, Image, TwoView
 
 Point = tuple[float, float]
@@ -93,16 +94,6 @@ def _spread_matches(xy: F64, count: int) -> I64:
     return np.array(chosen, dtype=np.int64)
 
 
-def _clip_line(line: F64, width: float, height: float) -> tuple[Point, Point] | None:
-    """Clip a line a x + b y + c = 0 to an image; None if it misses the image."""
-    a, b, c = (float(v) for v in line)
-    hits = [(x, -(a * x + c) / b) for x in (-0.5, width - 0.5) if b != 0]
-    hits += [(-(b * y + c) / a, y) for y in (-0.5, height - 0.5) if a != 0]
-    low = -0.5 - 1e-6 * max(width, height)
-    inside = [(x, y) for x, y in hits if low <= x <= width - 1 - low and low <= y <= height - 1 - low]
-    return (min(inside), max(inside)) if len(inside) >= 2 else None
-
-
 def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Image:
     """Draw dots, numbers and lines on one image; at twice the size, then reduced for smooth edges."""
     width, height = image.size
@@ -115,8 +106,8 @@ def _draw_half(image: Image, xy: F64, chosen: I64, lines: F64) -> PillowImage.Im
     for x, y in _to_drawing(xy, s):
         draw.ellipse((x - r, y - r, x + r, y + r), fill="#ffffff", outline="#1b2733")
     for n, line in enumerate(lines):
-        if (ends := _clip_line(line, width, height)) is not None:
-            draw.line([tuple(p) for p in _to_drawing(np.array(ends), s)], fill=HUES[n], width=3)
+        if (ends := clip_line(line, width, height)) is not None:
+            draw.line([tuple(p) for p in _to_drawing(ends, s)], fill=HUES[n], width=3)
     font = ImageFont.load_default(size=30)
     for n, (x, y) in enumerate(_to_drawing(xy[chosen], s)):
         draw.ellipse((x - 10, y - 10, x + 10, y + 10), fill=HUES[n], outline="#101418", width=3)

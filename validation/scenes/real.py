@@ -118,9 +118,8 @@ def with_known_cameras(scene: Scene, folder: Path) -> Scene:
 
 
 TRUTHS = (
-    *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "bundle.out", "scene.mvs", "camchain.yaml"),
-    *("sparse/0", "sparse", "dslr_calibration_undistorted", "cams", "cameras", "cal18"),
-    *("groundtruth.txt", "poses.txt"),
+    *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "camchain.yaml", "sparse/0", "sparse"),
+    *("dslr_calibration_undistorted", "cams", "cameras", "cal18", "groundtruth.txt", "poses.txt"),
 )
 
 
