@@ -81,10 +81,7 @@ def test_rectifying_warp(bench: Bench, method: str, photographs: tuple[Image, ..
     size = (rgb.shape[1], rgb.shape[0])
     H = np.array([[1.02, 0.03, -8.0], [-0.02, 1.01, 5.0], [1e-5, 2e-5, 1.0]])
     rectified = PlanarRectification(np.stack([H, np.eye(3)]), size)
-    calls = {
-        "ours": lambda: rectified.warp(rgb, 0),
-        "OpenCV": lambda: warp_perspective(rgb, H, size),
-    }
+    calls = {"ours": lambda: rectified.warp(rgb, 0), "OpenCV": lambda: warp_perspective(rgb, H, size)}
     bench("rectifying warp, 1024 x 768", method, calls[method])
 
 

@@ -66,7 +66,7 @@ html_theme_options = {
     "light_css_variables": {
         "font-stack": "system-ui, sans-serif",
         "font-stack--monospace": "ui-monospace, monospace",
-    },
+    }
 }
 pygments_style = "friendly"
 pygments_dark_style = "monokai"

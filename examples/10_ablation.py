@@ -31,11 +31,7 @@ class EveryMatch:
 
 
 default = thesisrecon.PipelineConfig().epipolar
-variants = [
-    replace(default, threshold_px=4.0),
-    "thesis-ransac",
-    EveryMatch(),
-]
+variants = [replace(default, threshold_px=4.0), "thesis-ransac", EveryMatch()]
 task = FundamentalOfCube(pairs=4, noise_px=0.5, outliers=0.3)
 study = Study({"epipolar": variants}, ["cube"], seeds=8, task=task, metrics=["distance_px"])
 with TemporaryDirectory() as folder:

@@ -11,13 +11,7 @@ import numpy as np
 
 from thesisrecon import arrays
 from thesisrecon.arrays import B8, F64, Record
-from thesisrecon.lens import (
-    Lens,
-    directions_of_image,
-    image_of_directions,
-    lens_row,
-    named_lens,
-)
+from thesisrecon.lens import Lens, directions_of_image, image_of_directions, lens_row, named_lens
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,14 +31,7 @@ from validation.runs.processes import own_cores
 from validation.runs.records import ReportOptions, load_images
 from validation.runs.report import run_tasks
 from validation.runs.results import Gate, Results, collect, read_gates, write_results
-from validation.runs.study import (
-    MODULES,
-    OF_PAGES,
-    progress_lines,
-    report_progress,
-    run_studies,
-    run_study,
-)
+from validation.runs.study import MODULES, OF_PAGES, progress_lines, report_progress, run_studies, run_study
 from validation.scenes.layout import SETS, lay_out
 from validation.stages import STAGES, available_scenes
 

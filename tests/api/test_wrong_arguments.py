@@ -213,20 +213,10 @@ CALLS = {
         lambda **given: tr.undistort_image(**{"image": LEFT, "camera": FRONT} | given),
         {"image": LEFT, "camera": FRONT, "K": K, "size": SIZE},
     ),
-    "undistort_points": (
-        lambda xy, K: tr.undistort_points(xy, CAMERAS[0], K),
-        {"xy": XY[0], "K": K},
-    ),
+    "undistort_points": (lambda xy, K: tr.undistort_points(xy, CAMERAS[0], K), {"xy": XY[0], "K": K}),
     "estimate_trifocal": (
         tr.estimate_trifocal,
-        {
-            "xy1": XY[0, :9],
-            "xy2": XY[1, :9],
-            "xy3": XY[2, :9],
-            "loss_px": 1.0,
-            "threshold_px": None,
-        }
-        | SEARCH,
+        {"xy1": XY[0, :9], "xy2": XY[1, :9], "xy3": XY[2, :9], "loss_px": 1.0, "threshold_px": None} | SEARCH,
     ),
     "epipolar_lines": (tr.epipolar_lines, {"F": F, "xy1": XY[0]}),
     "draw_epipolar_lines": (

@@ -9,11 +9,7 @@ import pytest
 from tests.epipolar.pairs import make_pair, spoil
 from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.camera import decompose_camera
-from thesisrecon.epipolar.ransac import (
-    ThesisRansac,
-    estimate_eight_point,
-    estimate_seven_point,
-)
+from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.epipolar.verification import classify_configuration
 from thesisrecon.errors import StageFailure

@@ -202,10 +202,7 @@ def test_the_command_reads_a_database_and_the_sparse_model_of_a_run(tmp_path, ca
 @pytest.mark.parametrize("orientation", [3, 6])
 def test_images_of_colmap_are_used_as_stored(tmp_path, from_rows, orientation):
     """COLMAP ignores the EXIF rotation; a run from its matches does so too, and says it to the export."""
-    database, exif = (
-        database_in(tmp_path),
-        PIL.Image.Exif(),
-    )
+    database, exif = (database_in(tmp_path), PIL.Image.Exif())
     exif[0x0112] = orientation
     pixels = np.zeros((480, 640, 3), np.uint8)
     pixels[:240, :, 0], pixels[240:, :, 1] = 200, 200

@@ -56,10 +56,7 @@ _DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] 
 }
 """Formats of cameras with distortion, which need no images."""
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
-_LENSES_OF = {
-    "opencv": ("radial", "brown", "rational", "fisheye"),
-    "kalibr": ("radial", "brown", "fisheye"),
-}
+_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
 """Lenses that a format has; others have all, or no distortion."""
 _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),

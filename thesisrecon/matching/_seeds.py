@@ -69,10 +69,7 @@ def _largest_by_lane(row: F32, largest: F32) -> None:
         largest[lane] = np.float32(-2.0)
     for first in range(0, whole, 4 * LANES):
         one, two = row[first : first + LANES], row[first + LANES : first + 2 * LANES]
-        three, four = (
-            row[first + 2 * LANES : first + 3 * LANES],
-            row[first + 3 * LANES : first + 4 * LANES],
-        )
+        three, four = (row[first + 2 * LANES : first + 3 * LANES], row[first + 3 * LANES : first + 4 * LANES])
         for lane in range(LANES):
             a = one[lane] if one[lane] > two[lane] else two[lane]
             b = three[lane] if three[lane] > four[lane] else four[lane]

@@ -12,12 +12,7 @@ from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.triangulation import triangulate_observations, triangulation_angles
 from thesisrecon.lens import ANGLE, DIVISION, PERSPECTIVE, fit_lens, straight_places, undistort
 from thesisrecon.optimize.bundle.partial import refine_points
-from thesisrecon.optimize.bundle.projection import (
-    LENS,
-    MetricCameras,
-    MetricModel,
-    image_points,
-)
+from thesisrecon.optimize.bundle.projection import LENS, MetricCameras, MetricModel, image_points
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, Tracks, Upgrade
 
 # Columns of a table of intrinsics: f, aspect, skew, cx, cy, k1, k2, k3.

@@ -13,13 +13,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.epipolar.division import (
-    bend,
-    estimate_division,
-    is_nearly_straight,
-    is_straight,
-    straighten,
-)
+from thesisrecon.epipolar.division import bend, estimate_division, is_nearly_straight, is_straight, straighten
 from thesisrecon.imaging.resampling import resampled
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.pipeline.run import Job, stream

@@ -23,12 +23,7 @@ from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.matching.pair_selection import reject_repeated_structure
-from thesisrecon.pipeline.large_sets import (
-    align_parts,
-    calibrate_with_core,
-    from_metric,
-    tracks_of_part,
-)
+from thesisrecon.pipeline.large_sets import align_parts, calibrate_with_core, from_metric, tracks_of_part
 from thesisrecon.pipeline.lens import straight_pair, straight_tracks
 from thesisrecon.pipeline.matching import build_tracks
 from thesisrecon.pipeline.run import Batch, Job, name_images, stream
