@@ -12,14 +12,7 @@ from thesisrecon import Camera, export
 from thesisrecon.camera import camera_of_row
 from thesisrecon.io._models import read_model
 from thesisrecon.lens import PERSPECTIVE, WIDTH, image_of_directions, lens_row, named_lens
-from thesisrecon.optimize.bundle.projection import (
-    Jacobians,
-    MetricModel,
-    Observations,
-    Weighting,
-    linearize_metric,
-    project_metric,
-)
+from thesisrecon.optimize.bundle import projection
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 KINDS = {
@@ -78,20 +71,20 @@ def test_derivatives_of_bundle_adjustment_are_those_of_the_projection(lens: Any)
     X = np.column_stack([rng.uniform(-1.5, 1.5, (n, 2)), rng.uniform(0.8, 3.0, n)])
     X[0, :2] = 1e-5  # near the axis the quotients of a fisheye lens are series
     q = np.concatenate([[500.0, 1.02, 3.0, 320.0, 240.0], lens_row(lens, k)[:7]])
-    model = MetricModel(np.eye(3)[None], np.zeros((1, 3)), q[None], np.zeros(1, int), X)
-    seen = Observations(np.zeros(n, int), np.arange(n), np.zeros((n, 2)))
+    model = projection.MetricModel(np.eye(3)[None], np.zeros((1, 3)), q[None], np.zeros(1, int), X)
+    seen = projection.Observations(np.zeros(n, int), np.arange(n), np.zeros((n, 2)))
     calibration = np.array([[500.0, 3.0, 320.0], [0.0, 510.0, 240.0]])
     expected = image_of_directions(X, lens_row(lens, k)) @ calibration[:, :2].T + calibration[:, 2]
-    np.testing.assert_allclose(project_metric(model, seen), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(projection.project_metric(model, seen), expected, rtol=0, atol=1e-9)
     columns = np.arange(11)
-    J = Jacobians.empty(n, 6 + len(columns), 0)
-    linearize_metric(model, seen, Weighting(1.0, np.inf), columns, np.zeros(0, int), J)
+    J = projection.Jacobians.empty(n, 6 + len(columns), 0)
+    projection.linearize_metric(model, seen, projection.Weighting(1.0, np.inf), columns, np.zeros(0, int), J)
 
     def central(make: Any, step: float = 1e-6) -> np.ndarray:
-        ends = [project_metric(make(sign * step), seen) for sign in (1, -1)]
+        ends = [projection.project_metric(make(sign * step), seen) for sign in (1, -1)]
         return np.asarray((ends[0] - ends[1]) / (2.0 * step))
 
-    def with_intrinsic(column: int, change: float) -> MetricModel:
+    def with_intrinsic(column: int, change: float) -> projection.MetricModel:
         row = q.copy()
         row[column] = row[column] * np.exp(change) if column == 0 else row[column] + change
         return model._replace(intrinsics=row[None])

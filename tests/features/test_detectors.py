@@ -8,30 +8,16 @@ from scipy.special import erf
 from tests.conftest import refuses
 from tests.constants import with_constants
 from tests.synthetic import photograph, texture
-from thesisrecon.features.harris import (
-    CornerMeasure,
-    HarrisCorners,
-    corner_response,
-    enforce_spacing,
-    fit_maxima,
-    select_spread,
-)
-from thesisrecon.features.multiscale import (
-    PATCH_VALUES,
-    MultiScaleCorners,
-    _low_frequencies,
-    _normalize_patches,
-    simulate_view,
-)
+from thesisrecon.features import harris, multiscale
 from thesisrecon.imaging.resampling import gaussian_taps
 from thesisrecon.records import Image
 
-HARRIS = CornerMeasure(formula="harris", integration_sigma_px=1.0, colour=True)
+HARRIS = harris.CornerMeasure(formula="harris", integration_sigma_px=1.0, colour=True)
 VARIANTS = [
-    HarrisCorners(),
-    MultiScaleCorners(),
-    HarrisCorners(selection="spread", measure=HARRIS),
-    MultiScaleCorners(measure=HARRIS),
+    harris.HarrisCorners(),
+    multiscale.MultiScaleCorners(),
+    harris.HarrisCorners(selection="spread", measure=HARRIS),
+    multiscale.MultiScaleCorners(measure=HARRIS),
 ]
 
 
@@ -42,7 +28,7 @@ def chessboard(dx, dy):
 
 
 @pytest.mark.parametrize(
-    "variant", [HarrisCorners(), with_constants(MultiScaleCorners, upsample_below_px=0)()]
+    "variant", [harris.HarrisCorners(), with_constants(multiscale.MultiScaleCorners, upsample_below_px=0)()]
 )
 @pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4)])
 def test_a_corner_is_found_between_the_pixels(variant, dx, dy):
@@ -92,12 +78,12 @@ def test_tiny_blank_and_noisy_images_do_no_harm(variant, size, kind):
 
 def test_thesis_corners_keep_their_distance_their_number_and_the_strongest():
     image = photograph(texture(300, 400))
-    xy = with_constants(HarrisCorners, spacing_rel=0.02)(max_corners=150).detect(image).xy
+    xy = with_constants(harris.HarrisCorners, spacing_rel=0.02)(max_corners=150).detect(image).xy
     assert len(xy) == 150
     assert pdist(xy).min() >= 0.02 * 400
-    everything = with_constants(HarrisCorners, spacing_rel=0.0)(10**6, 0.0).detect(image).xy
+    everything = with_constants(harris.HarrisCorners, spacing_rel=0.0)(10**6, 0.0).detect(image).xy
     for selection in ("spacing", "spread"):
-        xy = HarrisCorners(max_corners=100, selection=selection).detect(image).xy
+        xy = harris.HarrisCorners(max_corners=100, selection=selection).detect(image).xy
         assert len(xy) == 100 < len(everything)
         assert np.array_equal(xy[0], everything[0])
 
@@ -105,16 +91,18 @@ def test_thesis_corners_keep_their_distance_their_number_and_the_strongest():
 def test_corners_that_are_spread_cover_the_image_though_one_side_is_faint():
     gray = texture(400, 1100)
     gray[:, 550:] = 128 + 0.15 * (gray[:, 550:] - 128)
-    features = MultiScaleCorners(full_corners=600, half_corners=300).detect(photograph(gray))
+    features = multiscale.MultiScaleCorners(full_corners=600, half_corners=300).detect(photograph(gray))
     assert (features.xy[:, 0] > 560).mean() > 0.1
-    strongest = MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(photograph(gray))
+    strongest = multiscale.MultiScaleCorners(full_corners=600, half_corners=0, spread=False).detect(
+        photograph(gray)
+    )
     assert set(strongest.scale.tolist()) == {1.0}
     assert (strongest.xy[:, 0] > 560).mean() < 0.05
 
 
 @pytest.mark.parametrize(("width", "scales"), [(420, {0.5, 1.0}), (1040, {1.0, 2.0})])
 def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width, scales):
-    features = MultiScaleCorners().detect(photograph(texture(300, width)))
+    features = multiscale.MultiScaleCorners().detect(photograph(texture(300, width)))
     assert set(features.scale.tolist()) == scales
     seeds = features.seeds
     assert seeds is not None
@@ -126,7 +114,7 @@ def test_two_sizes_and_seeds_twice_in_the_pixels_of_the_photograph(width, scales
 
 def test_turned_patches_turn_with_the_photograph():
     gray = texture(301, 301, 8)
-    one, two = (MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray)))
+    one, two = (multiscale.MultiScaleCorners().detect(photograph(g)).seeds for g in (gray, np.rot90(gray)))
     first, second = one.angle != 0, two.angle != 0
     # np.rot90 takes pixel (x, y) to (y, width - 1 - x).
     moved = np.stack([one.xy[first, 1], 300 - one.xy[first, 0], one.scale[first]], 1)[::7]
@@ -139,18 +127,18 @@ def test_turned_patches_turn_with_the_photograph():
 def test_patches_are_their_low_frequencies_whatever_the_exposure():
     rows = np.random.default_rng(0).normal(100, 20, (5, 64)).astype(np.float32)
     flat = np.full((1, 64), 70.0, np.float32)
-    patches, structured = _normalize_patches(np.concatenate([rows, 0.5 * rows + 30, flat]))
+    patches, structured = multiscale._normalize_patches(np.concatenate([rows, 0.5 * rows + 30, flat]))
     assert structured.tolist() == [True] * 10 + [False]
     assert patches[:5] == pytest.approx(patches[5:10], abs=1e-5)
-    waves = _low_frequencies()
-    assert waves.T @ waves == pytest.approx(np.eye(PATCH_VALUES), abs=1e-6)
+    waves = multiscale._low_frequencies()
+    assert waves.T @ waves == pytest.approx(np.eye(multiscale.PATCH_VALUES), abs=1e-6)
     checkerboard = (-1.0) ** np.add(*np.indices((8, 8))).ravel()
     assert np.abs(checkerboard @ waves).max() < 0.2 * np.linalg.norm(checkerboard)
 
 
 @pytest.mark.parametrize("formula", ["noble", "harris"])
 def test_both_formulas_find_the_same_corner_and_no_edge(formula):
-    measure = CornerMeasure(formula=formula)
+    measure = harris.CornerMeasure(formula=formula)
     xy, response = measure._find(chessboard(0.3, -0.2).gray[None])
     # det - k trace^2 has the flatter top.
     assert np.linalg.norm(xy[0] - (60.3, 49.8)) < (0.25 if formula == "noble" else 0.5)
@@ -160,18 +148,22 @@ def test_both_formulas_find_the_same_corner_and_no_edge(formula):
 def test_colour_and_surface_fits_find_more_and_nearer_corners():
     """Red and green squares of one luminance; a grey photograph has the same response in colour."""
     image = photograph(texture(90, 110))
-    one, three = (m._response(m._channels(image)) for m in (CornerMeasure(), CornerMeasure(colour=True)))
+    one, three = (
+        m._response(m._channels(image)) for m in (harris.CornerMeasure(), harris.CornerMeasure(colour=True))
+    )
     assert np.abs(one - three).max() < 1e-4 * one.max()
     board = chessboard(0.0, 0.0).rgb[:, :, 0] > 128
     rgb = np.where(board[:, :, None], np.array([200, 60, 90]), np.array([50, 136, 91])).astype(np.uint8)
     image = Image("a.png", rgb, (120, 100))
-    found = {c: HarrisCorners(measure=CornerMeasure(colour=c)).detect(image) for c in (False, True)}
+    found = {
+        c: harris.HarrisCorners(measure=harris.CornerMeasure(colour=c)).detect(image) for c in (False, True)
+    }
     assert found[False].response.max(initial=0.0) < 0.01 * found[True].response.max()
     assert np.linalg.norm(found[True].xy[0] - (60.0, 50.0)) < 3.0
     error = {False: [], True: []}
     for corner in np.random.default_rng(1).uniform(-0.5, 0.5, (12, 2)):
         for subpixel, reported in error.items():
-            xy, _ = CornerMeasure(subpixel=subpixel)._find(chessboard(*corner).gray[None])
+            xy, _ = harris.CornerMeasure(subpixel=subpixel)._find(chessboard(*corner).gray[None])
             assert subpixel or not (xy % 1.0).any()
             reported.append(np.linalg.norm(xy[0] - (60, 50) - corner))
     assert np.mean(error[True]) < 0.5 * np.mean(error[False])
@@ -179,10 +171,10 @@ def test_colour_and_surface_fits_find_more_and_nearer_corners():
 
 def test_a_detector_or_measure_that_cannot_be_is_refused():
     for kind, field, value in (
-        (HarrisCorners, "max_corners", 0), (HarrisCorners, "threshold_rel", 2.0),
-        (HarrisCorners, "threshold_rel", np.nan), (MultiScaleCorners, "full_corners", -1),
-        (MultiScaleCorners, "levels", 0), (MultiScaleCorners, "levels", 2),
-        (CornerMeasure, "integration_sigma_px", 0.0),
+        (harris.HarrisCorners, "max_corners", 0), (harris.HarrisCorners, "threshold_rel", 2.0),
+        (harris.HarrisCorners, "threshold_rel", np.nan), (multiscale.MultiScaleCorners, "full_corners", -1),
+        (multiscale.MultiScaleCorners, "levels", 0), (multiscale.MultiScaleCorners, "levels", 2),
+        (harris.CornerMeasure, "integration_sigma_px", 0.0),
     ):  # fmt: skip
         refuses(ValueError, field, kind, **{field: value})
 
@@ -191,7 +183,7 @@ def test_a_detector_or_measure_that_cannot_be_is_refused():
 def test_a_simulated_view_shows_each_pixel_where_it_says(enlargement):
     y, x = np.mgrid[:90, :140]
     blob = 200.0 * np.exp(-((x - 85.3) ** 2 + (y - 40.6) ** 2) / 18.0)
-    view = simulate_view(blob.astype(np.float32), 2.0, 0.7, enlargement)
+    view = multiscale.simulate_view(blob.astype(np.float32), 2.0, 0.7, enlargement)
     row, column = np.mgrid[: view.gray.shape[0], : view.gray.shape[1]]
     middle = np.array([(column * view.gray).sum(), (row * view.gray).sum()]) / view.gray.sum()
     assert np.abs(middle - (view.to_view @ [85.3, 40.6] + view.offset)).max() < 0.05
@@ -204,7 +196,7 @@ def test_a_simulated_view_shows_each_pixel_where_it_says(enlargement):
 def test_corner_response_is_that_of_the_moments_summed_over_the_channels(trace_weight, derivative, count):
     channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
     taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
-    found = corner_response(channels, along, taps, trace_weight)
+    found = harris.corner_response(channels, along, taps, trace_weight)
     gx, gy = (correlate1d(channels.astype(np.float64), along, axis=axis) for axis in (2, 1))
     a, m, c = (
         convolve1d(convolve1d(product.sum(axis=0), taps, axis=0), taps, axis=1)
@@ -224,7 +216,7 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
     response = (
         gaussian_filter(np.random.default_rng(2).normal(size=(50, 70)), 1.5).astype(np.float32) * 500 + 130
     )
-    xy, value = fit_maxima(response, 130.0)
+    xy, value = harris.fit_maxima(response, 130.0)
     top = (maximum_filter(response, 3) == response) & (response > 130.0)
     top[0] = top[-1] = top[:, 0] = top[:, -1] = False
     assert len(xy) == top.sum()
@@ -242,7 +234,7 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
 
 def test_selected_corners_are_apart_or_spread():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
-    kept = enforce_spacing(xy, np.arange(400), 6.0)
+    kept = harris.enforce_spacing(xy, np.arange(400), 6.0)
     assert pdist(xy[kept]).min() >= 6.0
     for dropped in np.setdiff1d(np.arange(400), kept):
         assert np.linalg.norm(xy[kept[kept < dropped]] - xy[dropped], axis=1).min() < 6.0
@@ -251,6 +243,6 @@ def test_selected_corners_are_apart_or_spread():
     xy, response = rng.uniform(0, 300, (68, 2)), np.sort(rng.exponential(size=68))[::-1]
     distance = np.linalg.norm(xy[:, None] - xy[None], axis=2)
     radius = np.where(0.9 * response[None] > response[:, None], distance, np.inf).min(axis=1)
-    kept = select_spread(xy, response.astype(np.float32), 40)
+    kept = harris.select_spread(xy, response.astype(np.float32), 40)
     assert set(kept.tolist()) == set(np.argsort(-radius, kind="stable")[:40].tolist())
     assert (np.diff(kept) > 0).all()

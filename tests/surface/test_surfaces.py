@@ -17,14 +17,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.imaging.raster import rasterize
 from thesisrecon.records import DepthMap, TexturedMesh
-from thesisrecon.surface import _simplification, fusion
-from thesisrecon.surface._mesh import (
-    connected_parts,
-    face_areas,
-    halve_surface,
-    remove_small_parts,
-    surface_from_depth,
-)
+from thesisrecon.surface import _mesh, _simplification, fusion
 from thesisrecon.surface._simplification import _merge_in_cells, reduce_faces, simplify_surface
 from thesisrecon.surface.bspline import BSplineSurface, _basis, _energies
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion, _incidence_cosines
@@ -59,7 +52,7 @@ def test_the_fused_sphere_is_round_closed_and_outward():
     sides = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(sides[seen[sides].all(axis=1)], axis=0, return_counts=True)
     assert (count == 2).mean() > 0.999
-    assert face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi, rel=0.05)
+    assert _mesh.face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi, rel=0.05)
 
 
 def test_fusion_averages_noise(ring):
@@ -121,7 +114,7 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     P = looking_at_origin(0.3, 0.0, 3.5)
     given = sphere_map(0, P)
     behind = np.where(np.isnan(given.depth), np.float32(6.0), given.depth)
-    mesh = surface_from_depth(replace(given, depth=behind))
+    mesh = _mesh.surface_from_depth(replace(given, depth=behind))
     x, y = np.rint(project(P, mesh.vertices)).astype(int).T
     np.testing.assert_allclose(mesh.vertices @ P[2, :3] + P[2, 3], behind[y, x], rtol=1e-6)
     on_sphere = (np.linalg.norm(mesh.vertices, axis=1) < 1.01)[mesh.faces]
@@ -130,16 +123,16 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     centre = -np.linalg.solve(P[:, :3], P[:, 3])
     assert ((np.cross(b - a, c - a) * (centre - a)).sum(1) > 0).all()
-    assert len(np.unique(connected_parts(mesh.faces, len(mesh.vertices)))) == 2
+    assert len(np.unique(_mesh.connected_parts(mesh.faces, len(mesh.vertices)))) == 2
 
 
 def test_holes_stay_holes_and_steps_thin_out():
     given = sphere_map(0, looking_at_origin(0.0, 0.0, 3.5))
-    full, coarse = surface_from_depth(given), surface_from_depth(given, step=3)
+    full, coarse = _mesh.surface_from_depth(given), _mesh.surface_from_depth(given, step=3)
     assert len(coarse.faces) == pytest.approx(len(full.faces) / 9, rel=0.15)
     depth = given.depth.copy()
     depth[55:65, 75:85] = np.nan
-    holed = surface_from_depth(replace(given, depth=depth))
+    holed = _mesh.surface_from_depth(replace(given, depth=depth))
     assert len(full.faces) - len(holed.faces) == 2 * 11 * 11 - 4  # the corners keep a half
 
 
@@ -147,12 +140,12 @@ def test_crumbs_are_dropped():
     grid = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     vertices, colors = np.concatenate([grid, 0.01 * grid + 5.0]), np.arange(24, dtype=np.uint8).reshape(8, 3)
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
-    mesh = remove_small_parts(TexturedMesh(vertices, faces, colors=colors))
+    mesh = _mesh.remove_small_parts(TexturedMesh(vertices, faces, colors=colors))
     assert len(mesh.vertices) == 4
     np.testing.assert_array_equal(mesh.faces, faces[:2])
     np.testing.assert_array_equal(mesh.colors, colors[:4])
     empty = TexturedMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    assert remove_small_parts(empty) is empty
+    assert _mesh.remove_small_parts(empty) is empty
 
 
 def test_sheets_show_each_place_once(ring):
@@ -161,7 +154,7 @@ def test_sheets_show_each_place_once(ring):
     assert np.abs(radius - 1.0).max() < 1e-3
     assert (outward(mesh) > 0.0).all()
     # The sphere but for its outline in each view, with some overlap and no more.
-    assert 0.9 * 4 * np.pi < face_areas(mesh.vertices, mesh.faces).sum() < 1.25 * 4 * np.pi
+    assert 0.9 * 4 * np.pi < _mesh.face_areas(mesh.vertices, mesh.faces).sum() < 1.25 * 4 * np.pi
     one, two = (DepthSheets(step=3).fuse(ring, threads=n) for n in (1, 2))
     np.testing.assert_array_equal(one.vertices, two.vertices)
     assert len(one.faces) == pytest.approx(len(mesh.faces) / 9, rel=0.25)
@@ -247,16 +240,16 @@ def test_the_surface_is_halved_into_compact_parts_of_bounded_size():
     sphere = fused_sphere()
     size = np.random.default_rng(4).integers(0, 9, len(sphere.faces))
     size[7] = 5000  # one face is not cut
-    part = halve_surface(sphere, size, 900)
+    part = _mesh.halve_surface(sphere, size, 900)
     sums, middle = np.bincount(part, size), sphere.vertices[sphere.faces].mean(axis=1)
     assert (np.sort(sums)[:-1] <= 900).all()
     assert sums[part[7]] >= 5000
     assert len(sums) < 4 * size.sum() / 900
     spread = [np.ptp(middle[part == k], axis=0).max(initial=0.0) for k in range(len(sums))]
     assert np.median(spread) < 0.6 * np.ptp(middle, axis=0).max()
-    assert halve_surface(sphere, size, 10**9).max() == 0
+    assert _mesh.halve_surface(sphere, size, 10**9).max() == 0
     together = replace(sphere, vertices=np.zeros_like(sphere.vertices))
-    assert np.bincount(halve_surface(together, np.ones(len(size), int), 100)).max() <= 100
+    assert np.bincount(_mesh.halve_surface(together, np.ones(len(size), int), 100)).max() <= 100
 
 
 def grid(height, steps=60):
@@ -281,7 +274,7 @@ def sides(faces):
 def points_on(mesh, count=20_000):
     """Random points of a mesh."""
     rng = np.random.default_rng(0)
-    area = face_areas(mesh.vertices, mesh.faces)
+    area = _mesh.face_areas(mesh.vertices, mesh.faces)
     corners = mesh.vertices[mesh.faces[rng.choice(len(area), count, p=area / area.sum())]]
     return (corners * rng.dirichlet([1, 1, 1], count)[:, :, None]).sum(axis=1)
 
@@ -290,7 +283,7 @@ def test_a_plane_keeps_its_outline_and_few_faces():
     plane = grid(lambda x, y: 0.3 * x + 0.2 * y)
     small = simplified(plane, 1e-4)
     assert len(small.faces) < 0.05 * len(plane.faces)
-    area, before = (face_areas(mesh.vertices, mesh.faces).sum() for mesh in (small, plane))
+    area, before = (_mesh.face_areas(mesh.vertices, mesh.faces).sum() for mesh in (small, plane))
     assert area == pytest.approx(before, abs=4e-4)
     np.testing.assert_allclose(small.vertices @ [0.3, 0.2, -1.0], 0.0, atol=1e-6)
     corners = np.array([[0, 0, 0], [1, 0, 0.3], [0, 1, 0.2], [1, 1, 0.5]])
@@ -347,7 +340,7 @@ def thin_wall(thickness, steps=60):
 def test_thin_walls_keep_both_sides_and_merged_faces_are_distinct():
     small = simplified(thin_wall(0.02), 1e-3)
     # The eight sides recede by less than half the limit.
-    assert face_areas(small.vertices, small.faces).sum() == pytest.approx(2.0, abs=8 * 0.5e-3)
+    assert _mesh.face_areas(small.vertices, small.faces).sum() == pytest.approx(2.0, abs=8 * 0.5e-3)
     assert set(np.round(small.vertices[:, 2] / 0.02, 2)) == {0.0, 1.0}
     small = _merge_in_cells(thin_wall(0.01, 40), 400)
     assert 100 < len(small.faces) <= 400

@@ -33,18 +33,13 @@ from thesisrecon.arrays import (
 from thesisrecon.camera import Camera
 from thesisrecon.errors import counted, require_word
 from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.optimize.bundle import metric
 from thesisrecon.optimize.bundle.knowledge import (
     LOSSES,
     NO_PRIOR,
     BundleKnowledge,
     PositionPrior,
     remaining_gauge,
-)
-from thesisrecon.optimize.bundle.metric import (
-    MAX_SIGMAS_TO_MINIMUM,
-    BundleOptions,
-    MetricBundleResult,
-    refine_metric_bundle,
 )
 from thesisrecon.optimize.bundle.projection import (
     POSE_DOF,
@@ -96,7 +91,7 @@ class BundleAdjustment(Record):
     @property
     def converged(self) -> bool:
         """Whether another adjustment would move no camera parameter by a tenth of its standard deviation."""
-        return self.sigmas_to_minimum <= MAX_SIGMAS_TO_MINIMUM
+        return self.sigmas_to_minimum <= metric.MAX_SIGMAS_TO_MINIMUM
 
     @property
     def centre_covariance(self) -> F64:
@@ -261,7 +256,7 @@ def _noise_options(loss: str, loss_px: Any, sigma_px: Any, most: int) -> tuple[f
 def _adjusted(
     start: MetricCameras, X: F64, observed: Observations,
     unknown: tuple[B8, IntrinsicsPrior, BundleKnowledge], noise: tuple[float | None, float | None], most: int,
-) -> tuple[MetricBundleResult, float]:  # fmt: skip
+) -> tuple[metric.MetricBundleResult, float]:  # fmt: skip
     """The adjustment, and the weight of its last pass over the noise found.
 
     First passes estimate noise that is not given: the weight of the prior and the width depend on it. For a
@@ -280,11 +275,11 @@ def _adjusted(
         loss_px = LOSSES[known.loss][1] * found if width is None else width
         if known.loss == "squared":
             loss_px = np.inf if plain else found
-        options = BundleOptions(
+        options = metric.BundleOptions(
             sigma_px=found, loss_px=loss_px, max_iterations=most, settled=1e-6, covariance=last,
             point_covariance=last,
         )  # fmt: skip
-        fit = refine_metric_bundle(
+        fit = metric.refine_metric_bundle(
             start, X, observed, free=free, prior=prior, options=options, knowledge=None if plain else known
         )
         start, X, weight, found = fit.cameras, fit.X, found, max(fit.sigma_px, 1e-6)
@@ -499,7 +494,7 @@ def _misfit(residual: F64) -> float:
     return float(np.median(np.linalg.norm(residual, axis=1)))
 
 
-def _warn_of_implausible(views: Sequence[Camera], fit: MetricBundleResult) -> None:
+def _warn_of_implausible(views: Sequence[Camera], fit: metric.MetricBundleResult) -> None:
     """Warn of focal lengths beyond those of cameras, if they began within, and of very large residuals."""
     longest = np.array([max(view.size) for view in views])
     before, after = np.array([view.K[0, 0] for view in views]) / longest, fit.cameras.K[:, 0, 0] / longest

@@ -26,15 +26,9 @@ from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh,
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.rectification import PlanarRectification
+from thesisrecon.views import tensor
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 from thesisrecon.views.render import Shading, render_mesh
-from thesisrecon.views.tensor import (
-    TensorSynthesis,
-    VirtualCamera,
-    default_intrinsics,
-    pair_from_fundamental,
-    prepare_synthesis,
-)
 
 _COARSE = 4
 """Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
@@ -230,7 +224,7 @@ def match_images(image1: Any, image2: Any, *, config: Config | None = None, seed
 
 def prepare_trilinear_views(
     found: MatchedImages, *, K: ArrayLike | None = None, config: Config | None = None
-) -> TensorSynthesis:
+) -> tensor.TensorSynthesis:
     """Prepare two matched images for views of any camera by the trilinear tensor (section 1.3).
 
     ``render(camera)`` of the result computes a view. K (3, 3) or (2, 3, 3) are the intrinsics in pixels of
@@ -240,10 +234,10 @@ def prepare_trilinear_views(
     """
     config = as_config(config)
     K1, K2 = _intrinsics(found, K, config)
-    pair = pair_from_fundamental(found.pair.F, found.pair.xy1, found.pair.xy2, K1=K1, K2=K2)
+    pair = tensor.pair_from_fundamental(found.pair.F, found.pair.xy1, found.pair.xy2, K1=K1, K2=K2)
     first, second = found.images
     places = found.dense.correspondences(0, first.size), found.dense.correspondences(1, second.size)
-    return prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=found.dense.gain)
+    return tensor.prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=found.dense.gain)
 
 
 def synthesize_view(
@@ -293,10 +287,10 @@ def synthesize_view(
     # Checked before the matching, which takes minutes.
     rotation, translation = arrays.numbers("synthesize_view", rotation=rotation, translation=translation)
     _given_intrinsics(K)
-    VirtualCamera(rotation, translation, np.eye(3), (1, 1))
+    tensor.VirtualCamera(rotation, translation, np.eye(3), (1, 1))
     found = match_images(image1, image2, config=config, seed=seed)
     views = prepare_trilinear_views(found, K=K, config=config)
-    return views.render(VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
+    return views.render(tensor.VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
 
 
 def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
@@ -323,7 +317,7 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
     prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
     both = []
     for image, (f, aspect, skew, u, v, _) in zip(found.images, prior.tolist(), strict=True):
-        f = f if np.isfinite(f) else float(default_intrinsics(image.size)[0, 0])
+        f = f if np.isfinite(f) else float(tensor.default_intrinsics(image.size)[0, 0])
         both.append(calibration_matrix(f, aspect * f, u, v, skew=skew))
     return both[0], both[1]
 

@@ -17,16 +17,10 @@ from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
+from thesisrecon.pipeline import outputs
 from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
 from thesisrecon.pipeline.lens import as_imaged
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
-from thesisrecon.pipeline.outputs import (
-    REPLACED_FILES,
-    RESULT_FILES,
-    WRITTEN_FILES,
-    best_result,
-    write_outputs,
-)
 from thesisrecon.pipeline.run import Job, Run, name_images, stream
 from thesisrecon.pipeline.stages import (
     better_model,
@@ -125,7 +119,7 @@ def metric_cameras(
         # Another start may keep the images that were left out.
         elif found.metric and found.metric.trusted and "views_left_out" not in found.metric.self_check:
             break
-    best = best_result(tried)
+    best = outputs.best_result(tried)
     yield best
     report_projective(job, best)
     if best.metric is None or best.calibration is None:
@@ -222,7 +216,7 @@ def run_job(job: Job) -> RunResult:
     result, failure = _last_named(job)
     if job.until not in ("features", "matches"):
         result = _with_further_models(job, result)
-    result = write_outputs(job.run, result, until=job.until, failure=failure)
+    result = outputs.write_outputs(job.run, result, until=job.until, failure=failure)
     if failure is not None:
         raise failure
     return result
@@ -249,9 +243,9 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
             places |= {i: name for i, there in zip(views, model.registered, strict=True) if there}
             further.append(found)
     for number in count(len(run.groups) + 2):
-        if not (folder / f"group-{number}" / RESULT_FILES[0]).exists():
+        if not (folder / f"group-{number}" / outputs.RESULT_FILES[0]).exists():
             break
-        RunDirectory(folder / f"group-{number}").remove(RESULT_FILES)
+        RunDirectory(folder / f"group-{number}").remove(outputs.RESULT_FILES)
     here = result.best_reconstruction
     if here is not None and job.until != "projective":
         # Images in no model that accepted pairs connect with one.
@@ -296,7 +290,7 @@ def _run_group(whole: Job, result: RunResult, name: str, views: Sequence[int]) -
     part = _part_of(whole, result, directory, views)
     known, identity = part.prior, identity_of(part.run, part.inputs)
     with directory.claim(identity, overwrite=True):
-        directory.adopt(identity, overwrite=True, results=RESULT_FILES)
+        directory.adopt(identity, overwrite=True, results=outputs.RESULT_FILES)
         found, failure = _last_named(part)
         alone = replace(part, run=whole.run.inside(directory), known=None)
         # Images of equal size may have another zoom.
@@ -304,7 +298,7 @@ def _run_group(whole: Job, result: RunResult, name: str, views: Sequence[int]) -
         if refuted and part.until != "projective":
             part = alone
             found, failure = _last_named(part)
-        found = write_outputs(part.run, found, until=part.until, failure=failure)
+        found = outputs.write_outputs(part.run, found, until=part.until, failure=failure)
     facts = {fact: found.summary[fact] for fact in ("images", "registered", "trusted", "failure")}
     model = found.best_reconstruction
     there = [model is not None and bool(model.registered[k]) for k in range(len(views))]
@@ -331,7 +325,9 @@ def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResu
 @contextmanager
 def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Iterator[None]:
     """Start the workers and lock the output folder of a run."""
-    claim = run.directory.claim(_settings_identity(run, source), overwrite=overwrite, results=WRITTEN_FILES)
+    claim = run.directory.claim(
+        _settings_identity(run, source), overwrite=overwrite, results=outputs.WRITTEN_FILES
+    )
     with run.workers, claim, run.resumable():
         yield
 
@@ -339,7 +335,7 @@ def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Itera
 def run_adopted(job: Job, *, overwrite: bool, source: Source | None = None) -> RunResult:
     """Make the output folder that of this job, and run it."""
     identity = identity_of(job.run, job.inputs, source)
-    job.run.directory.adopt(identity, overwrite=overwrite, results=REPLACED_FILES)
+    job.run.directory.adopt(identity, overwrite=overwrite, results=outputs.REPLACED_FILES)
     return run_job(job)
 
 

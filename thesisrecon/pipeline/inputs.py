@@ -20,16 +20,9 @@ from thesisrecon.io._files import require_image_name
 from thesisrecon.matching._prepared import select_found
 from thesisrecon.matching.tracks import corners_from_matches
 from thesisrecon.optimize.bundle.projection import Observations, read_observations, sort_observations
+from thesisrecon.pipeline import matching
 from thesisrecon.pipeline.large_sets import tracks_of_part
 from thesisrecon.pipeline.lens import bent_pair, lens_of_matches, straight_matches
-from thesisrecon.pipeline.matching import (
-    FromImages,
-    report_choice,
-    report_given,
-    report_matches,
-    values_at,
-    verify_matches,
-)
 from thesisrecon.pipeline.run import Batch, Job, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Tracks, TwoView, common_points
 from thesisrecon.runtime._run_folder import key_of
@@ -76,7 +69,7 @@ class Given:
         key = job.run.key("pairs", "given", pairs)
         compute = partial(PairChoice, pairs, "the pairs with matches")
         choice: PairChoice = job.run.cached("pairs", "choice", key, compute)
-        report_choice(job, choice)
+        matching.report_choice(job, choice)
         return choice
 
     def lens(self, job: Job) -> F64 | None:
@@ -102,16 +95,16 @@ class Given:
                 for n, s in zip(missing, sizes, strict=True)
             )
 
-        return report_matches(job, run.map_cached("matches", keys, _verify, batches))
+        return matching.report_matches(job, run.map_cached("matches", keys, _verify, batches))
 
     def track(
         self, job: Job, views: Sequence[Any], pairs: Sequence[TwoView], among: Sequence[int] | None = None
     ) -> Tracks:
         """The given tracks, or those of the matches."""
         if self.tracks is None:
-            return FromImages().track(job, views, pairs)
+            return matching.FromImages().track(job, views, pairs)
         some = self.tracks if among is None else tracks_of_part(self.tracks, np.array(among))
-        return report_given(job.run, some, pairs)
+        return matching.report_given(job.run, some, pairs)
 
 
 @dataclass(frozen=True)
@@ -335,7 +328,7 @@ def outside_masks(given: Given, images: Sequence[Image]) -> Given:
     if all(image.mask is None for image in images):
         return given
     clear = [
-        np.ones(len(xy), bool) if image.mask is None else values_at(image.mask, xy)
+        np.ones(len(xy), bool) if image.mask is None else matching.values_at(image.mask, xy)
         for image, xy in zip(images, given.corners, strict=True)
     ]
     matches = [select_found(m, clear[m.i][m.index1] & clear[m.j][m.index2]) for m in given.matches]
@@ -370,5 +363,7 @@ def _verify(
 ) -> list[TwoView]:
     rng = stream(seed, "matches", matches.i, matches.j)
     if lens is None:
-        return [verify_matches(config, matches, rng)]
-    return [bent_pair(verify_matches(config, straight_matches(matches, sizes, lens), rng), sizes, lens)]
+        return [matching.verify_matches(config, matches, rng)]
+    return [
+        bent_pair(matching.verify_matches(config, straight_matches(matches, sizes, lens), rng), sizes, lens)
+    ]

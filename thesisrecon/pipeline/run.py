@@ -16,20 +16,12 @@ from typing import Any, Literal, Protocol, TypedDict, get_args
 
 import numpy as np
 
+from thesisrecon import errors
 from thesisrecon._numba import code_digest
 from thesisrecon.arrays import F64, I64, flag, whole_number
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
 from thesisrecon.config.text import table_from_dataclass, tables_from_config
-from thesisrecon.errors import (
-    Notice,
-    OutputError,
-    StageFailure,
-    UsageError,
-    WorkersLost,
-    counted,
-    unknown_word,
-)
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.io._files import as_path, read_json
 from thesisrecon.io._images import ImageSet
@@ -68,7 +60,7 @@ def stream(seed: int, stage: str, *ids: int) -> np.random.Generator:
 
 def _checked_seed(seed: Any) -> int:
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
+        raise errors.UsageError(f"the seed must be a whole number of at least 0; got {seed!r}")
     return int(seed)
 
 
@@ -155,7 +147,7 @@ class Run:
             yield record
         if changed:
             more, were = (f" and {len(changed) - 1} more", "were") if len(changed) > 1 else ("", "was")
-            self.warnings.append(Notice("changed-files", changed[0], more, were, were))
+            self.warnings.append(errors.Notice("changed-files", changed[0], more, were, were))
 
     def map_cached(
         self, stage: str, keys: Mapping[str, str], function: Callable[..., Sequence[Any]],
@@ -173,7 +165,7 @@ class Run:
 
             def stored(n: int) -> Any:
                 if (record := folder.load(names[n], keys[names[n]])) is None:
-                    raise UsageError(Notice("record-lost", folder.path / f"{names[n]}.npz"))
+                    raise errors.UsageError(errors.Notice("record-lost", folder.path / f"{names[n]}.npz"))
                 return record
 
             records = OnDemand(len(names), stored, max_bytes)
@@ -208,10 +200,12 @@ class Run:
         """Add resume advice to the error if workers are lost or a file cannot be written in the block."""
         try:
             yield
-        except WorkersLost as lost:
-            raise WorkersLost(Notice("workers-lost", lost, self._stage, self.directory.path)) from None
-        except OutputError as refused:
-            raise OutputError(refused.place, refused.error, self.directory.path) from None
+        except errors.WorkersLost as lost:
+            raise errors.WorkersLost(
+                errors.Notice("workers-lost", lost, self._stage, self.directory.path)
+            ) from None
+        except errors.OutputError as refused:
+            raise errors.OutputError(refused.place, refused.error, self.directory.path) from None
 
     def finish(
         self, stage: str, *, counts: Mapping[str, int], metrics: Mapping[str, float] | None = None,
@@ -320,7 +314,7 @@ class Job:
             more = [f"and {len(unread) - 3} more"] if len(unread) > 3 else []
             wanted = f"at least {'two different ones are' if needed == 2 else 'one is'} needed"
             evidence = "; ".join([wanted, *unread[:3], *more])
-            raise StageFailure.of("one-image" if found else "no-images", evidence)
+            raise errors.StageFailure.of("one-image" if found else "no-images", evidence)
 
 
 def name_images(text: str, names: Sequence[str]) -> str:
@@ -329,7 +323,7 @@ def name_images(text: str, names: Sequence[str]) -> str:
     named = re.sub(
         r"(?<![^\s(])#(\d+)(?!\.?\w)", lambda m: names[int(m[1])] if int(m[1]) < len(names) else m[0], text
     )
-    return Notice.of(text.code, named) if isinstance(text, Notice) else named
+    return errors.Notice.of(text.code, named) if isinstance(text, errors.Notice) else named
 
 
 def start_run(
@@ -340,13 +334,13 @@ def start_run(
     if unknown:
         others = ("config", "preset", "max_size", "cameras", "pairs", "set", "masks", "every", "seed")
         known = (*RunOptions.__annotations__, *others)
-        raise TypeError(unknown_word("option of reconstruct", unknown[0], known))
+        raise TypeError(errors.unknown_word("option of reconstruct", unknown[0], known))
     until: Until = options.get("until") or "model"
     if until not in get_args(Until):
-        raise UsageError(unknown_word("stage", str(until), get_args(Until)))
+        raise errors.UsageError(errors.unknown_word("stage", str(until), get_args(Until)))
     folder, threads = as_path("a run", "out", out), options.get("threads")
     if not str(out).strip():
-        raise UsageError("the output folder has no name; write . for the current one")
+        raise errors.UsageError("the output folder has no name; write . for the current one")
     seed = _checked_seed(seed)
     threads = 0 if threads is None else whole_number("a run", "threads", threads, 0)
     workers = Workers(threads or available_threads(), options.get("executor", "local"))
@@ -369,7 +363,7 @@ def run_position(folder: Path) -> str:
         keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
         choice = _run_folder.read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
         total = 0 if choice is None else len(choice.pairs)
-    where = f"{stage} begins" if not items else f"{stage}, {counted(len(items), 'item')} done"
+    where = f"{stage} begins" if not items else f"{stage}, {errors.counted(len(items), 'item')} done"
     if items and total:
         where = f"{stage}, {len(items)} of {total} done" if len(items) < total else f"{stage} is done"
     if not _run_folder.is_running(folder):

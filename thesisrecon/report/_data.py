@@ -9,18 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from thesisrecon import records
 from thesisrecon.arrays import F32, F64, U8, rows_of_views
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.lens import distort
-from thesisrecon.records import (
-    IdentifiabilityReport,
-    Image,
-    IntrinsicInterval,
-    Reconstruction,
-    SelfCalibration,
-    TexturedMesh,
-)
 from thesisrecon.results import RunResult, in_original_pixels, pose_deviations
 
 MAX_PICTURED = 100
@@ -40,8 +33,8 @@ class ReportData(RunResult):
     title: str = ""
     config_text: str = ""
     colors: U8 | None = None  # (N, 3) of the metric points, valid or not
-    affine: Reconstruction | None = None
-    model: TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
+    affine: records.Reconstruction | None = None
+    model: records.TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
     depths: Mapping[int, F32] = field(default_factory=dict)  # by view; a long side of 400 px is enough
     until: str | None = None  # last stage that was requested, None = all
     end: StageFailure | None = None
@@ -52,7 +45,7 @@ class ReportData(RunResult):
         return cls(**{f.name: getattr(result, f.name) for f in fields(result)}, **more)
 
     @property
-    def original_intrinsics(self) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    def original_intrinsics(self) -> tuple[Mapping[str, records.IntrinsicInterval], ...]:
         """Intrinsics of every view in original pixels; empty mappings if there are none."""
         if self.metric is None:
             return tuple({} for _ in self.images)
@@ -72,7 +65,7 @@ class ResidualSummary:
     q95_px: float
 
 
-def reprojection_distances(reconstruction: Reconstruction) -> list[F64]:
+def reprojection_distances(reconstruction: records.Reconstruction) -> list[F64]:
     """Residual lengths |observed - reprojected| (px) per view, empty if it is not registered."""
     r, poses = reconstruction, reconstruction.P.copy()
     used = np.flatnonzero(r.used)
@@ -150,7 +143,7 @@ def summarize(result: RunResult) -> dict[str, Any]:
     }
 
 
-def _start(calibration: SelfCalibration | None) -> dict[str, Any] | None:
+def _start(calibration: records.SelfCalibration | None) -> dict[str, Any] | None:
     """The report on the images in which self-calibration began, which may be a part of those returned."""
     if calibration is None:
         return None
@@ -158,7 +151,7 @@ def _start(calibration: SelfCalibration | None) -> dict[str, Any] | None:
     return facts | {"motion": _motion(calibration.identifiability)}
 
 
-def _motion(found: IdentifiabilityReport | None) -> dict[str, Any] | None:
+def _motion(found: records.IdentifiabilityReport | None) -> dict[str, Any] | None:
     if found is None:
         return None
     evidence = {"evidence": dict(found.evidence), "sentences": list(found.sentences)}
@@ -199,7 +192,9 @@ def _model(result: RunResult) -> dict[str, Any] | None:
     }
 
 
-def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distances: F64) -> dict[str, Any]:
+def _view_summary(
+    result: RunResult, best: records.Reconstruction | None, i: int, distances: F64
+) -> dict[str, Any]:
     image = result.images[i]
     registered = best is not None and bool(best.registered[i])
     view: dict[str, Any] = {
@@ -219,7 +214,9 @@ def _view_summary(result: RunResult, best: Reconstruction | None, i: int, distan
     return view
 
 
-def point_colors(reconstruction: Reconstruction, images: tuple[Image, ...]) -> NDArray[np.uint8]:
+def point_colors(
+    reconstruction: records.Reconstruction, images: tuple[records.Image, ...]
+) -> NDArray[np.uint8]:
     """Average colours (N, 3) of the observations of each point; mid-grey without observations."""
     tracks, used = reconstruction.tracks, reconstruction.used
     view, point = tracks.view_index[used], tracks.point_index[used]

@@ -17,14 +17,8 @@ from thesisrecon.errors import Notice, StageFailure
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.imaging.resampling import resample, smooth
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
+from thesisrecon.surface import _texture_blending
 from thesisrecon.surface._mesh import components, connected_parts, face_neighbours, select_faces
-from thesisrecon.surface._texture_blending import (
-    DEPTH_TOLERANCE_PX,
-    depth_buffers,
-    paint_texture,
-    prepare_views,
-    view_camera,
-)
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 
@@ -39,8 +33,8 @@ def texture_mesh(
     """Texture a mesh at the resolution of the best view of each part, up to ``max_texels`` (2.6)."""
     min_scale = 0.05  # Smallest reduction of the images
     neighbours = face_neighbours(mesh.faces)
-    given = [view_camera(view) for view in views]
-    buffers = depth_buffers(mesh, views)
+    given = [_texture_blending.view_camera(view) for view in views]
+    buffers = _texture_blending.depth_buffers(mesh, views)
     label = choose_views(mesh, views, buffers, neighbours, threads=threads)
     if not (label >= 0).any():
         raise StageFailure(Notice("no-texture"), "no image shows the outside of a face completely")
@@ -60,13 +54,13 @@ def texture_mesh(
     if scale < 1.0:
         whole = views
         views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
-        buffers = depth_buffers(mesh, views)
+        buffers = _texture_blending.depth_buffers(mesh, views)
     cut_out = _fill(
         lambda v: views[v].rgb, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size
     )
     seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
-    prepared = prepare_views(mesh, views, buffers, threads=threads)
-    texture = paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
+    prepared = _texture_blending.prepare_views(mesh, views, buffers, threads=threads)
+    texture = _texture_blending.paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
     uv, texture = _swatches(neighbours, label, uv, texture)
     return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
@@ -100,7 +94,7 @@ def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
 
 def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
     """Vertices (N,) with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
-    camera = view_camera(view)
+    camera = _texture_blending.view_camera(view)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
         inside = (xy >= 0.0).all(axis=1) & (xy[:, 0] <= width - 1.0) & (xy[:, 1] <= height - 1.0)
@@ -109,7 +103,7 @@ def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8
     places = ((y, x), (y, right), (below, x), (below, right))
     farthest = np.max([buffer[place] for place in places], axis=0)
     seen = np.all([view.seen[place] for place in places], axis=0)
-    tolerance = DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+    tolerance = _texture_blending.DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
     return np.asarray(inside & seen & (depth <= farthest + tolerance))
 
 
@@ -117,7 +111,7 @@ def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequ
     """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
     for v, view in enumerate(views):
-        xy, depth = project_to_view(view_camera(view), mesh.vertices)
+        xy, depth = project_to_view(_texture_blending.view_camera(view), mesh.vertices)
         seen = _visible_vertices(view, buffers[v], xy, depth)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # y points down: faces that are anticlockwise from outside have a negative area.
@@ -203,7 +197,7 @@ def _join_small(label: I64, visible: U8, neighbours: I64) -> I64:
 
 def _reduced(view: PinholeView, scale: float) -> PinholeView:
     """The view with ``scale`` < 1 times as many pixels per side."""
-    width, height = view_camera(view).scaled(scale).size
+    width, height = _texture_blending.view_camera(view).scaled(scale).size
     S = resizing_transform(np.divide((width, height), view.rgb.shape[1::-1]))
     blur = 0.5 * np.sqrt(max(1.0 / scale**2 - 1.0, 1e-6))
     planes = [resample(smooth(view.rgb[..., k].astype(np.float32), blur), width, height) for k in range(3)]

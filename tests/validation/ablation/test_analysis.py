@@ -5,19 +5,10 @@ import pytest
 from scipy import stats
 
 from tests.validation.ablation.toy import Darts
-from validation.ablation import Measure, Study, analyse
+from validation.ablation import Measure, Study, analyse, statistics
 from validation.ablation.analysis import as_reported
 from validation.ablation.plan import Plan, plan_study
 from validation.ablation.run import Row, Rows
-from validation.ablation.statistics import (
-    STUDENTISED_FROM,
-    holm,
-    on_front,
-    paired_interval,
-    resampled_t,
-    sign_test,
-    signed_rank_test,
-)
 
 
 def rows_of(study, value):
@@ -198,7 +189,7 @@ def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():
 def test_five_differences_by_hand():
     # 1 2 3 4 5: mean 3, variance 2.5, standard error sqrt(2.5 / 5), t = 4.2426 with 4 degrees of freedom,
     # whose 97.5 % quantile is 2.7764; Hedges' factor 1 - 3 / 15.
-    found = paired_interval([np.arange(1.0, 6.0)], "draws")
+    found = statistics.paired_interval([np.arange(1.0, 6.0)], "draws")
     assert found.mean == 3.0
     assert found.low == pytest.approx(3.0 - 2.7764 * 0.70711, abs=1e-4)
     assert found.high == pytest.approx(3.0 + 2.7764 * 0.70711, abs=1e-4)
@@ -211,7 +202,7 @@ def test_two_scenes_are_welch():
     # The mean of two means has the standard error and the freedom of Welch's test of their difference.
     rng = np.random.default_rng(2)
     a, b = rng.normal(1.0, 1.0, 5), rng.normal(2.0, 3.0, 7)
-    found, known = paired_interval([a, b], "draws"), stats.ttest_ind(a, -b, equal_var=False)
+    found, known = statistics.paired_interval([a, b], "draws"), stats.ttest_ind(a, -b, equal_var=False)
     assert found.mean == pytest.approx((a.mean() + b.mean()) / 2.0)
     assert found.p == pytest.approx(known.pvalue)
     low, high = known.confidence_interval(0.95)
@@ -219,8 +210,8 @@ def test_two_scenes_are_welch():
 
 
 def test_the_studentised_bootstrap_is_that_of_scipy():
-    d = np.random.default_rng(3).exponential(size=STUDENTISED_FROM)
-    t = resampled_t([[np.array([v]) for v in d]], resamples=20000)
+    d = np.random.default_rng(3).exponential(size=statistics.STUDENTISED_FROM)
+    t = statistics.resampled_t([[np.array([v]) for v in d]], resamples=20000)
 
     def statistic(x, axis=-1):
         return (x.mean(axis=axis) - d.mean()) / (x.std(axis=axis, ddof=1) / np.sqrt(x.shape[axis]))
@@ -237,7 +228,7 @@ def test_the_studentised_bootstrap_is_that_of_scipy():
 @pytest.mark.parametrize("count", [5, 20])
 def test_at_most_five_per_cent_of_null_effects_are_reported(count):
     rng, trials = np.random.default_rng(7), 400
-    found = [paired_interval([rng.standard_t(3, size=count)], "draws") for _ in range(trials)]
+    found = [statistics.paired_interval([rng.standard_t(3, size=count)], "draws") for _ in range(trials)]
     held = sum(f.low <= 0.0 <= f.high for f in found)
     # Two standard deviations of a count of trials that each hold in 95 of 100.
     assert held >= 0.95 * trials - 2.0 * np.sqrt(trials * 0.05 * 0.95)
@@ -247,14 +238,14 @@ def test_at_most_five_per_cent_of_null_effects_are_reported(count):
 @pytest.mark.parametrize("count", [9, 40])
 def test_signed_ranks_are_those_of_scipy(count):
     d = np.random.default_rng(count).normal(0.4, 1.0, count)
-    mean, p = signed_rank_test([np.array([v]) for v in d])
+    mean, p = statistics.signed_rank_test([np.array([v]) for v in d])
     known = stats.wilcoxon(d, method="exact" if count < 12 else "asymptotic", correction=False)
     assert p == pytest.approx(known.pvalue, rel=1e-9 if count < 12 else 1e-2)
     ranks = stats.rankdata(np.abs(d))
     assert mean == pytest.approx(np.sum(np.sign(d) * ranks) / count**2)
     k = np.argmax(np.abs(d))
     d[k] = np.copysign(np.inf, d[k])
-    assert signed_rank_test([np.array([v]) for v in d]) == pytest.approx((mean, p))
+    assert statistics.signed_rank_test([np.array([v]) for v in d]) == pytest.approx((mean, p))
 
 
 def test_signed_ranks_of_scenes_keep_the_level():
@@ -263,34 +254,36 @@ def test_signed_ranks_of_scenes_keep_the_level():
         found = []
         for _ in range(trials):
             shift = rng.normal(size=scenes)  # Rows of one scene have an error in common
-            found.append(signed_rank_test([s + 0.3 * rng.normal(size=rng.integers(1, 5)) for s in shift])[1])
+            found.append(
+                statistics.signed_rank_test([s + 0.3 * rng.normal(size=rng.integers(1, 5)) for s in shift])[1]
+            )
         assert np.mean(np.array(found) <= 0.05) <= 0.05 + 2.0 * np.sqrt(0.05 * 0.95 / trials)
 
 
 def test_success_is_compared_exactly():
     # Six rows on which only one fails, one on which only the other does: 2 (1 + 7) / 2^7.
-    assert sign_test(np.array([1.0] * 6 + [-1.0] + [0.0] * 9)) == pytest.approx(0.125)
-    assert np.isnan(sign_test(np.zeros(3)))
+    assert statistics.sign_test(np.array([1.0] * 6 + [-1.0] + [0.0] * 9)) == pytest.approx(0.125)
+    assert np.isnan(statistics.sign_test(np.zeros(3)))
 
 
 def test_p_falls_below_what_resamples_resolve():
     found = []
     for seed in range(40):
         d = np.random.default_rng(seed).normal(1.8, 1.0, 20)
-        found.append(np.log(paired_interval([d], "draws").p / stats.ttest_1samp(d, 0.0).pvalue))
+        found.append(np.log(statistics.paired_interval([d], "draws").p / stats.ttest_1samp(d, 0.0).pvalue))
     assert np.median(np.abs(found)) <= np.log(5.0)
     assert max(np.exp(found)) <= 1e4
-    small = paired_interval([np.random.default_rng(1).normal(3.0, 1.0, 20)], "draws").p
+    small = statistics.paired_interval([np.random.default_rng(1).normal(3.0, 1.0, 20)], "draws").p
     assert 0.0 < small < 1e-6
 
 
 def test_holm_by_hand():
-    assert holm([0.01, 0.04, 0.03, float("nan")])[:3] == pytest.approx([0.03, 0.06, 0.06])
-    assert np.isnan(holm([0.01, float("nan")])[1])
-    assert holm([0.6, 0.7]) == pytest.approx([1.0, 1.0])
-    assert holm([]) == []
+    assert statistics.holm([0.01, 0.04, 0.03, float("nan")])[:3] == pytest.approx([0.03, 0.06, 0.06])
+    assert np.isnan(statistics.holm([0.01, float("nan")])[1])
+    assert statistics.holm([0.6, 0.7]) == pytest.approx([1.0, 1.0])
+    assert statistics.holm([]) == []
 
 
 def test_the_front_is_not_dominated():
     cost, loss = np.array([1.0, 2.0, 3.0, 2.0, np.nan]), np.array([5.0, 3.0, 4.0, 3.0, 0.0])
-    assert on_front(cost, loss).tolist() == [True, True, False, True, False]
+    assert statistics.on_front(cost, loss).tolist() == [True, True, False, True, False]

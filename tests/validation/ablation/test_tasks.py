@@ -16,14 +16,7 @@ from thesisrecon.epipolar.verification import Configuration
 from thesisrecon.errors import StageFailure, UsageError
 from validation.ablation import Place, Study, ablate
 from validation.ablation.plan import plan_study, study_from_table
-from validation.ablation.tasks import Reconstruction
-from validation.ablation.tasks.images import (
-    ImagePairs,
-    RectifiedPairs,
-    matched_pair,
-    numbers_of_pair,
-    read_pair,
-)
+from validation.ablation.tasks import Reconstruction, images
 from validation.ablation.tasks.searches import ESTIMATORS, RobustSearch
 from validation.ablation.tasks.synthetic import FundamentalOfCube, TriangulationOverNoise
 from validation.metrics.searches import traced
@@ -71,8 +64,8 @@ def test_the_polynomial_method_does_not_depend_on_the_frame():
     ("task", "scene", "words"),
     [
         (FundamentalOfCube(), "cub", "unknown scene 'cub'; did you mean cube"),
-        (ImagePairs(), "courtyard/13", "there is no pair courtyard/13"),
-        (RectifiedPairs(), "Teddy#3/2", "with k from 1 to n"),
+        (images.ImagePairs(), "courtyard/13", "there is no pair courtyard/13"),
+        (images.RectifiedPairs(), "Teddy#3/2", "with k from 1 to n"),
         (Reconstruction(), str(ROOT / "scripts"), "there are no images in"),
     ],
 )
@@ -91,23 +84,23 @@ def test_a_yard_is_matched_whole_and_in_windows_of_its_rows(tmp_path, monkeypatc
         write_png(tmp_path / f"{name}.png", image)
     np.save(tmp_path / "disparity.npy", np.stack([disparity, disparity]).astype(np.float32))
     monkeypatch.setattr(stereo_scenes, "stereo_yard_folder", {9: tmp_path}.get)
-    task = RectifiedPairs()
+    task = images.RectifiedPairs()
     assert task.subsets("yard-9", 2) == ["yard-9#1/2", "yard-9#2/2"]
     for scene, rows in (("yard-9", 60), ("yard-9#1/2", 40), ("yard-9#2/2", 40)):
         assert task.scene_of(scene) == "yard-9"
-        pair = matched_pair(scene)
+        pair = images.matched_pair(scene)
         assert pair.left.shape == pair.right.shape == (rows, 160, 3)
         assert pair.disparities >= 13
         assert task.run(CONFIG, scene, 0, NOWHERE)["bad1_pct"] < 5.0
-    np.testing.assert_array_equal(matched_pair("yard-9#2/2").left, left[20:])
+    np.testing.assert_array_equal(images.matched_pair("yard-9#2/2").left, left[20:])
 
 
 def test_pairs_of_a_scene_are_one_value_and_a_wrong_F_is_a_failure():
-    task = ImagePairs(gap=2)
+    task = images.ImagePairs(gap=2)
     assert {task.scene_of(f"courtyard/{i}") for i in (0, 4)} == {"courtyard"}
-    pair = read_pair("courtyard/4", 2)
+    pair = images.read_pair("courtyard/4", 2)
     views = [CONFIG.matching.prepare(image, CONFIG.features.detect(image)) for image in pair.images]
-    found = numbers_of_pair(CONFIG, views, pair, 0)
+    found = images.numbers_of_pair(CONFIG, views, pair, 0)
     assert [image.name for image in pair.images] == ["0004.jpg", "0006.jpg"]
     assert found["verified"] > 500
     assert found["error_px"] < 0.1
@@ -117,21 +110,21 @@ def test_pairs_of_a_scene_are_one_value_and_a_wrong_F_is_a_failure():
     assert found["matching_score_pct"] == pytest.approx(right / fewest)
     assert found["auc5_pct"] > 95.0
     spoiled = pair._replace(truth=pair.truth[:, [0, 1, 2, 0]])
-    refuses(StageFailure, "F is wrong", numbers_of_pair, CONFIG, views, spoiled, 0)
+    refuses(StageFailure, "F is wrong", images.numbers_of_pair, CONFIG, views, spoiled, 0)
     # Without F: the pose counts as wrong, the distance as the largest.
     few = replace(CONFIG, epipolar=replace(CONFIG.epipolar, threshold_px=1e-9))
-    none = numbers_of_pair(few, views, pair, 0, strict=False)
+    none = images.numbers_of_pair(few, views, pair, 0, strict=False)
     assert (none["error_px"], none["auc20_pct"], none["precision_pct"]) == (99.0, 0.0, 0.0)
 
 
 def test_pairs_of_a_folder_are_listed_and_judged_at_any_size(yard, tmp_path):
     (yard / "pairs.txt").write_text("0004.jpg 0006.jpg\n0005.jpg 0004.jpg\n", encoding="utf-8")
-    task = ImagePairs(gap=1)
+    task = images.ImagePairs(gap=1)
     assert task.expand(f"{yard}/*") == [f"{yard}/0", f"{yard}/1"]
     study = Study({}, [f"{yard}/pairs.txt", f"{yard}/0"], task=task)
     scenes = [row.scene for row in plan_study(study).rows]
     assert scenes == [f"{yard}/0004.jpg+0006.jpg", f"{yard}/0005.jpg+0004.jpg", f"{yard}/0"]
-    whole, half = (read_pair(scenes[0], 1, size) for size in (1536, 300))
+    whole, half = (images.read_pair(scenes[0], 1, size) for size in (1536, 300))
     assert half.images[0].size[0] == 300
     scale = half.images[0].scale / whole.images[0].scale
     np.testing.assert_allclose(half.truth + 0.5, scale * (whole.truth + 0.5), rtol=1e-12)

@@ -13,15 +13,8 @@ import thesisrecon
 from validation.command import main
 from validation.runs.models import report_models
 from validation.runs.records import ReportOptions, load_images
+from validation.scenes import fixtures
 from validation.scenes.courtyard import build_courtyard
-from validation.scenes.fixtures import (
-    courtyard_cameras,
-    courtyard_poses,
-    encode_depth,
-    render_image,
-    versions,
-    write_cube,
-)
 from validation.scenes.layout import SETS
 from validation.scenes.materials import Material
 from validation.scenes.pose import Pose
@@ -39,14 +32,14 @@ def scene():
 
 def test_a_view_is_made_again_byte_for_byte():
     view = 4
-    jpeg, depth = render_image(build_courtyard(), courtyard_poses()[view], view)
+    jpeg, depth = fixtures.render_image(build_courtyard(), fixtures.courtyard_poses()[view], view)
     kept = (FOLDER / "images" / f"{view:04d}.jpg").read_bytes()
     cameras = (FOLDER / "cameras.json").read_text(encoding="utf-8")
     made_with = json.loads(cameras)["made_with"]
-    assert courtyard_cameras(made_with) == cameras
-    if made_with == versions():
+    assert fixtures.courtyard_cameras(made_with) == cameras
+    if made_with == fixtures.versions():
         assert jpeg == kept
-        assert encode_depth(depth) == (FOLDER / "depth" / f"{view:04d}.png").read_bytes()
+        assert fixtures.encode_depth(depth) == (FOLDER / "depth" / f"{view:04d}.png").read_bytes()
     # Another library version may round or encode otherwise; the picture stays.
     a, b = (np.asarray(Image.open(io.BytesIO(data)), dtype=float) for data in (jpeg, kept))
     assert np.abs(a - b).mean() < 0.5
@@ -55,7 +48,7 @@ def test_a_view_is_made_again_byte_for_byte():
 
 
 def test_the_file_is_made_again_byte_for_byte(tmp_path):
-    write_cube(tmp_path)
+    fixtures.write_cube(tmp_path)
     assert (tmp_path / "cube.npz").read_bytes() == (ROOT / "fixtures" / "cube" / "cube.npz").read_bytes()
 
 
