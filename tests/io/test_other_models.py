@@ -16,23 +16,23 @@ from thesisrecon.results import SparseModel, SparseView
 SIZE = (640, 480)
 
 
-def _model(lens):
+def _model(lens=(0.0, 0.0, 0.0)):
     rng = np.random.default_rng(0)
     K = np.array([[500.0, 0, 310], [0, 500, 250], [0, 0, 1]])
     R = Rotation.from_rotvec(0.4 * rng.normal(size=(4, 3))).as_matrix()
-    views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, lens) for i, r in enumerate(R)]
+    views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, np.array(lens)) for i, r in enumerate(R)]
     return SparseModel(views, rng.normal(size=(9, 3)))
 
 
 def test_written_models_are_read_again(tmp_path):
-    model = _model(np.zeros(3))
+    model = _model()
     found = read_model(_exports.write_nerfstudio(tmp_path, model, masked=False))
     assert found.names == model.names
     for a, b in zip(found.views, model.views, strict=True):
         for name in ("R", "t", "K", "distortion"):
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9)
         assert a.size == b.size
-    cameras = read_cameras(_exports.write_kalibr(tmp_path, _model(np.array([0.1, -0.02, 0.0])))[0])
+    cameras = read_cameras(_exports.write_kalibr(tmp_path, _model((0.1, -0.02, 0.0)))[0])
     assert list(cameras) == ["cam0"]
     np.testing.assert_allclose(cameras["cam0"].distortion, [0.1, -0.02, 0.0])
 
