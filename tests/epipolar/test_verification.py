@@ -116,7 +116,6 @@ def test_exact_and_wrong_calls():
     fit = FundamentalFit(np.eye(3), np.ones(11, bool), 0.1, np.zeros((9, 9)))
     refuses(ValueError, "11", PairVerification().verify, as_matches(xy, xy), fit, np.random.default_rng(0))
     refuses(ValueError, "min_inliers", PairVerification, min_inliers=3)
-    refuses(ValueError, "min_inlier_ratio", PairVerification, min_inlier_ratio=1.5)
     pair = make_pair(40, np.random.default_rng(0))
     assert classify_configuration(pair.F, pair.xy1, pair.xy2) is Configuration.GENERAL
     xy1, xy2, _ = spoil(pair, np.random.default_rng(0), sigma=0.3, outliers=0.0)

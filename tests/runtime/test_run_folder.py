@@ -2,10 +2,7 @@
 
 import errno
 import json
-import os
-import re
 import shutil
-import time
 import zipfile
 
 import numpy as np
@@ -18,7 +15,6 @@ from thesisrecon.api.reconstruct import reconstruct
 from thesisrecon.cli.commands import run_command
 from thesisrecon.errors import OutputError, UsageError
 from thesisrecon.io._files import read_json, write_atomically, write_json
-from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.pipeline import algorithm1
 from thesisrecon.pipeline.run import run_position
 from thesisrecon.runtime._run_folder import (
@@ -265,38 +261,20 @@ def test_the_command_reports_a_full_disk_in_one_sentence(tmp_path, monkeypatch, 
 IMAGES = 10
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """A run whose features were done 100 s ago, and 5 of 45 pairs since."""
-    now = time.time()
+def test_a_folder_tells_its_stage_or_how_to_go_on(tmp_path, capsys):
     write_json(tmp_path / "run.json", {"images": {f"{i}.jpg": "" for i in range(IMAGES)}})
-    os.utime(tmp_path / "run.json", (now - 300, now - 300))
     pairs = np.array([(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)])
-    stages = {"01-features": IMAGES, "02-matches": 5}
-    for name, count in stages.items():
+    for name, count in {"01-features": IMAGES, "02-matches": 5}.items():
+        (tmp_path / name).mkdir()
         for n in range(count):
-            path = tmp_path / name / f"{n:05d}.npz"
-            path.parent.mkdir(exist_ok=True)
-            path.touch()
-            os.utime(path, (now - 100 - n, now - 100 - n) if name == "01-features" else (now - n, now - n))
+            (tmp_path / name / f"{n:05d}.npz").touch()
     choice = StageFolder(tmp_path / "02-pairs")
     choice.save("choice", "key", records.PairChoice(pairs, "all"))
     choice.finish(records.StageReport("pairs", 0.0, {}, {}, ()), {}, {"choice": "key"})
-    for path in (tmp_path / "02-pairs").iterdir():
-        os.utime(path, (now - 100, now - 100))
-    return tmp_path
-
-
-def test_a_folder_tells_its_stage_and_the_time_left_or_how_to_go_on(folder, capsys, tmp_path):
-    assert run_position(folder) == "interrupted: matches, 5 of 45 done; repeat the command to resume"
-    with RunDirectory(folder).claim({}, overwrite=True):
-        # Resumed items do not count for the rate.
-        assert run_position(folder) == "running: matches, 5 of 45 done"
-        os.utime(folder / LOCK_FILE, (begun := time.time() - 200.0, begun))
-        assert run_command(["inspect", str(folder)]) == 0
-    # 5 pairs in 100 s, 40 are left: 800 s.
-    words = r"running: matches, 5 of 45 done, about 1[34] min left in this stage\n"
-    assert re.match(words, capsys.readouterr().out)
+    assert run_position(tmp_path) == "interrupted: matches, 5 of 45 done; repeat the command to resume"
+    with RunDirectory(tmp_path).claim({}, overwrite=True):
+        assert run_command(["inspect", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == "running: matches, 5 of 45 done\n"
     assert run_position(tmp_path / "01-features") == ""
 
 

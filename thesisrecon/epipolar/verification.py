@@ -284,20 +284,16 @@ class PairVerification:
     ----------
     min_inliers : int
         Minimum number of verified matches, at least 8.
-    min_inlier_ratio : float
-        Minimum fraction of the matches that are verified, in [0, 1].
     """
 
     min_inliers: int = 60
-    min_inlier_ratio: float = 0.25
 
+    min_inlier_ratio = 0.25  # minimum fraction of the matches that are verified
     homography_px = 2.0  # distance within which a homography explains a match, or 4.3 sigma if that is more
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:
             raise ValueError(f"min_inliers must be at least 8; got {self.min_inliers}")
-        if not 0.0 <= self.min_inlier_ratio <= 1.0:
-            raise ValueError(f"min_inlier_ratio must lie in [0, 1]; got {self.min_inlier_ratio}")
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         """See `thesisrecon.config.Verifier.verify`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 import zlib
@@ -25,7 +24,6 @@ from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.io._files import as_path, read_json
 from thesisrecon.io._images import ImageSet
-from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
 from thesisrecon.runtime import _run_folder
 from thesisrecon.runtime._executors import Workers, available_threads
@@ -352,50 +350,29 @@ def start_run(
 
 
 def run_position(folder: Path) -> str:
-    """One sentence: running or interrupted, the stage, the items done, the time left; empty without a run."""
+    """One sentence: running or interrupted, the stage and the items done; empty without a run."""
     content = read_json(folder / _run_folder.RUN_FILE)
     if not isinstance(content, dict):
         return ""
-    stage, items, since = _latest_stage(folder)
+    stage, done = _latest_stage(folder)
     total = len(content.get("images", ())) if stage == "features" else 0
     if stage == "matches":
         manifest = read_json(folder / FOLDERS["pairs"] / _run_folder.MANIFEST_FILE)
         keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
         choice = _run_folder.read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
         total = 0 if choice is None else len(choice.pairs)
-    where = f"{stage} begins" if not items else f"{stage}, {errors.counted(len(items), 'item')} done"
-    if items and total:
-        where = f"{stage}, {len(items)} of {total} done" if len(items) < total else f"{stage} is done"
-    if not _run_folder.is_running(folder):
-        return f"interrupted: {where}; repeat the command to resume"
-    left = _seconds_left(items, total, max(since, (folder / LOCK_FILE).stat().st_mtime))
-    return f"running: {where}" + (f", about {_in_words(left)} left in this stage" if left else "")
+    where = f"{stage}, {errors.counted(done, 'item')} done" if done else f"{stage} begins"
+    if done and total:
+        where = f"{stage}, {done} of {total} done" if done < total else f"{stage} is done"
+    running = _run_folder.is_running(folder)
+    return f"running: {where}" if running else f"interrupted: {where}; repeat the command to resume"
 
 
-def _latest_stage(folder: Path) -> tuple[str, list[float], float]:
-    """The last stage that was written to, the times of its items, and when the one before it ended."""
-    started = ended = (folder / _run_folder.RUN_FILE).stat().st_mtime
-    found = ("images", list[float](), ended)
+def _latest_stage(folder: Path) -> tuple[str, int]:
+    """The last stage that was written to, and the number of its items."""
+    started, found = (folder / _run_folder.RUN_FILE).stat().st_mtime, ("images", 0)
     for stage, name in FOLDERS.items():
-        every = [path.stat().st_mtime for path in (folder / name).glob("*.npz")]
         # Older records belong to a replaced run and were not reused.
-        times = sorted(when for when in every if when >= started)
-        if times:
-            found = (stage, times, ended)
-            manifest = folder / name / _run_folder.MANIFEST_FILE
-            ended = max(ended, manifest.stat().st_mtime if manifest.exists() else times[-1])
+        if items := sum(path.stat().st_mtime >= started for path in (folder / name).glob("*.npz")):
+            found = stage, items
     return found
-
-
-def _seconds_left(items: Sequence[float], total: int, since: float) -> float:
-    """Remaining time at the rate of this run's items, without those of an earlier run; 0 if unknown."""
-    new = sum(when > since for when in items)
-    known = new >= 3 and len(items) < total
-    return (time.time() - since) / new * (total - len(items)) if known else 0.0
-
-
-def _in_words(seconds: float) -> str:
-    if seconds < 90.0:
-        return f"{math.ceil(seconds)} s"
-    minutes = math.ceil(seconds / 60.0)
-    return f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"

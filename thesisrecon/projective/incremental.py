@@ -70,16 +70,14 @@ class IncrementalProjective:
 
     Parameters
     ----------
-    points_per_view : int
-        Approximate number of tracks per view, longest first; the metric stage uses all.
     core_views : int
         Number of views above which only a core of this many well-connected views is reconstructed, twice as
         many at each further attempt; the metric stage registers the others. 0: all views are reconstructed.
     """
 
-    points_per_view: int = 1500
     core_views: int = 40
 
+    points_per_view = 1500  # approximate number of tracks per view, longest first; the metric stage uses all
     min_points = 12  # minimum number of matches for resection: twice the six of a minimal sample
     # Inlier thresholds in noise sigmas of the early and late rounds, and lower bound of the noise.
     outlier_sigmas, noise_floor_px = (12.0, 7.0), 0.3
@@ -96,7 +94,7 @@ class IncrementalProjective:
     max_initial_pairs = 3  # initial pairs tried in one attempt while usable views are missing
 
     def __post_init__(self) -> None:
-        require_at_least(self, points_per_view=1, core_views=0)
+        require_at_least(self, core_views=0)
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0

@@ -211,16 +211,13 @@ class HypothesesAndRefinement:
 
     Parameters
     ----------
-    focal_range : (float, float)
-        Range of the scanned focal lengths in long sides.
     search : CheiralitySearch, optional
         Hartley's search; None to omit it.
     """
 
-    focal_range: tuple[float, float] = (0.2, 40.0)
     search: CheiralitySearch | None = field(default_factory=CheiralitySearch)
 
-    focal_steps = 45  # number of scanned focal lengths
+    focal_range, focal_steps = (0.2, 40.0), 45  # range in long sides and number of scanned focal lengths
     camera_subsets = 6  # number of random camera subsets for the quadric
     # Numbers of hypotheses to refine, and of distinct candidates to refine over all unknown intrinsics.
     max_refined, max_full_refined = 40, 8
