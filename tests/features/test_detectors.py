@@ -37,7 +37,9 @@ def test_a_corner_is_found_between_the_pixels(variant, dx, dy):
     assert distance.min() < 0.25
 
 
-@pytest.mark.parametrize("variant", [with_constants(MultiScaleCorners, upsample_below_px=0)(), VARIANTS[1]])
+@pytest.mark.parametrize(
+    "variant", [with_constants(multiscale.MultiScaleCorners, upsample_below_px=0)(), VARIANTS[1]]
+)
 def test_corners_of_every_size_are_right_on_average(variant):
     errors = {}
     for place in np.random.default_rng(0).uniform(-0.5, 0.5, (36, 2)):
