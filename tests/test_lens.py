@@ -63,10 +63,10 @@ def test_pixels_that_no_direction_has_are_nan() -> None:
     assert np.isnan(rays[1]).all()
 
 
-@pytest.mark.parametrize("lens", ["brown", "division", "fisheye"])
+@pytest.mark.parametrize("lens", ["brown", "division", "fisheye", "thin-prism-fisheye"])
 def test_derivatives_of_bundle_adjustment_are_those_of_the_projection(lens: Any) -> None:
     rng, n = np.random.default_rng(3), 30
-    k = rng.normal(0.0, SCALES[: {"brown": 5, "division": 1, "fisheye": 4}[lens]])
+    k = rng.normal(0.0, SCALES[: {"brown": 5, "division": 1, "fisheye": 4, "thin-prism-fisheye": 6}[lens]])
     k = -np.abs(k) if lens == "division" else k
     X = np.column_stack([rng.uniform(-1.5, 1.5, (n, 2)), rng.uniform(0.8, 3.0, n)])
     X[0, :2] = 1e-5  # near the axis the quotients of a fisheye lens are series

@@ -34,8 +34,9 @@ class Camera(Record):
         they mean k1, k2, p1, p2, k3 in OpenCV and k1, k2, k3, k4, k5 elsewhere.
     std : mapping of str to float, optional
         Standard deviations of estimated values: "focal_px", "aspect", "skew_px", "principal_x_px",
-        "principal_y_px", "k1", "k2", "k3" (0: as assumed), and of poses of a run "rotation_x_deg" and y, z
-        about the axes of the camera, "centre_x" and y, z along those of the model. None: unknown.
+        "principal_y_px", "k1", "k2", "k3", further "k4", "p1", "p2" of other lenses (0: as assumed), of
+        :attr:`angles_of_view` "angle_of_view_deg" and "corner_deg", and of poses of a run "rotation_x_deg"
+        and y, z about the axes of the camera, "centre_x" and y, z along those of the model. None: unknown.
     as_stored : bool
         Whether the pixels are those of the image file as stored, as in COLMAP, and not after EXIF rotation.
     lens : {"radial", "division", "fisheye", "brown", "rational", "thin-prism-fisheye"}
@@ -134,6 +135,15 @@ class Camera(Record):
         return np.asarray(-self.R.T @ self.t)
 
     @property
+    def angles_of_view(self) -> tuple[float, float]:
+        """Angle of view along the long side, and of the farthest corner from the axis, degrees.
+
+        Of the outer edges of the pixels, along the row or column of the principal point; NaN where the lens
+        images nothing.
+        """
+        return angles_of_view(self.K, self.size, self.lens_row)
+
+    @property
     def is_pinhole(self) -> bool:
         """Whether the camera has no distortion."""
         return not np.any(self.lens_row)
@@ -173,8 +183,7 @@ class Camera(Record):
         z = None if depth is None else arrays.numbers("Camera.unproject", missing=("depth",), depth=depth)[0]
         given = {} if z is None else {"depth": (z, ("N",))}
         arrays.require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
-        xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(self.K).T
-        rays = directions_of_image(xh[:, :2] / xh[:, 2:], self.lens_row)
+        rays = viewing_rays(self.K, xy, self.lens_row)
         if z is None:
             return np.asarray(rays @ self.R)
         return np.asarray((rays * (z / rays[:, 2])[:, None] - self.t) @ self.R)
@@ -215,6 +224,22 @@ def camera_of_row(
     """The camera of (K, R, t) with the lens of a row as in :attr:`Camera.lens_row`."""
     lens, coefficients = named_lens(row)
     return Camera(*pose, size, coefficients, std, as_stored, lens)
+
+
+def viewing_rays(K: F64, xy: F64, lens: F64) -> F64:
+    """Unit directions (N, 3) of pixels in the camera frame, by the row of a lens; NaN: of nothing."""
+    xh = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(K).T
+    return directions_of_image(xh[:, :2] / xh[:, 2:], lens)
+
+
+def angles_of_view(K: F64, size: tuple[int, int], lens: F64) -> tuple[float, float]:
+    """As :attr:`Camera.angles_of_view`, of a camera with the row of a lens."""
+    x, y = size[0] - 0.5, size[1] - 0.5
+    cx, cy = K[:2, 2]
+    ends = [[-0.5, cy], [x, cy]] if size[0] >= size[1] else [[cx, -0.5], [cx, y]]
+    rays = viewing_rays(K, np.array([*ends, [-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]]), lens)
+    angle = np.degrees(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]))
+    return float(angle[:2].sum()), float(angle[2:].max())
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:

@@ -272,6 +272,7 @@ class IntrinsicsPrior(Record):
     spread: F64 | None = None
     #: (V, 3) lenses in half diagonals found in pairs: k1, k2 and the base; None: straight but for k1
     lens: F64 | None = None
+    lens_model: str = "auto"  #: as in ``IntrinsicsOptions.lens``
 
     @classmethod
     def unshared(
@@ -356,7 +357,8 @@ class MetricResult(Record):
 
     reconstruction: Reconstruction
     #: per registered view "focal_px", "aspect" (fy / fx), "skew_px", "principal_x_px", "principal_y_px",
-    #: "k1", "k2", "k3" (std 0: as assumed)
+    #: "k1", "k2", "k3" (std 0: as assumed), of other lenses further "k4", "p1", "p2", and what they give:
+    #: "angle_of_view_deg" along the long side and "corner_deg", that of the farthest corner from the axis
     intrinsics: tuple[Mapping[str, IntrinsicInterval], ...]
     self_check: Mapping[str, float]
     trusted: bool  #: whether the self-check passed

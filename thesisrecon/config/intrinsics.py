@@ -19,6 +19,8 @@ from thesisrecon.records import IntrinsicsPrior, Reconstruction
 Mode = Literal["known", "constant", "free"]
 """``known``: the value is given; ``constant``: one unknown value per camera; ``free``: one per image."""
 
+LensModel = Literal["auto", "radial", "brown", "division", "fisheye"]
+
 _OF_COLUMN = ("focal", "aspect", "skew", "principal_point", "principal_point", "k1")
 """Mode setting of each column."""
 _STD_SETTINGS = {
@@ -55,6 +57,9 @@ class IntrinsicsOptions:
         Principal point in pixels of the original images (None: image centre); std relative to the long side.
     k1, k1_value, k1_std : Mode, float, float
         First radial distortion coefficient.
+    lens : {"auto", "radial", "brown", "division", "fisheye"}
+        Model of the lens as of :class:`thesisrecon.Camera`. "auto": radial, and the model that explains the
+        observations best where pairs of images show that lines bend much.
 
     Raises
     ------
@@ -80,6 +85,7 @@ class IntrinsicsOptions:
     k1: Mode = "constant"
     k1_value: float = 0.0
     k1_std: float | None = 0.05
+    lens: LensModel = "auto"
 
     def __post_init__(self) -> None:
         given = self.exif or self.focal_px is not None
@@ -95,6 +101,8 @@ class IntrinsicsOptions:
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise ValueError(f"{name} must be finite; got {value}")
+        if self.k1 == "known" and self.lens not in ("auto", "radial"):
+            raise ValueError(f"k1 = known fixes a radial lens: leave out lens = {self.lens}, or k1")
         self._check_stds(given)
 
     def _check_stds(self, focal_given: bool) -> None:
@@ -158,7 +166,7 @@ def prior_from_options(
         # A known focal that is missing in EXIF becomes constant: these views of a camera share one unknown.
         first = {g: i for i, g in reversed(list(enumerate(group.tolist()))) if missing[i]}
         shared[missing, 0] = [first[g] for g in group[missing].tolist()]
-    return IntrinsicsPrior(mean, std, shared, kind)
+    return IntrinsicsPrior(mean, std, shared, kind, lens_model=options.lens)
 
 
 def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None = None) -> IntrinsicsPrior:

@@ -17,6 +17,8 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric._model import (
     CENTRE,
+    DECENTRING,
+    DECENTRING_STD,
     FOCAL,
     K1,
     LENS_STD,
@@ -61,7 +63,8 @@ class MetricAdjustment:
 
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
     lower bound of the estimated noise, ``inflation`` a factor on the noise in the weights, for correlated
-    residuals. The result does not depend on ``threads``.
+    residuals. Lenses in tables of twelve columns may be ``decentred``. The result does not depend on
+    ``threads``.
     """
 
     prior: IntrinsicsPrior
@@ -70,6 +73,7 @@ class MetricAdjustment:
     hierarchical: HierarchicalPrior | None = None
     inflation: float = 1.0
     threads: int = 1
+    decentred: bool = False
 
     def options(
         self, model: MetricEstimate, *, iterations: int = MAX_ITERATIONS, settled: float = SETTLED
@@ -93,6 +97,7 @@ class MetricAdjustment:
             coefficients = LENS_STD[int(lens)]
             mean[row, LENS], mean[row, K1], std[row, K1:] = lens, 0.0, 0.0
             std[row, K1 : K1 + len(coefficients)] = coefficients
+            std[row, DECENTRING] = DECENTRING_STD if self.decentred else 0.0
         # Images may be crops: the principal point has a bivariate t distribution, whose weight over that of
         # the normal one falls with the distance from the mean; 3 degrees of freedom: a finite variance.
         dof = 3.0
@@ -207,11 +212,30 @@ def remaining_cost(
     simple: tuple[MetricEstimate, MetricAdjustment], rich: tuple[MetricEstimate, MetricAdjustment]
 ) -> float:
     """Cost of held-out observations, richer over simple model; 1 if there are fewer than 30."""
+    costs = _held_out_costs(simple, rich)
+    return 1.0 if costs is None else float(costs[1].mean() / costs[0].mean())
+
+
+def predicts_better(
+    simple: tuple[MetricEstimate, MetricAdjustment], rich: tuple[MetricEstimate, MetricAdjustment]
+) -> bool:
+    """Whether a richer model predicts held-out observations better by three standard errors."""
+    costs = _held_out_costs(simple, rich)
+    if costs is None:
+        return False
+    gain = costs[0] - costs[1]
+    return bool(gain.mean() > 3.0 * gain.std() / np.sqrt(len(gain)))
+
+
+def _held_out_costs(
+    simple: tuple[MetricEstimate, MetricAdjustment], rich: tuple[MetricEstimate, MetricAdjustment]
+) -> tuple[F64, F64] | None:
+    """Costs of held-out observations of both models; None if there are fewer than 30."""
     model = simple[0]
     held = held_out_observations(replace(model, inlier=model.inlier & rich[0].inlier))
     if len(held) < 30:
-        return 1.0
-    return float(_held_out_cost(*rich, held, model).mean() / _held_out_cost(*simple, held, model).mean())
+        return None
+    return _held_out_cost(*simple, held, model), _held_out_cost(*rich, held, model)
 
 
 def _held_out_cost(

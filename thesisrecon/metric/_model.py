@@ -23,6 +23,13 @@ MAX_TANGENT = 4.0  # largest tangent of the angle from the axis of what triangul
 RADII = 100  # radii of the image at which one lens is fitted to another
 LENS_STD = {PERSPECTIVE: (0.5, 0.3, 0.1), DIVISION: (1.0,), ANGLE: (0.2, 0.1, 0.05, 0.02)}
 """Prior deviations of the coefficients about 0 of a lens that pairs of images show."""
+DECENTRING, DECENTRING_STD = (K1 + 4, K1 + 5), 0.005
+"""Columns of p1 and p2 of such a lens, and their prior deviations."""
+BASES = {
+    "auto": (ANGLE, PERSPECTIVE, DIVISION), "radial": (PERSPECTIVE,), "brown": (PERSPECTIVE,),
+    "division": (DIVISION,), "fisheye": (ANGLE,),
+}  # fmt: skip
+"""Bases of the lens by the model that the user sets."""
 MIN_ANGLE = float(np.radians(0.05))  # smallest triangulation angle of a point
 MAX_OBSERVATIONS, MANY_VIEWS, CELLS = 400_000, 40, 8
 """Larger sets are adjusted on a selection of points: more than ``MAX_OBSERVATIONS`` are divided evenly among
@@ -266,7 +273,7 @@ def camera_rows(prior: IntrinsicsPrior) -> tuple[I64, I64]:
 
 def _width(prior: IntrinsicsPrior) -> int:
     """Columns of the intrinsics."""
-    return WIDTH if prior.lens is None else LENS_WIDTH
+    return WIDTH if prior.lens is None and prior.lens_model in ("auto", "radial") else LENS_WIDTH
 
 
 def upgraded_model(

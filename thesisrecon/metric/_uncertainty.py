@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
-from thesisrecon.metric._model import ASPECT, CENTRE, FOCAL, K1, SKEW, MetricEstimate
+from thesisrecon.metric._model import ASPECT, CENTRE, DECENTRING, FOCAL, K1, SKEW, MetricEstimate
 from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
 from thesisrecon.optimize.least_squares import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
@@ -35,7 +36,7 @@ CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a ric
 _COLUMNS = {
     "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
     "principal_x_px": CENTRE[0], "principal_y_px": CENTRE[1],
-    "k1": K1, "k2": K1 + 1, "k3": K1 + 2, "k4": K1 + 3,
+    "k1": K1, "k2": K1 + 1, "k3": K1 + 2, "k4": K1 + 3, "p1": DECENTRING[0], "p2": DECENTRING[1],
 }  # fmt: skip
 
 
@@ -264,10 +265,8 @@ def pose_std(
             if unknown >= 0:
                 own = intervals[view][name]
                 std[unknown] = own.std / (own.value if column == FOCAL else 1.0)
-    known = [ratio[np.isfinite(ratio)] for ratio in (scatter.ratio, scatter.large_ratio)]
-    ratio, large = (float(np.median(values)) if len(values) else np.nan for values in known)
     share = lack_of_fit(scatter, model.tail)
-    common, fault = _inflation(scatter, ratio, large, share), MODEL_FLOOR_REL * np.sqrt(share)
+    common, fault = _common_inflation(scatter, share), MODEL_FLOOR_REL * np.sqrt(share)
     # Errors of a few blocks move some views more than they move the intrinsics.
     noise = np.full((len(poses.views), 2), common)
     for view, part in zip(*np.nonzero(np.isfinite(scatter.pose_ratios[0])), strict=True):
@@ -276,6 +275,65 @@ def pose_std(
     answer = np.full((len(model.registered), 6), np.nan)
     answer[poses.views] = np.sqrt(poses.variances(np.repeat(noise, 3, axis=1), std, fault))
     return answer
+
+
+def with_angles_of_view(
+    model: MetricEstimate, poses: PoseUncertainty, scatter: BlockScatter, intervals: Intervals
+) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    """The intervals with those of the angle of view along the long side and at the farthest corner.
+
+    Scatter, and the step by which the prior moves the intrinsics; errors of the camera model are those by
+    which the stated interval of the focal length exceeds its scatter.
+    """
+    inflation = _common_inflation(scatter, lack_of_fit(scatter, model.tail))
+    covariance = inflation**2 * poses.covariance
+    answer = [dict(own) for own in intervals]
+    found: dict[tuple[int, ...], dict[str, IntrinsicInterval]] = {}
+    for view in np.flatnonzero(model.registered).tolist():
+        g, width, height = int(model.cameras.group[view]), *model.sizes[view].tolist()
+        if (g, width, height) not in found:
+            row, number, focal = model.cameras.intrinsics[g], poses.number[g], answer[view]["focal_px"]
+            columns = np.flatnonzero(number >= 0)
+            value, slopes = _angles(row, columns, np.sqrt(scatter.variance[g]), (width, height))
+            unknown = number[columns]
+            variance = np.einsum("ka,kl,la->a", slopes, covariance[np.ix_(unknown, unknown)], slopes)
+            variance += (scatter.pull[g, columns] @ slopes) ** 2
+            if FOCAL in columns:
+                more = (focal.std / focal.value) ** 2 - covariance[number[FOCAL], number[FOCAL]]
+                variance += slopes[0] ** 2 * max(more, 0.0)
+            angles = zip(("angle_of_view_deg", "corner_deg"), value, np.sqrt(variance), strict=True)
+            how = "by the intervals of the intrinsics and their correlations"
+            found[g, width, height] = {
+                name: IntrinsicInterval(float(v), float(s), how)
+                for name, v, s in angles
+                if np.isfinite(v + s)
+            }
+        answer[view] |= found[g, width, height]
+    return tuple(answer)
+
+
+def _angles(row: F64, columns: I64, std: F64, size: tuple[int, int]) -> tuple[F64, F64]:
+    """Angles of view (2,) of a row of intrinsics, and slopes (K, 2) by ``columns``; the focal as log f."""
+
+    def angles(row: F64) -> F64:
+        f, aspect, skew, cx, cy = row[:5]
+        K = np.array([[f, skew, cx], [0.0, aspect * f, cy], [0.0, 0.0, 1.0]])
+        return np.array(angles_of_view(K, size, row[K1:]))
+
+    slopes = np.zeros((len(columns), 2))
+    for k, column in enumerate(columns):
+        # Steps of a thousandth of a standard deviation.
+        step, unit = 1e-3 * std[column], row[FOCAL] if column == FOCAL else 1.0
+        move = step * unit * (np.arange(len(row)) == column)
+        slopes[k] = (angles(row + move) - angles(row - move)) / (2.0 * step)
+    return angles(row), slopes
+
+
+def _common_inflation(scatter: BlockScatter, share: float) -> float:
+    """Inflation by the median scatter of all intrinsics."""
+    known = [ratio[np.isfinite(ratio)] for ratio in (scatter.ratio, scatter.large_ratio)]
+    ratio, large = (float(np.median(values)) if len(values) else np.nan for values in known)
+    return _inflation(scatter, ratio, large, share)
 
 
 def _inflation(scatter: BlockScatter, ratio: float, large: float, share: float) -> float:

@@ -60,7 +60,7 @@ class MetricRefinement:
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([_model.truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
-        model = with_best_lens(model, adjustment)
+        model, adjustment = with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
@@ -113,7 +113,9 @@ def _assess(
     )
     intervals = _uncertainty.widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
     report = check_returned(model, adjustment, motion, intervals)
-    poses = _uncertainty.pose_std(model, pose_uncertainty(fit), scatter, intervals)
+    uncertainty = pose_uncertainty(fit)
+    poses = _uncertainty.pose_std(model, uncertainty, scatter, intervals)
+    intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
     model = complete
     check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.

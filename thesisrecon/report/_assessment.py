@@ -9,9 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon.arrays import F64
 from thesisrecon.errors import counted
-from thesisrecon.lens import directions_of_image
 from thesisrecon.records import IntrinsicInterval, TexturedMesh, TwoView
 from thesisrecon.report._data import ReportData, ResidualSummary
 from thesisrecon.results import THRESHOLDS, ModelComparison
@@ -156,15 +154,12 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
     names = ("focal_px", "principal_x_px", "principal_y_px")
     focal, x, y = ([view[name] for view, _ in known] for name in names)
     sizes = np.array([photo.original_size for _, photo in known], dtype=float)
-    halves = sizes[:, 0] / (2.0 * np.array([f.value for f in focal]))
-    assert data.metric is not None
-    lenses = data.metric.reconstruction.distortion
-    rows = [None if lenses is None else lenses[k] for k, view in enumerate(data.original_intrinsics) if view]
-    angle = [2.0 * _angle(half, row) for half, row in zip(halves.tolist(), rows, strict=True)]
+    angles = [view["angle_of_view_deg"] for view, _ in known if "angle_of_view_deg" in view]
     distinct = {photo.original_size for _, photo in known}
     width, height = known[0][1].original_size
     where = f"images of {width}×{height} px" if len(distinct) == 1 else "images of several sizes"
-    field = f"horizontal field of view {np.median(angle):.1f}°; {where}. {_source_of(focal)}"
+    field = f"angle of view {_interval_text(angles, '°')} along the long side; " if angles else ""
+    field += f"{where}. {_source_of(focal)}"
     offset = np.array([[p.value for p in x], [p.value for p in y]]).T - (sizes - 1.0) / 2
     away = float(np.median(np.linalg.norm(offset, axis=1)))
     centre = f"x, y; {away:.1f} px from the image centre. {_source_of([*x, *y])}"
@@ -172,16 +167,6 @@ def _intrinsic_facts(data: ReportData) -> list[Fact]:
         Fact("Focal length", _interval_text(focal, "px"), field),
         Fact("Principal point", f"{_interval_text(x, '')}, {_interval_text(y, 'px')}", centre),
     ]
-
-
-def _angle(radius: float, lens: F64 | None) -> float:
-    """Angle from the axis, degrees, of an image point at a radius over the focal length."""
-    # Radial lenses are nearly pinholes.
-    if lens is not None and len(lens) > 3:
-        ray = directions_of_image(np.array([[radius, 0.0]]), lens)[0]
-        if np.isfinite(ray).all():
-            return float(np.degrees(np.arctan2(ray[0], ray[2])))
-    return float(np.degrees(np.arctan(radius)))
 
 
 def _interval_text(intervals: Sequence[IntrinsicInterval], unit: str) -> str:

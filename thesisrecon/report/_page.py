@@ -32,7 +32,8 @@ from thesisrecon.results import ModelComparison
 _INTRINSICS = {
     "focal_px": "Focal length (px)", "aspect": "Aspect (fy/fx)", "skew_px": "Skew (px)",
     "principal_x_px": "Principal x (px)", "principal_y_px": "Principal y (px)", "k1": "k1", "k2": "k2",
-    "k3": "k3",
+    "k3": "k3", "k4": "k4", "p1": "p1", "p2": "p2", "angle_of_view_deg": "Angle of view (°)",
+    "corner_deg": "Corner from the axis (°)",
 }  # fmt: skip
 T = TypeVar("T")
 

@@ -233,37 +233,38 @@ def _image_of(q: F64, x0: float, x1: float, w: float) -> tuple[float, float]:
 @kernel
 def _image_through_lens(q: F64, a: float, b: float, r2: float) -> tuple[float, float]:
     """Return the pixel of a normalised point, by the lens model q[LENS]."""
-    d = _lens_profile(q, r2)[0]
-    u = a * d + 2.0 * q[9] * a * b + q[10] * (r2 + 2.0 * a * a)
-    v = b * d + 2.0 * q[10] * a * b + q[9] * (r2 + 2.0 * b * b)
+    scale = _base_scale(q, r2)[0]
+    x, y = scale * a, scale * b
+    r2 = x * x + y * y
+    d = _polynomial(q, r2)[0]
+    u = x * d + 2.0 * q[9] * x * y + q[10] * (r2 + 2.0 * x * x)
+    v = y * d + 2.0 * q[10] * x * y + q[9] * (r2 + 2.0 * y * y)
     return q[0] * u + q[2] * v + q[3], q[0] * q[1] * v + q[4]
 
 
 @kernel
-def _lens_profile(q: F64, r2: float) -> tuple[float, float, float, float]:
-    """Return d(r^2) of the image d (a, b) without decentring, its derivative by r^2, and s, e.
-
-    The derivative of d by the n-th radial coefficient is e s^n, counted from 1.
-    """
+def _base_scale(q: F64, r2: float) -> tuple[float, float, float]:
+    """Return the factor of the base of the lens on a normalised point, its derivatives by r^2 and by q[5]."""
     if q[LENS] == DIVISION:
-        # r_d = d r solves r = r_d / (1 + k r_d^2).
+        # r_d = s r solves r = r_d / (1 + k r_d^2).
         root = math.sqrt(max(1.0 - 4.0 * q[5] * r2, TINY))
-        d = 2.0 / (1.0 + root)
-        return d, d * d * q[5] / root, r2, d * d / root
-    s, scale, turn = r2, 1.0, 1.0
+        s = 2.0 / (1.0 + root)
+        return s, s * s * q[5] / root, s * s * r2 / root
     if q[LENS] == ANGLE:
         r = math.sqrt(r2)
-        angle = math.atan(r)
-        s = angle * angle
-        # Below, the quotient and its derivative by their series: exact to rounding.
-        scale = angle / r if r2 > 1e-12 else 1.0 - r2 / 3.0
-        turn = 1.0 / (1.0 + r2)
-    radial = 1.0 + (q[5] + (q[6] + (q[7] + q[8] * s) * s) * s) * s
-    slope = q[5] + (2.0 * q[6] + (3.0 * q[7] + 4.0 * q[8] * s) * s) * s
-    d = scale * radial
-    if q[LENS] == ANGLE:
-        slope = q[5] - 1.0 / 3.0 if r2 < 1e-6 else 0.5 * ((radial + 2.0 * slope * s) * turn - d) / r2
-    return d, slope, s, scale
+        # The quotients lose digits near the axis, where their series are exact to rounding.
+        s = math.atan(r) / r if r2 > 1e-6 else 1.0 - r2 / 3.0
+        return s, (1.0 / (1.0 + r2) - s) / (2.0 * r2) if r2 > 1e-6 else -1.0 / 3.0 + 0.4 * r2, 0.0
+    return 1.0, 0.0, 0.0
+
+
+@kernel
+def _polynomial(q: F64, r2: float) -> tuple[float, float]:
+    """Return 1 + k1 r^2 + ... + k4 r^8 and its derivative by r^2; 1 of a division lens."""
+    if q[LENS] == DIVISION:
+        return 1.0, 0.0
+    d = 1.0 + (q[5] + (q[6] + (q[7] + q[8] * r2) * r2) * r2) * r2
+    return d, q[5] + (2.0 * q[6] + (3.0 * q[7] + 4.0 * q[8] * r2) * r2) * r2
 
 
 @kernel
@@ -399,24 +400,33 @@ def _fill_columns(q: F64, a: float, b: float, root: float, D: F64) -> None:
 def _fill_lens_columns(q: F64, a: float, b: float, scales: tuple[float, float, float, float], D: F64) -> None:
     """Fill D (2, 14) for a lens model of its own: eleven intrinsics, the model (0) and the point."""
     f, g, skew, root = scales
-    r2 = a * a + b * b
-    d, slope, s, e = _lens_profile(q, r2)
-    u = a * d + 2.0 * q[9] * a * b + q[10] * (r2 + 2.0 * a * a)
-    v = b * d + 2.0 * q[10] * a * b + q[9] * (r2 + 2.0 * b * b)
+    scale, growth, by_k1 = _base_scale(q, a * a + b * b)
+    x, y = scale * a, scale * b
+    r2 = x * x + y * y
+    d, slope = _polynomial(q, r2)
+    xx, xy, yy = r2 + 2.0 * x * x, 2.0 * x * y, r2 + 2.0 * y * y
+    u, v = x * d + q[9] * xy + q[10] * xx, y * d + q[10] * xy + q[9] * yy
     D[0, 0], D[1, 0] = f * u, g * v
     D[0, 1], D[1, 1] = 0.0, f * v
     D[0, 2], D[1, 2] = root * v, 0.0
     D[0, 3], D[1, 3] = root, 0.0
     D[0, 4], D[1, 4] = 0.0, root
+    # Derivatives of (u, v) by (x, y), and by the normalised point.
+    m00 = d + 2.0 * slope * x * x + 2.0 * q[9] * y + 6.0 * q[10] * x
+    m01 = 2.0 * slope * x * y + 2.0 * q[9] * x + 2.0 * q[10] * y
+    m11 = d + 2.0 * slope * y * y + 6.0 * q[9] * y + 2.0 * q[10] * x
+    along0, along1 = m00 * a + m01 * b, m01 * a + m11 * b
+    power = 1.0
     for n in range(4):
-        e *= s
-        D[0, 5 + n], D[1, 5 + n] = (f * a + skew * b) * e, g * b * e
-    xx, xy, yy = r2 + 2.0 * a * a, 2.0 * a * b, r2 + 2.0 * b * b
+        power *= r2
+        c0, c1 = x * power, y * power
+        if q[LENS] == DIVISION:
+            c0, c1 = (along0 * by_k1, along1 * by_k1) if n == 0 else (0.0, 0.0)
+        D[0, 5 + n], D[1, 5 + n] = f * c0 + skew * c1, g * c1
     D[0, 9], D[1, 9] = f * xy + skew * yy, g * yy
     D[0, 10], D[1, 10] = f * xx + skew * xy, g * xy
     D[0, 11], D[1, 11] = 0.0, 0.0
-    m00 = d + 2.0 * slope * a * a + 2.0 * q[9] * b + 6.0 * q[10] * a
-    m01 = 2.0 * slope * a * b + 2.0 * q[9] * a + 2.0 * q[10] * b
-    m11 = d + 2.0 * slope * b * b + 6.0 * q[9] * b + 2.0 * q[10] * a
-    D[0, 12], D[0, 13] = f * m00 + skew * m01, f * m01 + skew * m11
-    D[1, 12], D[1, 13] = g * m01, g * m11
+    n00, n01 = scale * m00 + 2.0 * growth * along0 * a, scale * m01 + 2.0 * growth * along0 * b
+    n10, n11 = scale * m01 + 2.0 * growth * along1 * a, scale * m11 + 2.0 * growth * along1 * b
+    D[0, 12], D[0, 13] = f * n00 + skew * n10, f * n01 + skew * n11
+    D[1, 12], D[1, 13] = g * n10, g * n11
