@@ -290,7 +290,8 @@ def with_angles_of_view(
     answer = [dict(own) for own in intervals]
     found: dict[tuple[int, ...], dict[str, IntrinsicInterval]] = {}
     for view in np.flatnonzero(model.registered).tolist():
-        g, width, height = int(model.cameras.group[view]), *model.sizes[view].tolist()
+        g = int(model.cameras.group[view])
+        width, height = (int(side) for side in model.sizes[view])
         if (g, width, height) not in found:
             row, number, focal = model.cameras.intrinsics[g], poses.number[g], answer[view]["focal_px"]
             columns = np.flatnonzero(number >= 0)
