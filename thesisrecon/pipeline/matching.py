@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from thesisrecon.arrays import B8, F64, rows_of_views
+from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
 from thesisrecon.errors import Notice, StageFailure, counted
@@ -206,22 +207,20 @@ class FromImages:
         first = rng.permutation(n - 1)
         others = np.sort(rng.integers(0, n, (LENS_PAIRS // 2, 2)), axis=1)
 
-        def seeds(pairs: Any, orientation: Any) -> list[Matches]:
+        def seeds(pairs: I64, most: int | None) -> list[Matches]:
             found = list[Matches]()
             for i, j in pairs.tolist():
-                sets = seed_matches(
-                    features[i], features[j], (i, j), orientation=orientation, ratio=matching.ratio
-                )
-                found.append(max((matches for matches, _ in sets), key=lambda m: len(m.xy1)))
+                sets = seed_matches(features[i], features[j], (i, j), ratio=matching.ratio)
+                found.append(max((matches for matches, _ in islice(sets, most)), key=lambda m: len(m.xy1)))
             return found
 
         # Half of the pairs are neighbours by name, which overlap in a sequence; few of them show most lenses.
         near = np.column_stack([first, first + 1])[: LENS_PAIRS // 2]
-        upright = "rotated" if matching.orientation == "rotated" else "upright"
-        if bends_little(job, seeds(near[:FEW_LENS_PAIRS], upright)):
+        # The first set of seeds is upright.
+        if bends_little(job, seeds(near[:FEW_LENS_PAIRS], 1)):
             return None
         some = np.unique(np.concatenate([near, others[others[:, 0] < others[:, 1]]]), axis=0)
-        return lens_of_matches(job, seeds(some, matching.orientation))
+        return lens_of_matches(job, seeds(some, None))
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """Match the pairs and estimate their epipolar geometry; weak ones again with oblique views."""
