@@ -125,7 +125,7 @@ def patched():
 
 
 KNOWN = (
-    *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json", "tiles/tile-0000.glb",
+    *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json",
     "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
     "frames.json", "strip.html", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
     "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "scene.mvs",

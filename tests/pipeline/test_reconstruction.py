@@ -22,7 +22,7 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import SequenceWindow
-from thesisrecon.pipeline import algorithm1, matching, outputs, stages
+from thesisrecon.pipeline import algorithm1, matching, stages
 from thesisrecon.pipeline.run import name_images, stream
 from thesisrecon.records import Image
 from thesisrecon.surface import fusion
@@ -182,55 +182,34 @@ def small_limit(monkeypatch):
     config = fake_config(model=SurfaceModel(fusion=VolumetricFusion(tolerance=0.0)))
     object.__setattr__(config.model, "max_glb_mb", 0.03)
     monkeypatch.setattr(SurfaceModel, "max_glb_mb", 0.03)
-    monkeypatch.setattr(outputs, "TILE_FACES", 500)
-    monkeypatch.setattr(outputs, "TILE_MB", 0.02)
     return config
 
 
-def test_a_model_above_the_size_limit_is_reduced_and_whole_in_tiles_of_bounded_size(tmp_path, small_limit):
+def test_a_model_above_the_size_limit_is_reduced_and_whole_beside_it(tmp_path, small_limit):
     result = run(tmp_path, until="model", threads=1, config=small_limit)
     mesh = result.mesh
-    (sentence,) = (text for text in result.warnings if "tiles/tiles.json" in text)
-    assert sentence.endswith("model-full.glb holds all")
+    assert sum(text.endswith("model-full.glb holds all") for text in result.warnings) == 1
     assert (tmp_path / "model.glb").stat().st_size <= 30_000
     reduced = read_mesh(tmp_path / "model.glb")
     assert len(reduced.faces) < len(mesh.faces) == len(read_mesh(tmp_path / "model-full.glb").faces)
     np.testing.assert_allclose(reduced.vertices[:, 2], 8.0, atol=0.05)
-    coarse, *tiles = read(tmp_path / "tiles" / "tiles.json")["tiles"]
-    assert (coarse["file"], coarse["level"], coarse["faces"]) == ("../model.glb", 0, len(reduced.faces))
-    assert len(tiles) > 4
-    names = {"tiles.json", *(tile["file"] for tile in tiles)}
-    assert {path.name for path in (tmp_path / "tiles").iterdir()} == names
-    found = []
-    for tile in tiles:
-        path = tmp_path / "tiles" / tile["file"]
-        assert path.stat().st_size <= 20_000
-        there = read_mesh(path)
-        assert (tile["level"], tile["faces"]) == (1, len(there.faces))
-        loaded = trimesh.load(path, force="mesh", process=False)
-        np.testing.assert_array_equal(tile["box"], loaded.bounds)
-        found.append(there.vertices[there.faces].reshape(-1, 9))
-    wanted = mesh.vertices[mesh.faces].reshape(-1, 9).astype(np.float32)
-    np.testing.assert_array_equal(*(np.unique(rows, axis=0) for rows in (np.concatenate(found), wanted)))
-    assert sum(map(len, found)) == len(mesh.faces)
     refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
 
 
-def test_a_run_with_fewer_images_in_the_same_folder_leaves_no_old_tiles(tmp_path, small_limit, monkeypatch):
+def test_a_smaller_run_in_the_same_folder_leaves_no_whole_model(
+    tmp_path, small_limit, monkeypatch
+):
     out = tmp_path / "out"
     result = run(out, until="model", config=small_limit)
     thesisrecon.save(result, tmp_path / "copy")
-    for name in ("tiles", "model-full.glb"):
-        assert (tmp_path / "copy" / name).exists()
-        assert (out / name).exists()
-    assert "all triangles are in the tiles of" in summary_text(result.summary, out)
+    assert (tmp_path / "copy" / "model-full.glb").is_file()
+    assert "all triangles are in" in summary_text(result.summary, out)
     object.__setattr__(small_limit.model, "max_glb_mb", 50.0)
     monkeypatch.setattr(SurfaceModel, "max_glb_mb", 50.0)
     run(out, 3, until="model", config=small_limit, overwrite=True)
     assert (out / "model.glb").is_file()
-    assert not (out / "tiles").exists()
     assert not (out / "model-full.glb").exists()
-    assert "tiles" not in summary_text(read(out / "summary.json"), out)
+    assert "all triangles" not in summary_text(read(out / "summary.json"), out)
 
 
 def test_no_depths_are_one_sentence_and_the_cameras_stay(tmp_path):

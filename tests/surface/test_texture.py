@@ -25,8 +25,8 @@ from thesisrecon.imaging.raster import rasterize, vertex_normals
 from thesisrecon.records import TexturedMesh
 from thesisrecon.surface import _texture_blending as blending
 from thesisrecon.surface import model as texture_atlas
-from thesisrecon.surface._mesh import face_neighbours, halve_surface
-from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, _pack_rectangles, cut_tile, texture_mesh
+from thesisrecon.surface._mesh import face_neighbours
+from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, _pack_rectangles, texture_mesh
 
 GAINS = (1.0, 0.85, 1.1, 0.95, 1.05, 0.9, 1.0, 1.1)
 
@@ -289,27 +289,6 @@ def test_a_part_of_the_surface_uses_no_view_away_from_it_and_each_one_that_shows
         assert may or not (ahead & inside).any()
         used += may
     assert 20 < used < 150
-
-
-def test_a_tile_has_the_texels_and_corners_of_the_whole(sphere):
-    whole = texture_mesh(sphere, [photograph(m) for m in ring_of()[:5]])
-    part = halve_surface(whole, np.ones(len(whole.faces), int), len(whole.faces) // 3)
-    assert whole.untextured.any()
-    texels = 0
-    for k in range(part.max() + 1):
-        faces = np.flatnonzero(part == k)
-        tile = cut_tile(whole, faces)
-        np.testing.assert_array_equal(tile.vertices[tile.faces], whole.vertices[whole.faces[faces]])
-        np.testing.assert_array_equal(tile.untextured, whole.untextured[faces])
-        for weights in ([1, 0, 0], [0, 1, 0], [0.2, 0.3, 0.5]):
-            (x, y), (x_whole, y_whole) = (
-                np.floor(np.asarray(weights) @ uv + 0.2).astype(int).T for uv in (tile.uv, whole.uv[faces])
-            )
-            np.testing.assert_array_equal(tile.texture[y, x], whole.texture[y_whole, x_whole])
-        texels += tile.texture[..., 0].size
-    assert texels < 2.0 * whole.texture[..., 0].size
-    plain = cut_tile(sphere, np.arange(10))
-    assert (len(plain.faces), plain.texture) == (10, None)
 
 
 def test_faces_are_continued_by_a_texel():

@@ -136,8 +136,8 @@ def summary_text(summary: Mapping[str, Any], out: Path) -> str:
     lines += _intrinsic_lines(summary["cameras"])
     if summary.get("model"):
         lines.append(f"model with {counted(summary['model']['faces'], 'triangle')}: {out / 'model.glb'}")
-        if (tiles := out / "tiles" / "tiles.json").is_file():
-            lines.append(f"reduced there; all triangles are in the tiles of {tiles}")
+        if (whole := out / "model-full.glb").is_file():
+            lines.append(f"reduced there; all triangles are in {whole}")
     groups = summary.get("groups", ())
     elsewhere = {name for group in groups for name in group["names"] if name not in group["missing"]}
     refused = [one for one in summary["refused"] if one["name"] not in elsewhere]

@@ -135,12 +135,6 @@ def glb_bytes(mesh: TexturedMesh) -> bytes:
     return bytes(made.export(file_type="glb"))
 
 
-def box_in_file(mesh: TexturedMesh) -> list[list[float]]:
-    """Smallest and largest coordinates of a mesh as :func:`write_mesh` writes it."""
-    written = (mesh.vertices * _HALF_TURN).astype(np.float32)
-    return [[float(x) for x in limit] for limit in (written.min(axis=0), written.max(axis=0))]
-
-
 def read_mesh(path: Path) -> TexturedMesh:
     """Read a GLB of :func:`write_mesh`, a PLY or an OBJ, whose axes stay.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon._numba import ThreadPool
-from thesisrecon.arrays import F32, I64, U8
+from thesisrecon.arrays import F32, U8
 from thesisrecon.camera import finite_cameras
 from thesisrecon.config.text import toml_from_config
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
@@ -23,7 +23,7 @@ from thesisrecon.io._colmap import COLMAP_FILES, write_colmap_model
 from thesisrecon.io._exports import cameras_table, write_point_cloud
 from thesisrecon.io._files import as_read, read_json, write_atomically, write_json, write_text
 from thesisrecon.io._images import image_without_pixels
-from thesisrecon.io._meshes import box_in_file, glb_bytes
+from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.pipeline.matching import final_pairs
 from thesisrecon.pipeline.run import FOLDERS, Run, Until, name_images
@@ -33,15 +33,12 @@ from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirectory, StageFolder
 from thesisrecon.selfcalibration.stratified import upgrade_to_affine
-from thesisrecon.surface._mesh import halve_surface
 from thesisrecon.surface._simplification import reduce_faces
-from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, cut_tile, texture_mesh
+from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, texture_mesh
 
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
-PAGE, TILES = "report.html", "tiles/tiles.json"
-TILE_FILES = (TILES, "tiles/tile-[0-9]*.glb")
-SURFACE_FILES = ("model.glb", "model-full.glb", *TILE_FILES)
+PAGE, SURFACE_FILES = "report.html", ("model.glb", "model-full.glb")
 MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FILES))
@@ -49,8 +46,6 @@ REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FIL
 CONFIG = "config.toml"
 WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (CONFIG, RUN_FILE)))
 """Files that a run writes beside the results of its stages."""
-TILE_FACES, TILE_MB = 100_000, 10.0
-"""Largest number of faces and largest size of a tile in megabytes (10^6 bytes)."""
 MAX_AFFINE = 1e3  # largest affine coordinate in affine.ply, in median depths of the best observed view
 
 
@@ -153,7 +148,7 @@ def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:
 
 
 def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, threads: int) -> list[str]:
-    """Write the mesh as GLB, above ``max_mb`` reduced, with the whole in one file and in tiles; warnings."""
+    """Write the mesh as GLB, above ``max_mb`` reduced, with the whole beside it; return warnings."""
     mesh, path, whole = result.mesh, directory.path / "model.glb", directory.path / "model-full.glb"
     directory.remove(SURFACE_FILES if mesh is None else SURFACE_FILES[1:])
     if mesh is None:
@@ -178,14 +173,9 @@ def _write_surface(directory: RunDirectory, result: RunResult, max_mb: float, th
 
     if (smaller := made(path.name, reduced, warnings, None)) is None:
         return warnings
-    tiles = made(TILES, lambda: write_tiles(directory, mesh, smaller), warnings, 0)
-    if not tiles:
-        directory.remove(TILE_FILES)
-    whole_in = [f"{counted(tiles, 'tile')} ({TILES}) hold all in parts"] if tiles else []
-    whole_in += [f"{whole.name} holds all"] if whole.is_file() else []
     faces = f"{len(smaller.faces)} of {len(mesh.faces)} faces and fewer texels (model.max_glb_mb={max_mb:g})"
-    parts = [f"model.glb is reduced to {faces}", ", and ".join(whole_in)]
-    return [*warnings, "; ".join(filter(None, parts))]
+    whole_in = f"; {whole.name} holds all" if whole.is_file() else ""
+    return [*warnings, f"model.glb is reduced to {faces}{whole_in}"]
 
 
 def _write_records(directory: RunDirectory, result: RunResult) -> None:
@@ -293,31 +283,6 @@ def _thinned_maps(result: RunResult) -> dict[int, F32]:
             step = max(1, -(-max(depth.shape) // DEPTH_PX))
             maps[view.view] = depth[::step, ::step].copy()
     return maps
-
-
-def write_tiles(directory: RunDirectory, whole: TexturedMesh, coarse: TexturedMesh) -> int:
-    """Write a mesh in tiles, halved until small, and a list with the ``coarse`` mesh; their number."""
-    folder = directory.path / "tiles"
-    entries = [{"file": "../model.glb", "level": 0, "faces": len(coarse.faces), "box": box_in_file(coarse)}]
-    open_ = _halves(whole, np.arange(len(whole.faces)), TILE_FACES)
-    while open_:
-        faces = open_.pop()
-        tile = cut_tile(whole, faces)
-        content = glb_bytes(tile)
-        if len(content) > 1e6 * TILE_MB and len(faces) > 1:
-            open_ += _halves(tile, faces, -(-len(faces) // 2))
-            continue
-        path = folder / f"tile-{len(entries) - 1:04d}.glb"
-        write_atomically(path, content)
-        entries.append({"file": path.name, "level": 1, "faces": len(faces), "box": box_in_file(tile)})
-    write_json(directory.path / TILES, {"tiles": entries})
-    return len(entries) - 1
-
-
-def _halves(mesh: TexturedMesh, faces: I64, largest: int) -> list[I64]:
-    """Divide the numbers ``faces`` (M,) of faces into parts of at most ``largest``, in reverse order."""
-    part = halve_surface(mesh, np.ones(len(faces), dtype=np.int64), largest)
-    return [faces[part == k] for k in range(part.max(), -1, -1)]
 
 
 def best_result(tried: Sequence[RunResult]) -> RunResult:

@@ -18,7 +18,7 @@ from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.imaging.resampling import resample, smooth
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
 from thesisrecon.surface import _texture_blending
-from thesisrecon.surface._mesh import components, connected_parts, face_neighbours, select_faces
+from thesisrecon.surface._mesh import components, face_neighbours
 from thesisrecon.surface.bspline import BSplineSurface
 from thesisrecon.surface.fusion import DepthSheets, VolumetricFusion
 
@@ -260,24 +260,6 @@ def _fill(
     return texture
 
 
-def cut_tile(mesh: TexturedMesh, faces: I64) -> TexturedMesh:
-    """Cut the faces (K,), in increasing order, out of a mesh, with the part of the texture that they show."""
-    keep = np.zeros(len(mesh.faces), dtype=bool)
-    keep[faces] = True
-    tile = select_faces(mesh, keep)
-    if tile.uv is None or tile.texture is None:
-        return tile
-    # Faces with a common corner in the texture are one chart.
-    corners = np.column_stack([tile.faces.ravel(), tile.uv.reshape(-1, 2)])
-    number = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    chart = connected_parts(number, int(number.max(initial=-1)) + 1)
-    whole, charts = tile.texture, int(chart.max(initial=-1)) + 1
-    rectangles = _rectangles(tile.uv, np.zeros_like(chart), chart, np.array([whole.shape[1::-1]]))
-    offsets, size = _pack_rectangles(rectangles[:, 2:] - rectangles[:, :2])
-    texture = _fill(lambda _: whole, np.zeros(charts, dtype=np.int64), rectangles, offsets, size)
-    return replace(tile, uv=tile.uv + (offsets - rectangles[:, :2])[chart][:, None, :], texture=texture)
-
-
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
     """Append patches with the colours of unseen faces: those of the nearest seen faces along the surface."""
     swatch = 3  # Texels per side of the patch of unseen faces of similar colour
@@ -341,7 +323,7 @@ class SurfaceModel:
     """Fusion of these surfaces."""
     max_glb_mb: float = 50.0
     """Largest size of model.glb in megabytes, at least 5; the mesh of a larger one is reduced, and
-    model-full.glb holds all of it, as do the tiles."""
+    model-full.glb holds all of it."""
 
     def __post_init__(self) -> None:
         if not self.max_glb_mb >= 5.0:
