@@ -48,11 +48,6 @@ class Image(Record):
             object.__setattr__(self, "mask", known)
 
     @property
-    def has_pixels(self) -> bool:
-        """Whether the image was read; otherwise its pixels are a grey placeholder without memory."""
-        return any(self.rgb.strides)
-
-    @property
     def size(self) -> tuple[int, int]:
         """(width, height) at working size."""
         return self.rgb.shape[1], self.rgb.shape[0]

@@ -196,9 +196,7 @@ def test_a_model_above_the_size_limit_is_reduced_and_whole_beside_it(tmp_path, s
     refuses(ValueError, "max_glb_mb must be at least 5; got 1", SurfaceModel, max_glb_mb=1)
 
 
-def test_a_smaller_run_in_the_same_folder_leaves_no_whole_model(
-    tmp_path, small_limit, monkeypatch
-):
+def test_a_smaller_run_in_the_same_folder_leaves_no_whole_model(tmp_path, small_limit, monkeypatch):
     out = tmp_path / "out"
     result = run(out, until="model", config=small_limit)
     thesisrecon.save(result, tmp_path / "copy")

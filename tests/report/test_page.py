@@ -114,16 +114,6 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
     assert synthetic.Structure(page).count("figure") == 1  # the matrix
 
 
-def test_warnings_of_the_run_stand_beside_those_of_its_stages():
-    data = synthetic.projective_run()
-    stage_warning = data.reports[1].warnings[0]
-    summary = {"warnings": [stage_warning, "2 initial pairs were tried"]}
-    page = render_report(replace(data, summary=summary))
-    section = page[page.index('id="warnings"') : page.index('id="config"')]
-    assert section.count("<li>") == 2
-    assert "2 initial pairs were tried" in section
-
-
 def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
@@ -224,39 +214,25 @@ def test_numbers_carry_as_many_digits_as_they_deserve(value, std, text):
     assert _assessment.plus_minus(value, std) == text
 
 
-def test_the_assessment_is_honest():
-    data = synthetic.made_up_run(points=100)
-    assert data.metric is not None
-    assert _assessment.assess(data).word == "Trusted, but incomplete"
-    phone = replace(data.metric, limitations=("image #1 is blurred",))
-    assert _assessment.assess(replace(data, metric=phone)).reasons == ("Image #1 is blurred.",)
+def test_the_assessment_and_the_key_facts_are_honest():
+    data, early = synthetic.made_up_run(points=100), synthetic.projective_run()
     doubt = replace(data.metric, trusted=False, failed_checks=("pure rotation",))
-    assessment = _assessment.assess(replace(data, metric=doubt))
-    assert (assessment.level, assessment.reasons) == ("doubt", ("Pure rotation.",))
-    early = _assessment.assess(synthetic.projective_run())
-    assert early.level == "open"
-    assert "projective reconstruction" in early.sentence
-
-
-def test_a_failure_states_reason_evidence_and_advice():
+    phone = replace(data.metric, limitations=("image #1 is blurred",))
     failure = StageFailure("no pair overlaps", "23 matches, 60 needed", "take more photographs")
-    data = replace(synthetic.projective_run(), projective=None, until=None, end=failure)
-    assessment = _assessment.assess(replace(data, reports=data.reports[:2]))
-    assert assessment.level == "bad"
-    assert assessment.sentence == "No pair overlaps."
-    assert assessment.reasons == ("23 matches, 60 needed.", "The last stage that finished was matches.")
-    assert assessment.advice == "Take more photographs."
-
-
-def test_the_head_of_the_page_summarises_the_run():
-    labels = [fact.label for fact in _assessment.key_facts(synthetic.made_up_run(points=100), None)]
-    assert labels == ["Cameras registered", "Focal length", "Principal point", "Points", "Computing time"]
-    facts = _assessment.key_facts(synthetic.made_up_run(points=100), ResidualSummary(1000, 0.8, 1.0, 2.0))
+    failed = replace(early, projective=None, until=None, end=failure, reports=early.reports[:2])
+    done = "The last stage that finished was matches."
+    for run, level, reasons in (
+        (data, "good", ()), (replace(data, metric=phone), "good", ("Image #1 is blurred.",)),
+        (replace(data, metric=doubt), "doubt", ("Pure rotation.",)), (early, "open", ()),
+        (failed, "bad", ("23 matches, 60 needed.", done)),
+    ):  # fmt: skip
+        found = _assessment.assess(run)
+        assert (found.level, found.reasons) == (level, reasons)
+    assert (found.sentence, found.advice) == ("No pair overlaps.", "Take more photographs.")
+    facts = _assessment.key_facts(data, ResidualSummary(1000, 0.8, 1.0, 2.0))
     assert facts[3].value == "0.80 px median"
     assert facts[3].note == "1.00 px RMS over 1\u202f000 observations; at working size 0.20 px median"
-    early = replace(synthetic.projective_run(), projective=None)
-    assert [fact.label for fact in _assessment.key_facts(early, None)] == [
-        "Images",
-        "Pairs accepted",
-        "Computing time",
-    ]
+    # A warning of a stage stands once.
+    summary = {"warnings": [early.reports[1].warnings[0], "2 initial pairs were tried"]}
+    page = render_report(replace(early, summary=summary))
+    assert page[page.index('id="warnings"') : page.index('id="config"')].count("<li>") == 2
