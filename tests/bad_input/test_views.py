@@ -109,7 +109,7 @@ BETWEEN = [
     ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "'--frames'"),
     ("background", ["a.png", "--background", "#" * 9000], 2, "--background"),
     ("small", ["a.png", "b.png", "--max-size", "9"], 2, "--max-size takes at least 64 px"),
-    ("one", ["a.png"], 2, "2 or 3 images; got 1"),
+    ("one", ["a.png"], 2, "2 images; got 1"),
     ("folder", ["sub", "a.png"], 2, "is a folder"),
     ("copy", ["a.png", "copy.png"], 2, "a.png and copy.png are the same image"),
     ("sizes", ["a.png", "less.png"], 2, "the same size; a.png is 96 x 80 and less.png is 80 x 64 px"),

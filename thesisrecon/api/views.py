@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -158,7 +156,7 @@ def prepare_pair(
         one if isinstance(one, Image) else read_image(one, max_size_px=config.images.max_size_px).images[0]
         for one in eight_bit_images(image1, image2)
     )
-    require_comparable_images((first, second))
+    _require_comparable_images(first, second)
     pair = match_pair(first, second, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))
     try:
@@ -175,14 +173,13 @@ def prepare_pair(
     return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
 
 
-def require_comparable_images(images: Sequence[Image]) -> None:
+def _require_comparable_images(first: Image, second: Image) -> None:
     """Raise ``UsageError`` unless the images have the same size and different content."""
-    for first, second in combinations(images, 2):
-        if first.size != second.size:
-            sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
-            raise UsageError(f"interpolation needs images of the same size; {sizes} px")
-        if np.array_equal(first.rgb, second.rgb):
-            raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
+    if first.size != second.size:
+        sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
+        raise UsageError(f"interpolation needs images of the same size; {sizes} px")
+    if np.array_equal(first.rgb, second.rgb):
+        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
 
 
 def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None:

@@ -215,9 +215,7 @@ _SIZE_HELP = "Frame size (px); by default that of the first image, at most 1000.
 _LIGHT_HELP = "Lighting: none, camera headlight or sun."
 _BACKGROUND_HELP = "Background colour, such as white or #20304f."
 _METHOD_HELP = "Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."
-_TWO_OR_THREE = typer.Argument(
-    parser=common.parse_folder, metavar="IMAGE IMAGE [IMAGE]", help="Two or three image files."
-)
+_TWO_IMAGES = typer.Argument(parser=common.parse_folder, metavar="IMAGE IMAGE", help="Two image files.")
 Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
 
 
@@ -373,7 +371,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def interpolate(
-    images: Annotated[list[Path], _TWO_OR_THREE],
+    images: Annotated[list[Path], _TWO_IMAGES],
     method: Annotated[
         Literal["interpolation", "tensor"], typer.Option("--method", help=_METHOD_HELP)
     ] = "interpolation",
@@ -384,7 +382,7 @@ def interpolate(
     threads: common.Threads = 0,
     overwrite: common.Overwrite = False,
 ) -> None:
-    """Compute views between two or three images."""
+    """Compute views between two images."""
     common.cap_threads(threads)
     if max_size is not None and max_size < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {max_size}")

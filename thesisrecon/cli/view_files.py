@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from thesisrecon.api.views import (
     prepare_pair,
     prepare_trilinear_views,
     render,
-    require_comparable_images,
 )
 from thesisrecon.arrays import U8
 from thesisrecon.camera import Camera
@@ -63,41 +61,28 @@ class ViewSequence:
 def interpolated_sequence(
     images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int, threads: int
 ) -> ViewSequence:
-    """Interpolate from the first image to the second and, of three, across their triangle (section 1.2)."""
-    require_comparable_images(images)
+    """Interpolate from the first image to the second (section 1.2)."""
+    first, second = images
+    pair = prepare_pair(first, second, config=config, seed=seed)
     path = np.linspace(0.0, 1.0, frames).tolist() if frames > 1 else [_MIDWAY]
-    legs = [prepare_pair(images[0], images[1], config=config, seed=seed)]
-    stops, weights = [(0, s) for s in path], [[1.0 - s, s] for s in path]
-    if len(images) == 3:
-        middle = Image("the interpolated view", legs[0].view(_MIDWAY), images[0].original_size)
-        legs.append(prepare_pair(middle, images[2], config=config, seed=seed))
-        stops = [(0, u) if u <= _MIDWAY else (1, 2.0 * u - 1.0) for u in path]
-        weights = [[1 - s, s, 0.0] if leg == 0 else [0.5 * (1 - s), 0.5 * (1 - s), s] for leg, s in stops]
-
-    def draw(k: int) -> U8:
-        leg, s = stops[k]
-        return legs[leg].view(s, threads=threads)
-
-    names, maps = [image.name for image in images], [leg.left.disparity for leg in legs]
-    # Shares of the known pixels of the first image.
-    counts = [(detect_monotonicity_violations(d).sum(), np.isfinite(d).sum()) for d in maps]
-    violations = [float(found / max(known, 1)) for found, known in counts]
-    facts = {"images": names, "violating_monotonicity": violations, "known": [leg.known for leg in legs]}
-    captions = [", ".join(f"{100 * a:.0f} % {n}" for a, n in zip(w, names, strict=True)) for w in weights]
-    notes = [
-        f"{100.0 * leg.known:.0f} % of the pixels have a correspondence; {100.0 * share:.1f} % of these "
-        "violate monotonicity, where near surfaces occlude far ones"
-        for share, leg in zip(violations, legs, strict=True)
-    ]
-    return ViewSequence(draw, facts, [{"weights": w} for w in weights], captions, notes)
+    names, disparity = [first.name, second.name], pair.left.disparity
+    # Share of the known pixels of the first image.
+    known = int(np.isfinite(disparity).sum())
+    violations = float(detect_monotonicity_violations(disparity).sum() / max(known, 1))
+    facts = {"images": names, "violating_monotonicity": violations, "known": pair.known}
+    captions = [f"{100 * (1.0 - s):.0f} % {names[0]}, {100 * s:.0f} % {names[1]}" for s in path]
+    note = (
+        f"{100.0 * pair.known:.0f} % of the pixels have a correspondence; {100.0 * violations:.1f} % of "
+        "these violate monotonicity, where near surfaces occlude far ones"
+    )
+    entries = [{"weights": [1.0 - s, s]} for s in path]
+    return ViewSequence(lambda k: pair.view(path[k], threads=threads), facts, entries, captions, [note])
 
 
 def trilinear_sequence(
     images: Sequence[Image], frames: int, *, config: PipelineConfig, seed: int, threads: int
 ) -> ViewSequence:
     """Compute views on the line through both cameras, from half a baseline before to half beyond."""
-    if len(images) != 2:
-        raise UsageError(f"the trilinear tensor takes 2 images; got {len(images)}")
     first, second = images
     if np.array_equal(first.rgb, second.rgb):
         raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
@@ -162,14 +147,14 @@ def interpolate_images(
     overwrite: bool = False,
 ) -> str:  # fmt: skip
     """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
-    if len(paths) not in (2, 3):
-        raise UsageError(f"interpolate takes 2 or 3 images; got {len(paths)}")
+    if len(paths) != 2:
+        raise UsageError(f"interpolate takes 2 images; got {len(paths)}")
     for path in paths:
         if path.is_dir():
             raise UsageError(f"{path} is a folder; interpolate takes image files")
-    for first, second in combinations(paths, 2):
-        if first.is_file() and second.is_file() and first.samefile(second):
-            raise UsageError(f"{first} is given twice; give different images")
+    first, second = paths
+    if first.is_file() and second.is_file() and first.samefile(second):
+        raise UsageError(f"{first} is given twice; give different images")
     with _claimed(folder, method, frames, overwrite=overwrite) as outputs:
         config = PipelineConfig()
         if max_size_px is not None:
