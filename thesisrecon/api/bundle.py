@@ -257,11 +257,9 @@ def _adjusted(
     start: MetricCameras, X: F64, observed: Observations,
     unknown: tuple[B8, IntrinsicsPrior, BundleKnowledge], noise: tuple[float | None, float | None], most: int,
 ) -> tuple[metric.MetricBundleResult, float]:  # fmt: skip
-    """The adjustment, and the weight of its last pass over the noise found.
-
-    First passes estimate noise that is not given: the weight of the prior and the width depend on it. For a
-    loss that redescends they begin with the noise of the start, so that the width falls with the residuals.
-    """
+    """The adjustment, and the weight of its last pass over the noise found."""
+    # First passes estimate noise that is not given: the weight of the prior and the width depend on it. For a
+    # loss that redescends they begin with the noise of the start, so that the width falls with the residuals.
     (free, prior, known), (sigma, width) = unknown, noise
     redescends = known.loss not in ("huber", "squared")
     plain = known.is_empty and not redescends

@@ -120,11 +120,9 @@ TAIL = 4.0  # standard deviation of the noise's tail relative to the noise
 
 @kernel
 def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
-    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood.
-
-    ``mixture`` (5,), updated: sigma, standard deviation of wrong residuals (prior ``spread``), fractions of
-    noise, its tail and wrong residuals.
-    """
+    """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood."""
+    # `mixture` (5,), updated: sigma, standard deviation of wrong residuals (prior `spread`), fractions of
+    # noise, its tail and wrong residuals.
     core_count, tail_count, wrong_count = 1.0, 0.5, 1.0
     n, likelihood = len(residuals), 0.0
     for last in range(rounds - 1, -1, -1):

@@ -67,12 +67,10 @@ def _determinant(a: Three, b: Three, c: Three) -> float:
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def solve_seven_point_batch(X: F64, Y: F64) -> None:
-    """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES), not finite if degenerate.
-
-    ``X`` (28, LANES) holds x1, y1, x2, y2 of seven matches. With t p + q a member of a pencil, det(t p + q) =
-    t^3 + ... has products of entries as coefficients, since F12 F23 F31 + F13 F21 F32 is the determinant of a
-    matrix with zero diagonal.
-    """
+    """Write the pencils and cubics of LANES samples to ``Y`` (ROWS, LANES), not finite if degenerate."""
+    # `X` (28, LANES) holds x1, y1, x2, y2 of seven matches. With t p + q a member of a pencil, det(t p + q) =
+    # t^3 + ... has products of entries as coefficients, since F12 F23 F31 + F13 F21 F32 is the determinant of
+    # a matrix with zero diagonal.
     for k in range(LANES):
         S = _basis_transform(X[0, k], X[1, k], X[4, k], X[5, k], X[8, k], X[9, k], X[12, k], X[13, k])
         T = _basis_transform(X[2, k], X[3, k], X[6, k], X[7, k], X[10, k], X[11, k], X[14, k], X[15, k])
@@ -138,11 +136,9 @@ def _newton_cubic_roots(a: float, b: float, c: float, roots: F64) -> int:
 
 @kernel(fastmath={"contract"}, forceinline=True)
 def _oriented_in_basis(g: F64, Y: F64, lane: int) -> bool:
-    """Return whether the seven matches of a lane can be in front of both cameras of the member ``g`` (6,).
-
-    Oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004): e2 x x2 and F x1 are parallel for an
-    exact match and must agree in direction for all matches or for none.
-    """
+    """Return whether the seven matches of a lane can be in front of both cameras of the member ``g`` (6,)."""
+    # Oriented epipolar constraint (Chum, Werner and Matas, ICPR 2004): e2 x x2 and F x1 are parallel for an
+    # exact match and must agree in direction for all matches or for none.
     g01, g02, g10, g12, g20, g21 = g
     # e2 is at right angles to the columns (0, g10, g20), (g01, 0, g21) and (g02, g12, 0).
     e0, e1, e2 = g10 * g21, g20 * g01, -g10 * g01
@@ -318,12 +314,10 @@ def _draw_batch(points: F64, uniforms: F64, X: F64) -> None:
 def search_fundamental(
     points: F64, columns: F64, uniforms: F64, gate: float, stop: tuple[int, int, float], state: F64, F: F64
 ) -> int:
-    """Score a seven-point sample of ``points`` per row of ``uniforms`` (B, 7) on ``columns`` (4, N).
-
-    Returns the number of samples, with the batch that finds a better ``F`` or when enough are drawn.
-    ``stop``: samples drawn before, minimum number, probability of a sample without outliers. ``state`` (4,):
-    best score, its inlier ratio, points seen and points inside the gate of rejected models.
-    """
+    """Score a seven-point sample of ``points`` per row of ``uniforms`` (B, 7) on ``columns`` (4, N)."""
+    # Returns the number of samples, with the batch that finds a better `F` or when enough are drawn. `stop`:
+    # samples drawn before, minimum number, probability of a sample without outliers. `state` (4,): best
+    # score, its inlier ratio, points seen and points inside the gate of rejected models.
     done, least, confidence = stop
     X, Y = full((28, LANES), 1.0), empty((ROWS, LANES))
     solutions, work = empty((3, 9)), empty(9)

@@ -72,11 +72,9 @@ class _CompetingModel:
 def _competing_starts(
     f: F64, points: F64, weights: F64, H: F64, off_plane: B8, *, band: float, rng: Generator
 ) -> tuple[F64, float]:
-    """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance.
-
-    [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005) is scored on all matches
-    off the plane. In half of the pairs only one match agrees with ``f``: a wrong F often shares most inliers.
-    """
+    """Other F (S, 9) of the plane, and the fraction of matches off it that an F explains by chance."""
+    # [e]x H of the plane and two matches off it (Chum, Werner and Matas, CVPR 2005) is scored on all matches
+    # off the plane. In half of the pairs only one match agrees with `f`: a wrong F often shares most inliers.
     off = np.flatnonzero(off_plane)
     if len(off) < 3:
         return np.empty((0, 9)), 0.0

@@ -279,12 +279,10 @@ def _in_frame(E: F64, inverse1: F64, inverse2: F64, f: F64) -> None:
 
 
 def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: float) -> B8:
-    """Inliers without those behind a camera, and without those of high leverage if chance explains these.
-
-    A wrong match near its epipolar line, as a ``share`` of them is, has any parallax. It stands apart from
-    the right ones, and pulls the fit to itself (high leverage: Hoaglin and Welsch, The American Statistician
-    32, 1978). Where the parallax is within the noise, depths have any sign.
-    """
+    """Inliers without those behind a camera, and without those of high leverage if chance explains these."""
+    # A wrong match near its epipolar line, as a `share` of them is, has any parallax. It stands apart from
+    # the right ones, and pulls the fit to itself (high leverage: Hoaglin and Welsch, The American
+    # Statistician 32, 1978). Where the parallax is within the noise, depths have any sign.
     R, t = pair.pose(relative_pose.essential_from_pose(*pose), np.flatnonzero(inliers))
     with np.errstate(divide="ignore", invalid="ignore"):
         parallax = np.linalg.norm(dehomogenize(pair.x1 @ R.T) - pair.x2[:, :2], axis=1) / pair.inverse2[0, 0]

@@ -272,10 +272,8 @@ def _undetermined(evidence: str) -> StageFailure:
 
 
 def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) -> None:
-    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers.
-
-    A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
-    """
+    """Raise ``StageFailure`` if some homography of wrong matches would have as many inliers."""
+    # A wrong match is an inlier if x2 lies in the ellipse of the largest distance about H x1, or x1 about x2.
     x1, x2 = homogenize(points[:, :2]), points[:, 2:]
     w = x1 @ H[2]
     A = H[:2, :2] - x2[:, :, None] * H[2, :2]
@@ -293,11 +291,9 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
 
 @kernel
 def _through_four(points: F64, samples: I64) -> F64:
-    """Homographies (B', 3, 3) of samples (B, 4) of four matches whose triangles keep their orientation.
-
-    With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
-    fourth, H = B diag(b / a) A^-1; the rows of A^-1 are cross products of the columns of A.
-    """
+    """Homographies (B', 3, 3) of samples (B, 4) of four matches whose triangles keep their orientation."""
+    # With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
+    # fourth, H = B diag(b / a) A^-1; the rows of A^-1 are cross products of the columns of A.
     models, n, s = empty((len(samples), 3, 3)), 0, empty((2, 3))
     d, x = empty((4, 3)), empty((4, 3))
     for sample in samples:

@@ -226,11 +226,10 @@ class ThesisRansac:
 def _search(
     points: F64, distances: Callable[[F64], F64], gate: float, samples: int, enough: float, rng: Generator
 ) -> tuple[F64 | None, B8, int]:
-    """Algorithm 2: F (9,) of seven points with the most of them within the gate, these, and the samples.
-
-    Of equal numbers the lower standard deviation decides (Fischler and Bolles, 1981). More than ``enough``
-    inliers end the search. The thesis' text has n! / s! samples of size s where n! / (s! (n - s)!) is meant.
-    """
+    """Algorithm 2: F (9,) of seven points with the most of them within the gate, these, and the samples."""
+    # Of equal numbers the lower standard deviation decides (Fischler and Bolles, 1981). More than `enough`
+    # inliers end the search. The thesis' text has n! / s! samples of size s where n! / (s! (n - s)!) is
+    # meant.
     best, inliers, best_rank, drawn = None, np.zeros(len(points), dtype=bool), (-np.inf, 0.0), 0
     while drawn < samples and best_rank[0] <= enough:
         if drawn % _BATCH == 0:

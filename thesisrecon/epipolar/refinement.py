@@ -29,11 +29,9 @@ FLATTEST_REL = 1e-14
 
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delta: float, D: F64) -> float:
-    """Derivatives of at most BLOCK residuals by F, columns of ``D`` (11, BLOCK); returns the cost.
-
-    Row 9 is the signed residual, row 10 the weight rho'(r) / r, 0 beyond the gate. No branches and contiguous
-    rows, so that the loop vectorises.
-    """
+    """Derivatives of at most BLOCK residuals by F, columns of ``D`` (11, BLOCK); returns the cost."""
+    # Row 9 is the signed residual, row 10 the weight rho'(r) / r, 0 beyond the gate. No branches and
+    # contiguous rows, so that the loop vectorises.
     X = empty((4, BLOCK))
     for k in range(len(points)):
         for c in range(4):
@@ -81,11 +79,9 @@ def _weighted_derivatives(f: F64, points: F64, criterion: int, gate: float, delt
 
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _reprojection_derivatives(f: F64, points: F64, gate: float, delta: float, D: F64) -> float:
-    """As :func:`_weighted_derivatives` for the distances r to the nearest exact match.
-
-    The nearest match p comes from the iteration of Kanatani, Sugaya and Niitsuma (BMVC 2008). Since r is
-    minimal there, dr = d(p2' F p1) / |gradient at p| without the motion of p.
-    """
+    """As :func:`_weighted_derivatives` for the distances r to the nearest exact match."""
+    # The nearest match p comes from the iteration of Kanatani, Sugaya and Niitsuma (BMVC 2008). Since r is
+    # minimal there, dr = d(p2' F p1) / |gradient at p| without the motion of p.
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f
     outside = delta * (gate - 0.5 * delta)
     cost = 0.0

@@ -275,11 +275,9 @@ class _TensorEquations:
         return np.asarray(np.linalg.svd(self.A @ whitening, compute_uv=False)[::-1])
 
     def solve_with_epipoles(self, e2: F64, e3: F64) -> F64:
-        """The unit tensor of cameras with these epipoles (3,) in views 2 and 3 and least |A t| (HZ 16.3).
-
-        T_i^jk = a_i^j e3^k - e2^j b_i^k is linear in the other entries of the cameras: t = E (a, b). E (27,
-        18) has rank 15, and t is sought in its range.
-        """
+        """The unit tensor of cameras with these epipoles (3,) in views 2 and 3 and least |A t| (HZ 16.3)."""
+        # T_i^jk = a_i^j e3^k - e2^j b_i^k is linear in the other entries of the cameras: t = E (a, b). E (27,
+        # 18) has rank 15, and t is sought in its range.
         eye = np.eye(3)
         left = np.einsum("ri,sj,k->ijkrs", eye, eye, e3).reshape(27, 9)
         right = np.einsum("ri,j,sk->ijkrs", eye, e2, eye).reshape(27, 9)

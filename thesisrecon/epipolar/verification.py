@@ -175,10 +175,8 @@ def _plane_noise(squared: F64) -> float:
 
 
 def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
-    """Standard errors by which the squared parallax of the matches near the plane exceeds the noise.
-
-    Of the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
-    """
+    """Standard errors by which the squared parallax of the matches near the plane exceeds the noise."""
+    # Of the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
     k = int(near.sum())
     if k < MINIMUM - 4:
         return float("inf")

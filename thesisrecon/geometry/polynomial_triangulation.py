@@ -84,12 +84,10 @@ def _least_stationary(pencil: _PencilCost, c: F64, whole: bool) -> float:
 
 @kernel
 def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, most: float, c: F64) -> _Four:
-    """Return the best member q of the pencil and n of both images.
-
-    q is counted from the line through one image's point. That image has x'L = ``own``, the form B, Q = q'Bq
-    of the line through its point and D = det B; the second ``other`` and E. ``most``, a bound on the cost,
-    restricts the search to the sector of lines within its root of the point.
-    """
+    """Return the best member q of the pencil and n of both images."""
+    # q is counted from the line through one image's point. That image has x'L = `own`, the form B, Q = q'Bq
+    # of the line through its point and D = det B; the second `other` and E. `most`, a bound on the cost,
+    # restricts the search to the sector of lines within its root of the point.
     a, b = own
     q0, q1 = b, -a
     p0, p1 = B[1] * b - B[2] * a, B[1] * a - B[0] * b

@@ -147,10 +147,8 @@ def _reduce(A: F64) -> bool:
 
 @kernel
 def _determinant_in_z(A: F64, B: F64, c: F64) -> None:
-    """Fill the polynomials B (3, 3, 5) in z of x, y and 1, and c (11,) of their determinant.
-
-    The rows x^2 z - z x^2, y^2 z - z y^2 and xyz - z xy of the reduced A have no other products of x and y.
-    """
+    """Fill the polynomials B (3, 3, 5) in z of x, y and 1, and c (11,) of their determinant."""
+    # The rows x^2 z - z x^2, y^2 z - z y^2 and xyz - z xy of the reduced A have no other products of x and y.
     B[:] = 0.0
     c[:] = 0.0
     for i in range(3):

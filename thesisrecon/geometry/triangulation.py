@@ -105,11 +105,9 @@ def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64
 def _triangulate_each_linear(
     P: F64, scale: F64, centre: F64, listed: tuple[I64, I64, F64], passes: int, tolerance: float, X: F64
 ) -> None:
-    """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,).
-
-    Points observed from one ``centre`` (V, 4) stay 0. ``passes`` > 0: repeat with each row over the depth
-    p3'X of the last pass until no depth changes by more than ``tolerance``, else the better answer is kept.
-    """
+    """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,)."""
+    # Points observed from one `centre` (V, 4) stay 0. `passes` > 0: repeat with each row over the depth p3'X
+    # of the last pass until no depth changes by more than `tolerance`, else the better answer is kept.
     start, view, xy = listed
     R, row, x, y = zeros((4, 4)), empty(4), empty(4), empty(4)
     weight = empty(len(xy))
@@ -286,10 +284,8 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
-    """Positive real roots of quartics c (B, 5), highest power first, with their rows (Ferrari).
-
-    Those of the reversed quartic are 1 / x: the larger of both ends leads.
-    """
+    """Positive real roots of quartics c (B, 5), highest power first, with their rows (Ferrari)."""
+    # Those of the reversed quartic are 1 / x: the larger of both ends leads.
     small = np.abs(c[:, 0]) < np.abs(c[:, 4])
     c = np.where(small[:, None], c[:, ::-1], c)
     good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))

@@ -63,11 +63,9 @@ def _row_span(inverse: F64, near: float, y: float, width: int) -> tuple[int, int
 def _rasterize_rows(
     corners: F64, near: float, rows: tuple[int, int], depth: F32, face: I64, weights: F32
 ) -> None:
-    """Draw triangles ``corners`` (M, 3, 3) into a z-buffer of some rows; the first of equal depths stays.
-
-    With the image points of a face as columns of M, M^-1 (x, y, 1) are its barycentric coordinates, each over
-    the depth: no clipping at the near plane (Olano and Greer, "2D homogeneous coordinates", 1997).
-    """
+    """Draw triangles ``corners`` (M, 3, 3) into a z-buffer of some rows; the first of equal depths stays."""
+    # With the image points of a face as columns of M, M^-1 (x, y, 1) are its barycentric coordinates, each
+    # over the depth: no clipping at the near plane (Olano and Greer, "2D homogeneous coordinates", 1997).
     width = depth.shape[1]
     inverse = empty((3, 3))
     top_row = rows[0]

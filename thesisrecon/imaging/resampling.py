@@ -166,11 +166,9 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
 
 @kernel
 def _sample_image(image: F32, xy: F64, out: F32) -> None:
-    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C).
-
-    The kernel is widened along each axis of the image where adjacent positions are more than a pixel apart.
-    NaN outside the pixel centres, or beside a NaN pixel; other NaN pixels are left out.
-    """
+    """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C)."""
+    # The kernel is widened along each axis of the image where adjacent positions are more than a pixel apart.
+    # NaN outside the pixel centres, or beside a NaN pixel; other NaN pixels are left out.
     height, width, channels = image.shape
     wx, wy = empty(MAX_TAPS), empty(MAX_TAPS)
     total = empty(channels)

@@ -45,11 +45,9 @@ def window_raster(side: int) -> F32:
 def sample_window(
     pixels: F32, level: I64, to_level: float, xy: F64, step: F64, raster: F32, out: F32
 ) -> bool:
-    """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image.
-
-    Column a and row b of the ``raster`` is at ``xy + step @ (a, b)``; ``to_level`` = level pixels per image
-    pixel.
-    """
+    """Sample a square window bilinearly to ``out`` (side^2,); False if it leaves the image."""
+    # Column a and row b of the `raster` is at `xy + step @ (a, b)`; `to_level` = level pixels per image
+    # pixel.
     offset, height, width = level[0], level[1], level[2]
     x0 = (xy[0] + 0.5) * to_level - 0.5
     y0 = (xy[1] + 0.5) * to_level - 0.5
@@ -169,10 +167,8 @@ class PreparedImage:
 def prepare_image(
     image: Image, features: Features, *, window: int = SIDE, colour: bool = False
 ) -> PreparedImage:
-    """Compute the grey pyramid and the corner cells of an image, for corner windows of side ``window``.
-
-    It starts at twice the image size with corners of scale below 1. ``colour``: windows of the three colours.
-    """
+    """Compute the grey pyramid and the corner cells of an image, for corner windows of side ``window``."""
+    # It starts at twice the image size with corners of scale below 1. `colour`: windows of the three colours.
     doubled = len(features.scale) > 0 and float(features.scale.min()) < 0.75
     base = 0.5 if doubled else 1.0
     pixels, levels = _pyramid(image.gray, doubled)

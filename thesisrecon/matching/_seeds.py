@@ -242,10 +242,8 @@ def corners_of_seeds(xy1: F64, xy2: F64, known: Matches) -> Matches:
 
 @kernel
 def nearest_neighbours(xy: F64, of: F64, count: int) -> I64:
-    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2).
-
-    The nearest is first, of equally distant ones that with the smaller number.
-    """
+    """Numbers (N, count) of the points ``xy`` (M, 2) nearest to each position ``of`` (N, 2)."""
+    # The nearest is first, of equally distant ones that with the smaller number.
     low, cell, shape = _grid(xy)
     start, order = _fill_cells(xy, low, cell, shape)
     found, near = empty((len(of), count), np.int64), empty(count)

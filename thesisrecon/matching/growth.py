@@ -52,12 +52,10 @@ def _median(values: F64, ordered: F64) -> float:
 
 @kernel
 def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
-    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K).
-
-    Weights 1 / (d^2 + d_mean^2), Cauchy reweighting against other surfaces, and the mean of the maps
-    ``prior`` (M, 2, 2) for collinear neighbours. Returns map (N, 2, 2), position (N, 2) and its uncertainty
-    (N,) px.
-    """
+    """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K)."""
+    # Weights 1 / (d^2 + d_mean^2), Cauchy reweighting against other surfaces, and the mean of the maps
+    # `prior` (M, 2, 2) for collinear neighbours. Returns map (N, 2, 2), position (N, 2) and its uncertainty
+    # (N,) px.
     count, k = neighbours.shape
     affine, position, spread = empty((count, 2, 2)), empty((count, 2)), empty(count)
     offset, rest, a0, z = empty((k, 2)), empty((k, 2)), empty((2, 2)), empty((3, 2))
@@ -133,13 +131,11 @@ def _match_guided(
     view1: tuple[F32, I64, float], corners1: tuple[F64, F32], predicted: tuple[F64, F64, F64],
     corners2: tuple[F64, F32, F32], grid2: tuple[float, I64, I64, I64], gate: tuple[F64, F64, float],
 ) -> tuple[I64, F32, F32]:  # fmt: skip
-    """Most similar corner of image 2 near the predicted position and epipolar line of each corner.
-
-    ``view1``: pixels, levels, base; ``corners1``: xy (N, 2), scale (N,); ``predicted``: affine (N, 2, 2),
-    position (N, 2), radius (N,) px; ``corners2``: xy, scale, patches (C, 225); ``grid2``: cell size, shape
-    (2,), start, order; ``gate``: F, half widths (N,) of the bands px, minimum correlation. Returns the corner
-    (-1: none), its correlation and the second best elsewhere (-1: none).
-    """
+    """Most similar corner of image 2 near the predicted position and epipolar line of each corner."""
+    # `view1`: pixels, levels, base; `corners1`: xy (N, 2), scale (N,); `predicted`: affine (N, 2, 2),
+    # position (N, 2), radius (N,) px; `corners2`: xy, scale, patches (C, 225); `grid2`: cell size, shape
+    # (2,), start, order; `gate`: F, half widths (N,) of the bands px, minimum correlation. Returns the corner
+    # (-1: none), its correlation and the second best elsewhere (-1: none).
     xy1, scale1 = corners1
     affine, position, radius = predicted
     xy2, scale2, patches2 = corners2
@@ -372,10 +368,8 @@ class SeedsAndGrowth:
     def _grow(
         self, view1: PreparedImage, view2: PreparedImage, chosen: I64, known: Matches, fit: FundamentalFit
     ) -> Matches:
-        """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches.
-
-        F is uncertain far from its matches: a narrow band would keep those that confirm its error.
-        """
+        """Match the ``chosen`` corners of image 1, guided by F and the local maps of known matches."""
+        # F is uncertain far from its matches: a narrow band would keep those that confirm its error.
         xy1, scale1 = view1.features.xy[chosen], view1.features.scale[chosen]
         near = _seeds.nearest_neighbours(known.xy1, xy1, min(self.neighbours, len(known.xy1)))
         affine, position, spread = _fit_local_affines(xy1, near, known.xy1, known.xy2, known.affine)

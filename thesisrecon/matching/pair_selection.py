@@ -245,10 +245,8 @@ def _connecting_pairs(chosen: I64, compared: I64, evidence: F64, words: scipy.sp
 
 
 def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> int:
-    """Largest number of other matches predicted by the similarity (scale, angle in rad) of one match.
-
-    ``limits``: position error in px, difference of log scales and of angles.
-    """
+    """Largest number of other matches predicted by the similarity (scale, angle in rad) of one match."""
+    # `limits`: position error in px, difference of log scales and of angles.
     turn = scale * np.exp(1j * angle)
     z1, z2 = (xy @ [1.0, 1j] for xy in (xy1, xy2))
     near = np.abs(z2[:, None] + turn[:, None] * (z1 - z1[:, None]) - z2) <= limits[0]
@@ -285,12 +283,10 @@ def _evidence(a: tuple[_Subset, _Subset], b: tuple[_Subset, _Subset]) -> float:
 
 
 def _overlap_evidence(a: _Subset, b: _Subset) -> float:
-    """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms.
-
-    M B(M - 1, k, p) for M matches, k that agree with the best one and p the relative area around a
-    prediction, B the tail of the binomial distribution (Desolneux, Moisan and Morel, IJCV 40, 2000). 0: one
-    false alarm is expected.
-    """
+    """Evidence that mutually best patches agree with one similarity, -log10 of the number of false alarms."""
+    # M B(M - 1, k, p) for M matches, k that agree with the best one and p the relative area around a
+    # prediction, B the tail of the binomial distribution (Desolneux, Moisan and Morel, IJCV 40, 2000). 0: one
+    # false alarm is expected.
     one, two, score = nearest_seeds(a.seeds, b.seeds, 0.8)
     one, two = (rows[np.argsort(-score, kind="stable")[:150]] for rows in (one, two))
     if len(one) < 2:

@@ -42,13 +42,11 @@ def _align_windows(
     view1: tuple[F32, I64, float], view2: tuple[F32, I64, float], matches: tuple[F64, F32, F64, F64],
     limits: tuple[int, float, float, float],
 ) -> tuple[F64, F64, F32]:  # fmt: skip
-    """Align the window around each ``xy1`` with image 2, invariant to gain and bias.
-
-    ``view*``: pixels, levels, base; ``matches``: xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
-    ``limits``: iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
-    shift and error in pixels of the corner's scale. Returns ``xy2`` (M, 2), affine (M, 2, 2) and the
-    correlation (M,), 0 for failures.
-    """
+    """Align the window around each ``xy1`` with image 2, invariant to gain and bias."""
+    # `view*`: pixels, levels, base; `matches`: xy1 (M, 2), scale1 (M,), xy2 (M, 2), affine (M, 2, 2);
+    # `limits`: iterations, prior standard deviation of an affine coefficient (0: translation only), maximum
+    # shift and error in pixels of the corner's scale. Returns `xy2` (M, 2), affine (M, 2, 2) and the
+    # correlation (M,), 0 for failures.
     pixels1, levels1, base1 = view1
     pixels2, levels2, base2 = view2
     xy1, scale1, start, affine_start = matches
@@ -161,11 +159,9 @@ def _iterate(
     level2: tuple[F32, I64, float], template: tuple[F32, F32, F64, F32, F32], found: tuple[F64, F64],
     limits: tuple[int, float, float, float],
 ) -> float:  # fmt: skip
-    """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost.
-
-    ``template``: window, derivatives, normal matrix, buffer and raster; ``limits``: iterations, prior
-    standard deviation, maximum shift px, sample spacing of image 1 px.
-    """
+    """Move ``found`` = xy2, affine in place by Gauss-Newton; return the correlation, 0 if lost."""
+    # `template`: window, derivatives, normal matrix, buffer and raster; `limits`: iterations, prior standard
+    # deviation, maximum shift px, sample spacing of image 1 px.
     pixels, level, to_level = level2
     fixed, gradient, normal, window, raster = template
     xy, a = found

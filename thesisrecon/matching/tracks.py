@@ -69,11 +69,9 @@ def _union_corners(edges: I64, view_of: I64, n_views: int) -> I64:
 
 
 def _chain_affines(edges: I64, xy1: F64, xy2: F64, affine: F64, xy: F64, middle: I64) -> tuple[F64, F64]:
-    """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the ``middle`` observations (T,).
-
-    ``edges`` (E, 2). Returns the middle's point (K, 2) in the view of each observation and the map (K, 2, 2)
-    to it.
-    """
+    """Chain x2 = xy2 + A (x1 - xy1) along the edges, breadth-first from the ``middle`` observations (T,)."""
+    # `edges` (E, 2). Returns the middle's point (K, 2) in the view of each observation and the map (K, 2, 2)
+    # to it.
     position, maps = xy.copy(), np.tile(np.eye(2), (len(xy), 1, 1))
     order, reached = np.full(len(xy), -1), len(middle)
     order[middle] = np.arange(reached)

@@ -33,12 +33,11 @@ _NO_PARALLAX_REASONS = {
 
 
 def rank_initial_pairs(tracks: Tracks, pairs: Sequence[TwoView]) -> list[TwoView]:
-    """Rank the accepted pairs as initial pairs, best first (6.2).
-
-    The score is the number of shared points (those seen in a third view count twice) times the share that no
-    homography explains; pairs whose matches leave F undetermined count a tenth. If one initial pair fails,
-    another one with the same view would probably fail too: each use of a view halves the score of its pairs.
-    """
+    """Rank the accepted pairs as initial pairs, best first (6.2)."""
+    # The score is the number of shared points (those seen in a third view count twice) times the share that
+    # no homography explains; pairs whose matches leave F undetermined count a tenth. If one initial pair
+    # fails, another one with the same view would probably fail too: each use of a view halves the score of
+    # its pairs.
     table = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     table[tracks.view_index, tracks.point_index] = True
     long = table.sum(axis=0) >= 3
@@ -89,12 +88,10 @@ def require_pair_with_parallax(pairs: Sequence[TwoView]) -> None:
 
 
 def initial_cameras(pair: TwoView, sizes: I64) -> tuple[F64, F64]:
-    """Compute initial cameras (3.42): P1 = [I | 0], P2 = [[e]x F + e pi' | e], in pixels (HZ 9.5).
-
-    The plane pi is chosen in unit-free pixels so that the left part of P2 is nearest to a rotation: the frame
-    is then nearly metric with a focal length of one long side. Of the two such planes the one with fewer
-    points beyond it is taken, and the sign of P2 that places most points in front of both cameras.
-    """
+    """Compute initial cameras (3.42): P1 = [I | 0], P2 = [[e]x F + e pi' | e], in pixels (HZ 9.5)."""
+    # The plane pi is chosen in unit-free pixels so that the left part of P2 is nearest to a rotation: the
+    # frame is then nearly metric with a focal length of one long side. Of the two such planes the one with
+    # fewer points beyond it is taken, and the sign of P2 that places most points in front of both cameras.
     T1, T2 = pixel_from_unit(sizes)
     F = T2.T @ pair.F @ T1
     found = []
@@ -291,10 +288,8 @@ def _triangulate(model: ProjectiveModel, chosen: B8) -> None:
 
 
 def consistent_observations(model: ProjectiveModel, chosen: B8, threshold_px: float) -> B8:
-    """Return the observations (K,) of each point that agree with its best two-view triangulation.
-
-    A wrong one shifts a least-squares point: least truncated squares select a pair of ``chosen`` ones.
-    """
+    """Return the observations (K,) of each point that agree with its best two-view triangulation."""
+    # A wrong one shifts a least-squares point: least truncated squares select a pair of `chosen` ones.
     t = model.tracks
     k = np.flatnonzero(chosen)
     view, xy, every = t.view_index[k], t.xy[k], np.ones(len(k), dtype=bool)

@@ -105,11 +105,9 @@ def minimize_batch(
     loss: Callable[[F64], tuple[F64, F64]] | None = None, project: Callable[[F64], F64] = lambda x: x,
     damping: float = 1e-2, decrease: float = 6.0, max_damping: float = 1e10, tolerance: float = 1e-14,
 ) -> tuple[F64, F64]:  # fmt: skip
-    """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; minima and costs (B,).
-
-    ``residuals`` maps (B, D) to (B, M) row by row, ``loss`` these to costs and weights, by default means of
-    soft-L1 losses.
-    """
+    """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; minima and costs (B,)."""
+    # `residuals` maps (B, D) to (B, M) row by row, `loss` these to costs and weights, by default means of
+    # soft-L1 losses.
     loss = loss or (lambda r: _mean_loss(r, loss_scale))
     cost, damped = loss(residuals(x))[0], np.full(len(x), damping)
     for _ in range(iterations):

@@ -39,11 +39,9 @@ _MAX_ITERATIONS = 12
 def check_identifiability(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> IdentifiabilityReport:
-    """Check whether a self-calibration is determined by the images and the prior (chapter 7).
-
-    Bundle adjustment of some observations gives the covariance of the focal lengths under the prior; a second
-    one, with free aspect ratio and principal point, shows the effect of the prior of these.
-    """
+    """Check whether a self-calibration is determined by the images and the prior (chapter 7)."""
+    # Bundle adjustment of some observations gives the covariance of the focal lengths under the prior; a
+    # second one, with free aspect ratio and principal point, shows the effect of the prior of these.
     if reconstruction.inlier.any():
         problem = _bundle_problem(reconstruction, upgrade, prior)
     else:
@@ -238,11 +236,9 @@ def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) ->
 
 
 def gherardi_fusiello_planes(frame: ReferenceFrame, other: int, f_reference: F64, f_other: F64) -> F64:
-    """Planes at infinity (2 B, 3) of the focals (B,) of two views (Gherardi and Fusiello, ECCV 2010).
-
-    For both signs of the other camera. Bougnoux's formula (ICCV 1998) gives two focals from F alone, but has
-    no solution if the optical axes meet, which is usual: focals are scanned instead.
-    """
+    """Planes at infinity (2 B, 3) of the focals (B,) of two views (Gherardi and Fusiello, ECCV 2010)."""
+    # For both signs of the other camera. Bougnoux's formula (ICCV 1998) gives two focals from F alone, but
+    # has no solution if the optical axes meet, which is usual: focals are scanned instead.
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
     t = frame.a[other] / K2

@@ -43,11 +43,9 @@ def _transfer_matrix(M: F64) -> F64:
 
 
 def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) -> F64:
-    """Return rows (B, M, 6) in the entries 11, 12, 13, 22, 23, 33 of w in the reference view.
-
-    H (B, R, 3, 3) of determinant 1 or NaN (no row); ``focals`` (B, R) are unit-free estimates: dividing the
-    coordinates by the reference focal length balances entries and weights.
-    """
+    """Return rows (B, M, 6) in the entries 11, 12, 13, 22, 23, 33 of w in the reference view."""
+    # H (B, R, 3, 3) of determinant 1 or NaN (no row); `focals` (B, R) are unit-free estimates: dividing the
+    # coordinates by the reference focal length balances entries and weights.
     focals = focals[:, constraints.first]
     scale = np.stack([focals, focals, np.ones_like(focals)], axis=-1)
     reference = scale[:, constraints.reference]

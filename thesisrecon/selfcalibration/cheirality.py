@@ -243,11 +243,9 @@ def _local_minima(score: F64) -> I64:
 
 
 def _modulus_coefficients(A: F64, a: F64, pairs: I64) -> F64:
-    """Return c (M, 4, 4) with l_k(p) = c[k, :3] . p + c[k, 3] for pairs (M, 2) of cameras [A | a].
-
-    From det(lambda X - Y) = lambda^3 det X - lambda^2 tr(adj(X) Y) + lambda tr(X adj(Y)) - det Y, X = A_i -
-    a_i p', Y = A_j - a_j p'; affine, since p changes both by matrices of rank 1.
-    """
+    """Return c (M, 4, 4) with l_k(p) = c[k, :3] . p + c[k, 3] for pairs (M, 2) of cameras [A | a]."""
+    # From det(lambda X - Y) = lambda^3 det X - lambda^2 tr(adj(X) Y) + lambda tr(X adj(Y)) - det Y, X = A_i -
+    # a_i p', Y = A_j - a_j p'; affine, since p changes both by matrices of rank 1.
     probes = np.concatenate([np.eye(3), np.zeros((1, 3))])
     H = A[None] - a[None, :, :, None] * probes[:, None, None, :]
     X, Y = H[:, pairs[:, 0]], H[:, pairs[:, 1]]

@@ -227,11 +227,9 @@ def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
 
 @kernel
 def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
-    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009).
-
-    255 where the pixel s + 1 to the left, right, top or bottom is within ``tolerance`` in every channel, else
-    0.
-    """
+    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009)."""
+    # 255 where the pixel s + 1 to the left, right, top or bottom is within `tolerance` in every channel, else
+    # 0.
     height, width = valid.shape
     masks[:] = 0
     for arm in range(4):

@@ -73,11 +73,9 @@ def _agree(a: F32, sa: F32, b: F32, sb: F32) -> B8:
 
 
 def update_kalman(state: InverseDepth, new: tuple[F32, F32], alive: B8) -> None:
-    """Update the one-dimensional Kalman filter of every pixel (H, W) in place; ``views`` are measurements.
-
-    A missing measurement, or an innovation beyond ``GATE`` standard deviations, ends a chain: ``alive`` =
-    False.
-    """
+    """Update the one-dimensional Kalman filter of every pixel (H, W) in place; ``views`` are measurements."""
+    # A missing measurement, or an innovation beyond `GATE` standard deviations, ends a chain: `alive` =
+    # False.
     first = np.isnan(state.value)
     alive &= np.isfinite(new[0]) & (first | _agree(state.value, state.std, *new))
     z, s, variance = new[0][alive], new[1][alive], state.std[alive].astype(np.float64) ** 2
@@ -101,13 +99,10 @@ def _projected(to: F64, u: float, v: float, z: float) -> tuple[float, float, flo
 def count_agreement(
     own: tuple[F32, F32], to: F64, other: tuple[F32, F32], back: F64, limits: F64, agree: U8, contradict: U8
 ) -> None:
-    """Count pixels that another depth map confirms or contradicts, which sees through them.
-
-    ``own``, ``other``: depths and standard deviations (H, W), NaN = unknown. Confirmed: the other depth
-    returns within ``limits[0]`` px, and depths differ by less than ``limits[1]`` of the depth plus
-    ``limits[2]`` standard deviations. ``to``, ``back`` (3, 4): from z (x, y, 1), 1 to z' (x', y', 1) of the
-    other view and vice versa.
-    """
+    """Count pixels that another depth map confirms or contradicts, which sees through them."""
+    # `own`, `other`: depths and standard deviations (H, W), NaN = unknown. Confirmed: the other depth returns
+    # within `limits[0]` px, and depths differ by less than `limits[1]` of the depth plus `limits[2]` standard
+    # deviations. `to`, `back` (3, 4): from z (x, y, 1), 1 to z' (x', y', 1) of the other view and vice versa.
     depth, std = own
     other_depth, other_std = other
     height, width = depth.shape
@@ -157,11 +152,9 @@ def splat_depths(depth: F32, to: F64, out: F32) -> None:
 def _window_plane(
     rho: F32, used: B8, at: tuple[int, int], radius: int
 ) -> tuple[int, tuple[float, float, float], float, tuple[float, float], bool]:
-    """Fit a plane to the inverse depths of a window that are ``used`` and similar to the centre's.
-
-    Returns the number of pixels, the means of x, y and inverse depth relative to the centre, sum of the
-    variances of x and y, gradient, and whether it is determined.
-    """
+    """Fit a plane to the inverse depths of a window that are ``used`` and similar to the centre's."""
+    # Returns the number of pixels, the means of x, y and inverse depth relative to the centre, sum of the
+    # variances of x and y, gradient, and whether it is determined.
     v, u = at
     here = np.float64(rho[at])
     sxx, sxy, syy, sxd, syd, sx, sy, sd, n = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0

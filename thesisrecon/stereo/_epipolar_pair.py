@@ -122,11 +122,9 @@ class HalfLines:
 
     @property
     def sagitta(self) -> F64:
-        """(...) distance of each foot from the circle about the epipole through the centre.
-
-        D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre, evaluated
-        without cancellation. It aligns columns of equal distance from the epipole.
-        """
+        """(...) distance of each foot from the circle about the epipole through the centre."""
+        # D (1 - cos alpha) with the epipole's distance D and the angle alpha between foot and centre,
+        # evaluated without cancellation. It aligns columns of equal distance from the epipole.
         e = self.epipole
         D_w = float(np.hypot(e[0], e[1]))
         if D_w == 0.0:

@@ -204,11 +204,9 @@ def _plane_cost(
     search: PatchSearch, at: tuple[int, int], plane: F64, samples: F32, variance: float, limit: float,
     work: tuple[F64, F64, I64],
 ) -> float:  # fmt: skip
-    """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first (occlusion).
-
-    ``work``: work space (8,), (K,), and the order (K,) of the neighbours; the best two become its first two.
-    If these cost ``limit`` or more, the others are not tried.
-    """
+    """Mean of the two smallest costs, the second at most ``MAX_EXCESS_COST`` above the first (occlusion)."""
+    # `work`: work space (8,), (K,), and the order (K,) of the neighbours; the best two become its first two.
+    # If these cost `limit` or more, the others are not tried.
     _, squares, layout, H, e, offsets, _ = search
     warp, costs, order = work
     n_views = layout.shape[0]
@@ -268,13 +266,11 @@ def sweep_planes(
     search: PatchSearch, step_px: float, converged_cost: float, backward: bool, planes: F32, cost: F32,
     active: U8,
 ) -> None:  # fmt: skip
-    """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo).
-
-    Each pixel tries the planes of the two neighbours visited before, and its own shifted by ``step_px`` in
-    the neighbours and tilted by as much at the border of the window. Planes up to ``converged_cost`` stay, as
-    do those not ``active`` (H, W) beside no active one; a fall of the ``cost`` by ``MIN_GAIN`` keeps a pixel
-    active.
-    """
+    """Propagate and perturb the planes (H, W, 3) of all pixels in one pass (PatchMatch stereo)."""
+    # Each pixel tries the planes of the two neighbours visited before, and its own shifted by `step_px` in
+    # the neighbours and tilted by as much at the border of the window. Planes up to `converged_cost` stay, as
+    # do those not `active` (H, W) beside no active one; a fall of the `cost` by `MIN_GAIN` keeps a pixel
+    # active.
     gray, H, e, offsets = search.gray, search.H, search.e, search.offsets
     height, width = gray.shape
     samples, plane, trial = empty((2, offsets.shape[1]), np.float32), empty(3), empty(3)
@@ -371,13 +367,11 @@ def begin_planes(search: PatchSearch, planes: F32) -> F32:
 
 
 def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: InverseDepth) -> InverseDepth:
-    """Refine and extend the inverse depths of a view by propagating and refining a plane per pixel (2.6).
-
-    A plane in space is linear in inverse depth; each window is transferred by its homography and compared by
-    weighted correlation (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al., ECCV
-    2016), from the fused correspondences ``found`` on. A pixel is kept if two neighbours have at most
-    ``MAX_COST``, one has at most half of it, or two of the fused correspondences agree.
-    """
+    """Refine and extend the inverse depths of a view by propagating and refining a plane per pixel (2.6)."""
+    # A plane in space is linear in inverse depth; each window is transferred by its homography and compared
+    # by weighted correlation (Bleyer, Rhemann and Rother, "PatchMatch stereo", BMVC 2011; Schönberger et al.,
+    # ECCV 2016), from the fused correspondences `found` on. A pixel is kept if two neighbours have at most
+    # `MAX_COST`, one has at most half of it, or two of the fused correspondences agree.
     sweeps = 4  # Passes over the image, alternating in direction
     if not others or not np.isfinite(found.value).any():
         return found

@@ -56,12 +56,10 @@ def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tupl
 
 @kernel
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
-    """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on.
-
-    ``out`` (3 of (H, W)): left disparities at the vertex of two lines of opposite slope through three totals,
-    whole right ones (NaN out of range), and the confidence m / (m + ``half``), m the margin to the second
-    best.
-    """
+    """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on."""
+    # `out` (3 of (H, W)): left disparities at the vertex of two lines of opposite slope through three totals,
+    # whole right ones (NaN out of range), and the confidence m / (m + `half`), m the margin to the second
+    # best.
     pairs, _, n, width = sums.shape
     left, right, confidence = out
     total = empty((n, width), np.uint16)

@@ -58,12 +58,10 @@ def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) ->
 def _select_neighbours(
     points: SparsePoints, views: Mapping[int, PinholeView], view: int, max_neighbours: int = 4
 ) -> tuple[int, ...]:
-    """Select the neighbours of a view greedily, the most useful first.
-
-    The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
-    observe count less, and so does a view in the direction of an earlier one: other sides see what is
-    occluded here.
-    """
+    """Select the neighbours of a view greedily, the most useful first."""
+    # The weight of a common point is a Gaussian of its triangulation angle. Points that earlier neighbours
+    # observe count less, and so does a view in the direction of an earlier one: other sides see what is
+    # occluded here.
     # Triangulation angle of the greatest weight, and the decay of the weight for smaller and larger ones.
     best_deg, sigma_below_deg, sigma_above_deg = 10.0, 3.0, 10.0
     # A neighbour has this many common points with at least this triangulation angle.
@@ -96,12 +94,10 @@ def _select_neighbours(
 
 
 def _confirm_depths(depth_map: DepthMap, others: Sequence[DepthMap]) -> DepthMap:
-    """Keep the depths that the depth maps of other views confirm (Merrell et al., ICCV 2007).
-
-    A pixel is projected into another view, and the depth there is projected back. It is confirmed if both
-    agree and contradicted if the other view sees through it. It is kept if more views confirm than contradict
-    it, or if none contradicts it and it continues the surface of confirmed pixels.
-    """
+    """Keep the depths that the depth maps of other views confirm (Merrell et al., ICCV 2007)."""
+    # A pixel is projected into another view, and the depth there is projected back. It is confirmed if both
+    # agree and contradicted if the other view sees through it. It is kept if more views confirm than
+    # contradict it, or if none contradicts it and it continues the surface of confirmed pixels.
     # Limits of the reprojection error, and of the depth difference: a share plus standard deviations.
     reprojection_px, max_relative, max_sigmas = 1.5, 0.01, 2.0
     # Window of the surface continuation, and distance from its plane in standard deviations.
@@ -140,12 +136,10 @@ def keep_depths(depth_map: DepthMap, keep: B8) -> DepthMap:
 
 
 def _complete_depths(own: DepthMap, others: Sequence[DepthMap], views: Mapping[int, PinholeView]) -> DepthMap:
-    """Complete a depth map with surfaces that only the depth maps of other views contain.
-
-    The nearest of their projections initialise the plane search against the images that contribute most
-    pixels. Accepted planes (by the rule of :func:`refine_depths`) are measured depths: nothing is
-    interpolated.
-    """
+    """Complete a depth map with surfaces that only the depth maps of other views contain."""
+    # The nearest of their projections initialise the plane search against the images that contribute most
+    # pixels. Accepted planes (by the rule of :func:`refine_depths`) are measured depths: nothing is
+    # interpolated.
     max_sources = 4  # Largest number of views from which a depth map is completed
     # Size of the gaps between projected pixels that completion fills, and number of passes of its search.
     gap_px, sweeps = 1, 2

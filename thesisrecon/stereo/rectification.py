@@ -265,11 +265,9 @@ def _require_in_front(pair: EpipolarPair, rows: F64) -> None:
 
 
 def _affine_rows(pair: EpipolarPair, rows: F64) -> F64:
-    """First rows (2, 3) that make the affine part of each homography a similarity (Loop and Zhang 1999).
-
-    The best affine approximation over the common field of view gets two perpendicular rows of equal length;
-    with x' = alpha x_a + beta y' and any other coordinate x_a the condition is linear.
-    """
+    """First rows (2, 3) that make the affine part of each homography a similarity (Loop and Zhang 1999)."""
+    # The best affine approximation over the common field of view gets two perpendicular rows of equal length;
+    # with x' = alpha x_a + beta y' and any other coordinate x_a the condition is linear.
     first = []
     for side in (0, 1):
         z = homogenize(pair.pencil.normalized(side, pair.regions[side]))

@@ -174,12 +174,9 @@ def _solve_rows(
     left: tuple[I16, U8], right: tuple[I16, U8], disparities: tuple[int, int],
     model: tuple[int, float, int, int], likelihood: F64, out: tuple[I32, F32],
 ) -> None:  # fmt: skip
-    """Solve the rows of a pair from the top, each with cohesion to the previous one.
-
-    ``left``, ``right``: channels (K, H, W), valid (H, W); ``disparities``: first, last; ``model``: window
-    radius, steps per squared unit, penalties of :func:`_solve_row`; ``out``: disparities (H, W) and
-    probabilities.
-    """
+    """Solve the rows of a pair from the top, each with cohesion to the previous one."""
+    # `left`, `right`: channels (K, H, W), valid (H, W); `disparities`: first, last; `model`: window radius,
+    # steps per squared unit, penalties of :func:`_solve_row`; `out`: disparities (H, W) and probabilities.
     first, last = disparities
     radius, scale, penalties = model[0], model[1], (model[2], model[3])
     height, width = left[1].shape

@@ -56,11 +56,9 @@ def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.flo
 
 @kernel
 def _extend(cost: U8, before: tuple[U8, U8, U8], base: U8, p2: U8, P1: np.uint8, path: U8, least: U8) -> None:
-    """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'.
-
-    ``before`` are the rows L'(d - 1), L'(d), L'(d + 1) of the previous pixels, ``base`` their minimum over d;
-    ``least`` is updated with the minimum of this row.
-    """
+    """Path costs of one disparity: L = C + min(L'(d), L'(d +- 1) + P1, min L' + P2) - min L'."""
+    # `before` are the rows L'(d - 1), L'(d), L'(d + 1) of the previous pixels, `base` their minimum over d;
+    # `least` is updated with the minimum of this row.
     below, same, above = before
     for x in range(len(cost)):
         # Loads precede the selections: a load inside one would prevent vectorisation.
@@ -154,10 +152,8 @@ def _store(square: Word8, words: U64, first: int, column: int) -> None:
 
 @kernel
 def _transpose_rows(source: U8, out: U8) -> None:
-    """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8.
-
-    Tiles avoid cache conflicts of row lengths that are multiples of a large power of two.
-    """
+    """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8."""
+    # Tiles avoid cache conflicts of row lengths that are multiples of a large power of two.
     rows, n, width = source.shape
     words = out.view(np.uint64)
     tile = zeros((BLOCK, TILE // 8 + 1), np.uint64)

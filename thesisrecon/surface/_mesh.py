@@ -103,11 +103,9 @@ def max_depth_slope(P: F64, grazing_deg: float) -> float:
 
 
 def triangulate_grid(depth: F64, std: F64, slope: float) -> tuple[B8, B8]:
-    """Divide the squares of depths (H, W) into triangles without surface break along a side.
-
-    Whether the diagonal, that of the smaller depth step, rises to the right (H - 1, W - 1), and which of the
-    two triangles exist (H - 1, W - 1, 2).
-    """
+    """Divide the squares of depths (H, W) into triangles without surface break along a side."""
+    # Whether the diagonal, that of the smaller depth step, rises to the right (H - 1, W - 1), and which of
+    # the two triangles exist (H - 1, W - 1, 2).
     corner = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     z, spread = (np.stack([values[c] for c in corner], axis=-1) for values in (depth, std))
     falling_step = np.abs(z[..., 0] - z[..., 3])

@@ -139,11 +139,9 @@ def keep_largest(one: F32, its_color: F32, weight: F32, color: F32) -> None:
 
 @kernel
 def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F32) -> None:
-    """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``.
-
-    Relative weight^``power`` / (1 + (d / scatter)^2)^2, with the RMS distance d from the weighted median
-    colour.
-    """
+    """Blend the colours (V, N, 3) of points; those without positive ``weight`` (V, N) stay in ``out``."""
+    # Relative weight^`power` / (1 + (d / scatter)^2)^2, with the RMS distance d from the weighted median
+    # colour.
     views = weight.shape[0]
     relative = empty(views)
     order = empty(views, np.int64)
@@ -191,10 +189,8 @@ def grow_colors(texture: U8, drawn: B8) -> None:
 
 
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
-    """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``.
-
-    ``corners`` (M, 3, 3): homogeneous texels; updates ``face`` (H, W), -1: none, and ``weights`` (H, W, 2).
-    """
+    """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``."""
+    # `corners` (M, 3, 3): homogeneous texels; updates `face` (H, W), -1: none, and `weights` (H, W, 2).
     (height, width), before = face.shape, np.pad(face, 1, constant_values=-1)
     for top, left in ((1, 0), (1, 2), (0, 1), (2, 1)):
         beside = before[top : top + height, left : left + width]
@@ -211,13 +207,11 @@ def paint_texture(
     mesh: TexturedMesh, prepared: Sequence[ViewSurface], cameras: Sequence[Camera], uv: F64, cut_out: U8, *,
     threads: int = 1,
 ) -> U8:  # fmt: skip
-    """Colours of a texture (H, W, 3) as a robust blend of all images that show a point, part by part.
-
-    The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
-    foreground objects and where its colour contradicts the others. Weights vary smoothly, so no seams occur.
-    ``uv`` (M, 3, 2): corners in texels, NaN for faces that no view shows; other texels keep the colours of
-    ``cut_out``.
-    """
+    """Colours of a texture (H, W, 3) as a robust blend of all images that show a point, part by part."""
+    # The weight of an image is its number of pixels per area, reduced towards image borders and outlines of
+    # foreground objects and where its colour contradicts the others. Weights vary smoothly, so no seams
+    # occur. `uv` (M, 3, 2): corners in texels, NaN for faces that no view shows; other texels keep the
+    # colours of `cut_out`.
     prepared_bytes = 11  # Bytes of a pixel of a view that is prepared for blending
     grown_texels = 3  # Further texels that take the colours of the rim, for reduced textures
     normals = vertex_normals(mesh)

@@ -139,11 +139,9 @@ class _Spline(NamedTuple):
 
     @classmethod
     def over(cls, domain: Domain, knot_px: int) -> _Spline:
-        """Divide a domain into pieces and number their coefficients.
-
-        A node has one coefficient for every connected part of the surface within its sixteen cells, so that
-        both sides of a cut are separate and the surface is smooth around the end of a cut.
-        """
+        """Divide a domain into pieces and number their coefficients."""
+        # A node has one coefficient for every connected part of the surface within its sixteen cells, so that
+        # both sides of a cut are separate and the surface is smooth around the end of a cut.
         # Weight of the gradient energy relative to the bending energy; it determines undetermined slopes.
         gradient_weight = 1e-7
         y, x = np.indices(domain.covered.shape)

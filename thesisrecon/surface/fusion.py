@@ -141,11 +141,9 @@ def integrate_view(
 
 @kernel
 def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[float, tuple[int, int], float]:
-    """Depth at (u, v), the row and column it is taken from, and its weight; NaN if all four are unknown.
-
-    Bilinear in 1 / z on one surface, else of the nearest pixel or, if unknown, of the next of the four,
-    because a surface net ends half a voxel before the last depth.
-    """
+    """Depth at (u, v), the row and column it is taken from, and its weight; NaN if all four are unknown."""
+    # Bilinear in 1 / z on one surface, else of the nearest pixel or, if unknown, of the next of the four,
+    # because a surface net ends half a voxel before the last depth.
     weight_beyond = 0.1  # Weight of a depth extrapolated by half a pixel or more
     x, y = min(int(u), depth.shape[1] - 2), min(int(v), depth.shape[0] - 2)
     x, y = max(x, 0), max(y, 0)
@@ -400,11 +398,9 @@ def _measured(depth_map: DepthMap) -> FusionMap:
 
 
 def _incidence_cosines(depth: F32, K: F64) -> F32:
-    """n . r (H, W) of the unit surface normal n and the ray r of unit depth: distance across per depth.
-
-    The inverse depth of a plane is linear in the pixel, and its gradient determines the normal: the smaller
-    of the differences to both neighbours, averaged over 3 x 3 pixels.
-    """
+    """n . r (H, W) of the unit surface normal n and the ray r of unit depth: distance across per depth."""
+    # The inverse depth of a plane is linear in the pixel, and its gradient determines the normal: the smaller
+    # of the differences to both neighbours, averaged over 3 x 3 pixels.
     min_cosine = 0.1  # Lower limit of the incidence cosine
     with np.errstate(divide="ignore"):
         inverse = np.float32(1.0) / depth
@@ -470,11 +466,9 @@ def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> Vo
 
 
 def _zero_level(grid: VoxelGrid, maps: Sequence[FusionMap], pool: ThreadPool) -> tuple[TexturedMesh, F64]:
-    """Zero level of the fused distances as a surface net, and the standard deviation at each vertex.
-
-    Computed slab by slab of layers of blocks, with the layers before (faces use their vertices) and after
-    (cells use their voxels). Weights are inverse variances.
-    """
+    """Zero level of the fused distances as a surface net, and the standard deviation at each vertex."""
+    # Computed slab by slab of layers of blocks, with the layers before (faces use their vertices) and after
+    # (cells use their voxels). Weights are inverse variances.
     # The first block of each layer, with an empty layer before the first and after the last one.
     layers = np.searchsorted(grid.blocks[:, 0], np.arange(-1, grid.place.shape[0] + 2)).tolist()
     points, faces, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]

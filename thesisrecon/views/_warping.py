@@ -121,12 +121,10 @@ def _outside_rows(target: F64, a: tuple[int, int], reach: float, rows: tuple[int
 def _draw_surface(
     target: F64, inverse_depth: F32, limits: F64, rows: tuple[int, int], source: F32, front: F32
 ) -> None:
-    """Draw the surface of an image's pixels into some rows of another view, nearest in front.
-
-    ``limits``: largest differences of inverse depth and position (px) on one surface. Four pixels form two
-    triangles, three connected ones form one; at discontinuities and borders a pixel covers half a pixel to
-    each side.
-    """
+    """Draw the surface of an image's pixels into some rows of another view, nearest in front."""
+    # `limits`: largest differences of inverse depth and position (px) on one surface. Four pixels form two
+    # triangles, three connected ones form one; at discontinuities and borders a pixel covers half a pixel to
+    # each side.
     height, width = inverse_depth.shape
     for y in range(height):
         for x in range(width):
@@ -278,13 +276,11 @@ def forward_map(
     target_xy: F64 | F32, inverse_depth: F64 | F32, *, size: tuple[int, int], step: float = np.inf,
     threads: int = 1,
 ) -> tuple[F32, F32]:  # fmt: skip
-    """Position of an image that each pixel of another view shows, and its inverse depth; NaN for none.
-
-    ``target_xy`` (h, w, 2): position of each pixel in the view; ``inverse_depth`` (h, w): larger is in front,
-    in any unit. Pixels are corners of small triangles. Neighbours belong to one surface if they come at most
-    3 px apart, or twice their median distance, and their inverse depth differs by at most ``step``. Back
-    faces are not drawn.
-    """
+    """Position of an image that each pixel of another view shows, and its inverse depth; NaN for none."""
+    # `target_xy` (h, w, 2): position of each pixel in the view; `inverse_depth` (h, w): larger is in front,
+    # in any unit. Pixels are corners of small triangles. Neighbours belong to one surface if they come at
+    # most 3 px apart, or twice their median distance, and their inverse depth differs by at most `step`. Back
+    # faces are not drawn.
     target = np.ascontiguousarray(target_xy, dtype=np.float64)
     near = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     source = np.full((size[1], size[0], 2), np.nan, dtype=np.float32)
@@ -312,11 +308,9 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
 
 
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
-    """Fill holes (NaN inverse depth) with the background around them: occluded surfaces are background.
-
-    The nearest known pixels in sixteen directions, at most ``step`` or 0.4 of the range above the smallest
-    inverse depth, are averaged with weights 1 / distance^2.
-    """
+    """Fill holes (NaN inverse depth) with the background around them: occluded surfaces are background."""
+    # The nearest known pixels in sixteen directions, at most `step` or 0.4 of the range above the smallest
+    # inverse depth, are averaged with weights 1 / distance^2.
     filled = rgb.copy()
     distance = distances_to_known(inverse_depth)
     _fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, step, filled)

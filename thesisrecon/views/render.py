@@ -36,10 +36,8 @@ def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
 
 @kernel
 def _shade_points(color: F32, points: F32, normals: F32, lights: F64, ambient: float) -> None:
-    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye at 0.
-
-    ``lights`` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
-    """
+    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye at 0."""
+    # `lights` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
     light = empty(3)
     for p in range(color.shape[0]):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]

@@ -239,11 +239,9 @@ def _transfer(T: F64, P2: F64, xy1: F64, xy2: F64, xy: F64, inverse_depth: F64) 
 def _extrapolate_inverse_depth(
     inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
 ) -> None:
-    """Complete the inverse depth of the first image of two from the surrounding pixels.
-
-    The nearest known pixel in any direction (``distance`` steps) that would not occlude a surface of the
-    other image.
-    """
+    """Complete the inverse depth of the first image of two from the surrounding pixels."""
+    # The nearest known pixel in any direction (`distance` steps) that would not occlude a surface of the
+    # other image.
     own, other = inverse_depth
     for y in range(own.shape[0]):
         for x in range(own.shape[1]):
@@ -374,11 +372,9 @@ class TensorSynthesis(Record):
 
 
 def _weight_of_second(layers: list[tuple[F32, F32]], share: np.float32, step: float) -> F32:
-    """Blending weight (H, W) of the second image, NaN where both are empty.
-
-    ``share`` on one surface; else the nearer surface is shown in the half of the baseline next to its own
-    image, with weight 0 in the last quarter before the other image, which does not show it.
-    """
+    """Blending weight (H, W) of the second image, NaN where both are empty."""
+    # `share` on one surface; else the nearer surface is shown in the half of the baseline next to its own
+    # image, with weight 0 in the last quarter before the other image, which does not show it.
     (first, near1), (second, near2) = layers
     seen1, seen2 = np.isfinite(near1), np.isfinite(near2)
     sure1, sure2 = np.nan_to_num(first[..., 3]) > 0.5, np.nan_to_num(second[..., 3]) > 0.5

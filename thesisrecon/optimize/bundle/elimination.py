@@ -246,11 +246,9 @@ def _add_gram_of_six(blocks: F64, n: int, A: F64, k: int) -> None:
 def _add_common(
     first: int, last: int, J: Jacobians, index: BlockIndex, sums: ReducedSums, left: _Elimination
 ) -> None:
-    """Add border, corner and right-hand side of the common columns.
-
-    Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p of
-    them, and E' T = E'E - p'p.
-    """
+    """Add border, corner and right-hand side of the common columns."""
+    # Those of one point side by side are E (2m, n). With p = B~' E the point's own step leaves T = E - B~ p
+    # of them, and E' T = E'E - p'p.
     most, C = 1, J.A.shape[2]
     for j in range(first, last):
         most = max(most, index.start[j + 1] - index.start[j])

@@ -255,10 +255,8 @@ def _metric_problem(
     cameras: MetricCameras, o: SortedObservations, unknown: tuple[B8, B8], prior: IntrinsicsPrior | None,
     options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:  # fmt: skip
-    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics.
-
-    ``unknown``: the views (V,) that move, and the intrinsics (C,) that do.
-    """
+    """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
+    # `unknown`: the views (V,) that move, and the intrinsics (C,) that do.
     group, (moves, free) = np.asarray(cameras.group, dtype=np.int64), unknown
     used = np.bincount(group[moves], minlength=len(cameras.intrinsics)) > 0
     values, start, table = intrinsic_unknowns.number_unknowns(cameras, used, free, prior)

@@ -82,10 +82,8 @@ def _linearize_point(
     P: F64, x: F64, tangent: tuple[F64, float, F64], view_index: I64, xy: F64, options: _PointOptions,
     H: F64, g: F64,
 ) -> None:  # fmt: skip
-    """Fill the lower triangle of J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space.
-
-    ``tangent``: Householder vector, its factor, and scratch memory (2, 4).
-    """
+    """Fill the lower triangle of J'J (3, 3) and J'r (3,) of a unit point in its ``tangent`` space."""
+    # `tangent`: Householder vector, its factor, and scratch memory (2, 4).
     v, beta, J = tangent
     H[:] = 0.0
     g[:] = 0.0
