@@ -4,8 +4,6 @@ The stub ``__init__.pyi`` is the one list of public names and of the modules tha
 imported when one of its names is first used, so that ``import thesisrecon`` takes no time.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

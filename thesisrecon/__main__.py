@@ -1,7 +1,5 @@
 """``python -m thesisrecon``, and the command ``thesisrecon``."""
 
-from __future__ import annotations
-
 from thesisrecon.runtime._signals import install_signal_handlers
 
 

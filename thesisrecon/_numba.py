@@ -7,8 +7,6 @@ the key is a digest of all code and constants that a kernel refers to, as for th
 # numba's own modules have no types.
 # mypy: disable-error-code="no-untyped-call"
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import dis

@@ -1,7 +1,5 @@
 """Names of NumPy array types, the arrays of callers read and checked, and records that compare by value."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, Literal

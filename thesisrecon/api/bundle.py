@@ -1,7 +1,5 @@
 """Bundle adjustment in one call: cameras and points refined together, with their covariances."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The steps of chapter 7, one function each: plane at infinity, affine frame, dual quadric, metric frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras and points: resection, triangulation, cheirality and models of plain arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """Export of a model to other programs: the files they read, and images without lens distortion."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Corners of one image."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 from thesisrecon.arrays import number, whole_number

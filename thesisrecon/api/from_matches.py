@@ -1,7 +1,5 @@
 """Reconstruction from corners, matches or tracks of other programs: Algorithm 1 from chapter 5 on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace

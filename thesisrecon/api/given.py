@@ -1,7 +1,5 @@
 """Cameras and models as they are given to calls: records, arrays, runs, folders and models of pycolmap."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from os import PathLike

@@ -1,7 +1,5 @@
 """Lens distortion removed from points and images, and pairs of known cameras rectified."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

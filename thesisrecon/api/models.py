@@ -1,7 +1,5 @@
 """Finished runs and models of other programs: loaded, saved, aligned, scaled and compared."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

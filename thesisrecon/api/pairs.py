@@ -1,7 +1,5 @@
 """Two and three images: matches, fundamental matrix, homography, trifocal tensor and epipolar lines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """Algorithm 1 of the thesis: from images to cameras, points and a textured model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Unpack

@@ -1,7 +1,5 @@
 """Relative poses of calibrated cameras: essential matrix, recovered pose, homography taken apart."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rectified pairs, and depth maps, surface and texture of known cameras (thesis, sections 2.5 and 2.6)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

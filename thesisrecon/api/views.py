@@ -1,7 +1,5 @@
 """New views: interpolated between two images (1.2), by the trilinear tensor (1.3), rendered from a model."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

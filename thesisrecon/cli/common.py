@@ -4,8 +4,6 @@ NumPy is imported only inside the commands, after the number of its threads is s
 algebra gives the same bytes for any number of workers.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback

@@ -1,7 +1,5 @@
 """Frames, animation and description that the commands ``render`` and ``interpolate`` write."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ Presets: ``default`` (best results) and ``thesis`` (the pipeline of the thesis).
 ``--set``, is read and written by :mod:`thesisrecon.config.text`.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import typing

@@ -3,8 +3,6 @@
 Self-calibration and bundle adjustment derive their unknowns from the prior.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@
 functions and checks objects. ``path/to/file.py:name`` is the text form of a function or class in a file.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import sys

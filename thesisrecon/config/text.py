@@ -4,8 +4,6 @@ A stage is a table: ``kind`` selects the method, the other keys are its fields: 
 or dataclasses. ``None`` is written as the word ``none``, since TOML has no null.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

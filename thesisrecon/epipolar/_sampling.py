@@ -6,8 +6,6 @@ three equations leave a pencil by minors without pivoting: the loop vectorises a
 Points are rows (x1, y1, x2, y2) in a frame that scales both images equally, F is a row-major vector of 9.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon._numba import copy_to, empty, full, kernel

@@ -4,8 +4,6 @@ If most matches lie on one plane with homography H, every [e]x H explains them: 
 matches off the plane, and a wrong F has as many inliers as the right one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal

@@ -4,8 +4,6 @@ Points are rows (x1, y1, x2, y2); F and H are row-major vectors of 9. Distances 
 that noise has the standard deviation of one coordinate.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sections 5.2 and 5.4: F from linear equations, and RANSAC (Algorithm 2)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

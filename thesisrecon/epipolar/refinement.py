@@ -6,8 +6,6 @@ is the orthonormal representation of Bartoli and Sturm (IJCV 2004). Points are r
 common frame, F is a row-major vector of 9.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -5,8 +5,6 @@ simpler model is rejected if its residuals exceed the noise, or if F explains mo
 than chance would. A homography K R K^-1 with square pixels is a pure rotation (HZ 13.2, 19.6).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from enum import Enum
 

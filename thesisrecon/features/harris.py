@@ -3,8 +3,6 @@
 C. Harris and M. Stephens, "A combined corner and edge detector", Alvey Vision Conference, 1988.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -4,8 +4,6 @@ Patches of simulated oblique views match those of another camera far to the side
 "ASIFT: a new framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2, 2009).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain

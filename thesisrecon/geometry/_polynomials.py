@@ -1,7 +1,5 @@
 """Real roots of polynomials in compiled code, by the roots of their derivatives (Yuksel, HPG 2022)."""
 
-from __future__ import annotations
-
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64
 

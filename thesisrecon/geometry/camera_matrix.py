@@ -3,8 +3,6 @@
 The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its transpose.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.arrays import F64, I64

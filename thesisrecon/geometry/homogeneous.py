@@ -1,7 +1,5 @@
 """Section 3.2: homogeneous coordinates, and the transforms and scales that condition them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

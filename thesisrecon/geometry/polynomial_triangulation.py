@@ -10,8 +10,6 @@ companion replace the rotated images of the paper, so that epipoles may be at in
 (B00, B01, B11).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Relative poses of calibrated cameras: five points, essential matrices and homographies taken apart."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon._numba import empty, kernel, zeros

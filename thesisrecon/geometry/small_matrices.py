@@ -1,7 +1,5 @@
 """Small matrices: kernels that compile in a fraction of the time of LAPACK's wrappers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

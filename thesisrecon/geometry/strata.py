@@ -14,8 +14,6 @@ are symmetric and of any scale. The absolute conic Omega is x'x = 0 on the plane
 (3.11-3.13).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal, get_args
 

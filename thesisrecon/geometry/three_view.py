@@ -5,8 +5,6 @@ T (3, 3, 3) is indexed T[i, j, k] = T_i^jk: i is a coordinate of a point of view
 matches satisfy sum x^i l2_j l3_k T_i^jk = 0; every relation of points and lines follows from this one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.arrays import F64, require_finite

@@ -5,8 +5,6 @@ unit norm (mid-points X4 = 1). Near an epipole "optimal" may end in a higher min
 docs/theory/projective.md compares the methods (Hartley and Sturm, "Triangulation", CVIU 68(2), 1997).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ x2' F x1 = 0; the epipolar line in image 2 is F x1, in image 1 F' x2; F e1 = 0, 
 those of a plane (3.6.4) and of matches, with the test for parallax.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.arrays import F64, require_finite, require_shapes

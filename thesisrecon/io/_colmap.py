@@ -6,8 +6,6 @@ normalized points; FULL_OPENCV adds k2 and k3. Since COLMAP 3.12 a model has rig
 its own rig and each image its own frame here.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import sqlite3

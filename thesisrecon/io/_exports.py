@@ -5,8 +5,6 @@ all of them but nerfstudio, where it is (0.5, 0.5) and cameras look along -z wit
 format returns its main file; images lie in ``images/`` beside it, masks in ``masks/``.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

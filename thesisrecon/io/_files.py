@@ -3,8 +3,6 @@
 If the program is killed at any moment, the old file or the new one is there.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -5,8 +5,6 @@ microscopy", ICPR 2000) of the smoothed image, relative to the variance of its g
 contrast do not change it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator

@@ -4,8 +4,6 @@ Resizing uses one exact scale s along both axes, (x + 0.5) s - 0.5, so that squa
 last row may be cut by less than a working pixel.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os

@@ -3,8 +3,6 @@
 trimesh is imported on demand: it takes longer to import than the rest of the package.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -3,8 +3,6 @@
 Known camera positions are read from CSV files: lengths, or latitude, longitude and height (WGS84).
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

@@ -3,8 +3,6 @@
 Of data sets: par.txt (Middlebury), NAME_cam.txt (MVSNet, BlendedMVS, DTU), a matrix P for each image.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

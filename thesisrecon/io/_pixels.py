@@ -4,8 +4,6 @@ The decoded image is held once, in the mode of its file. Rotation, conversion an
 at a time: on the whole image each of them would need another four bytes per pixel.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import threading

@@ -4,8 +4,6 @@ A pyramid is stored as ``pixels``, all levels one after the other, and ``levels`
 width of each; a pixel of level k spans ``base * 2^k`` pixels of the image.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace

@@ -1,7 +1,5 @@
 """First matches without a search radius: mutual nearest patches that pass the ratio test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, replace
 from itertools import product

@@ -1,7 +1,5 @@
 """The default matching: seeds without a search radius, guided matching along epipolar lines, alignment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Section 4.2.2: matching by correlation within a radius and strength of match (algorithm 4.1)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ Inverse compositional (S. Baker and I. Matthews, IJCV 56, 2004, section 3.2), at
 scale.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

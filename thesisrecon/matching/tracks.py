@@ -1,7 +1,5 @@
 """Tracks: chains of verified matches over many views, optionally aligned with their middle view."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Levenberg-Marquardt: one damping loop, dense solvers of small problems; robust losses and noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar

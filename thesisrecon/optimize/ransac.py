@@ -1,7 +1,5 @@
 """RANSAC (Fischler and Bolles 1981) with local optimisation; robust resection of cameras (section 6.4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from contextvars import ContextVar
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Algorithm 1 of the thesis: from images to cameras, points and a textured model, stage after stage."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Corners, matches and tracks of other programs: checks, and the steps of Algorithm 1 that take them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

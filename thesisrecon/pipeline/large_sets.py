@@ -7,8 +7,6 @@ Parts are independent tasks. Wrong matches between two similar places cannot def
 one of them, and a part that fails does not affect the others: its images are registered after the alignment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice, product

@@ -1,7 +1,5 @@
 """Output files of a run, written and read back: COLMAP model, points, cameras, surface, summary, report."""
 
-from __future__ import annotations
-
 import resource
 import sys
 import time

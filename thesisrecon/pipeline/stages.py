@@ -3,8 +3,6 @@
 Each function computes one record of the result, or reads it if the run has computed it before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace

@@ -5,8 +5,6 @@ with an arbitrary P), and kept if it agrees with its points and verified matches
 sequential reconstruction of the thesis, used by the preset ``thesis``, does without these tests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar

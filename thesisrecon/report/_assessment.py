@@ -1,7 +1,5 @@
 """Sentences, tables and numbers of the pages: the assessment of a run, its key facts, a comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

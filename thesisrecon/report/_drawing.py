@@ -1,7 +1,5 @@
 """Drawings of the report: thumbnails, image pairs, depth maps and the held-out comparison."""
 
-from __future__ import annotations
-
 import base64
 import io
 from dataclasses import dataclass

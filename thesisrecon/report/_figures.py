@@ -4,8 +4,6 @@ The scene is drawn upright and without outliers. Plain mappings instead of plotl
 version of plotly.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

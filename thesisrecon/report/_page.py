@@ -5,8 +5,6 @@ for scripts is JSON that cannot close its element, and a content security policy
 hashes and forbids all addresses except ``data:``.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib

@@ -4,8 +4,6 @@
 order, ``tuple_of("module.Class", ...)`` a named tuple. A kernel that it lacks is compiled when it is called.
 """
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Each result is one npz file with a JSON description, written atomically. It is r
 and its key, made from settings, code and all inputs, is the same.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import fcntl
 import hashlib

@@ -6,8 +6,6 @@ message, kills the child processes and exits. Nothing is lost: files are written
 (:mod:`thesisrecon.io._files`), and a run resumes from its cache.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import signal

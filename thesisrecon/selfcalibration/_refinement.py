@@ -5,8 +5,6 @@ the six entries of 3 C C' / tr(C C') - I: the nonlinear criterion of Pollefeys e
 scale-free form, with one log f per camera group.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

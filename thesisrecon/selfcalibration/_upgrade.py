@@ -3,8 +3,6 @@
 The identifiability is that of the upgraded cameras, or of projective ones where self-calibration failed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps

@@ -6,8 +6,6 @@ H_j^-1, so prior knowledge of w_j is linear in w: constant K: w_j = w (R. Hartle
 CVPR 1999).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

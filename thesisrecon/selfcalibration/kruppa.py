@@ -10,8 +10,6 @@ Both triples are normalized and compared by their cross product, so that no deno
 infinity does not appear: more motions are critical than for the quadric, but no projective frame is needed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

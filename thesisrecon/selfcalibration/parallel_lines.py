@@ -4,8 +4,6 @@ Vanishing points of a direction in two images or more are triangulated to a poin
 points span the plane.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from thesisrecon.arrays import F64

@@ -6,8 +6,6 @@ Nonlinear: M. Pollefeys, R. Koch, L. Van Gool, IJCV 32(1), 1999, over the plane 
 Each closed form fails on some image sets, so that the default method refines the hypotheses of all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stratified self-calibration (chapter 7): plane at infinity, affine upgrade, then calibration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Integer images of rectified pairs, their noise, and matching costs of rows, strip by strip."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any

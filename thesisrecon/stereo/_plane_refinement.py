@@ -1,7 +1,5 @@
 """Refinement of depth maps with slanted windows: the plane of every pixel of largest correlation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Compiled selection of disparities, left-right check, speckle filter, smoothing, and confidence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(3), 1996, [26] of the thesis.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

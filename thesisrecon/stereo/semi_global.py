@@ -5,8 +5,6 @@ afterwards by the left-right check. All inner loops run over pixels of a row so 
 them; horizontal paths are computed on transposed blocks.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Triangle meshes: areas, connected parts, halves, and the piecewise linear surfaces of depth maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ collapses to the point of least sum if its rms is below the limit. At last each 
 distance of the original ones from the faces around it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple

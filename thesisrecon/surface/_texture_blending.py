@@ -1,7 +1,5 @@
 """Colours of a texture, blended from all images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from itertools import combinations, pairwise, product

@@ -5,8 +5,6 @@ Levoy 1996) and extracts the zero level as a surface net (Gibson 1998): one vert
 :class:`DepthSheets` follows the thesis.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 A chart consists of connected faces assigned to one image, at its resolution; colours are blended from all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Forward warping of an image, nearer pixels in front in any order (thesis, sections 1.2 and 1.3)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """View interpolation (view morphing) between two images (thesis, section 1.2; Seitz and Dyer 1995)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

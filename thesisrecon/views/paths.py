@@ -1,7 +1,5 @@
 """Camera paths around a model and along the registered cameras (thesis, section 1.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

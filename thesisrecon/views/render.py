@@ -3,8 +3,6 @@
 PSNR and SSIM of a rendered and a real image (H, W, 3) of uint8 use the pixels ``compared`` (H, W).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Covariance of poses, intrinsics and points after bundle adjustment, and the noise from the residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -6,8 +6,6 @@ V = sum B'B + damping = L L' of one point, B~ = B L^-T, Q_kl = delta_kl I - B~_k
 L^-1 W' (3 x C), two observations add S_kl = A_k' Q_kl A_l = delta_kl A_k' A_k - Z_k' Z_l to U - W V^-1 W'.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Rows of the table that share a value have the same unknown; the focal length is 
 mean of a hierarchical prior is an unknown of its own, seen by no image: the prior stays sparse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Metric bundle adjustment: poses, points and intrinsics, shared or separate, with priors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

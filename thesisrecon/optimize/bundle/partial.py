@@ -3,8 +3,6 @@
 Also triangulation by any method of section 6.3, among them the least reprojection error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple

@@ -5,8 +5,6 @@ V^-1 (e_b - W' a) (HZ A6.3). Points are eliminated in chunks, whose sums lose fe
 banded Cholesky factor is linear in the views if an order keeps neighbours together (streets).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
