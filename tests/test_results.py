@@ -45,7 +45,7 @@ def test_a_camera_is_found_by_name_and_by_number_and_has_standard_deviations(run
     assert repr(result.cameras).startswith("Cameras(['image-0', ")
 
 
-def test_a_finished_folder_is_read_back_and_saved_as_the_run_wrote_it(run, tmp_path):
+def test_results_are_read_back_and_saved_with_or_without_their_folder(run, tmp_path):
     result = run[1]
     loaded = thesisrecon.load(result.out)
     assert loaded.summary == result.summary
@@ -57,9 +57,6 @@ def test_a_finished_folder_is_read_back_and_saved_as_the_run_wrote_it(run, tmp_p
     thesisrecon.save(loaded, tmp_path / "copy")
     for name in ("cameras.json", "points.ply", "summary.json", "sparse/0/images.bin"):
         assert (tmp_path / "copy" / name).read_bytes() == (result.out / name).read_bytes()
-
-
-def test_a_result_without_a_folder_is_saved(run, tmp_path):
     scene, kept = run
     result = thesisrecon.reconstruct_from_matches(scene.keypoints, scene.matches, scene.sizes)
     assert result.out is None

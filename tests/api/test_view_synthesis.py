@@ -35,7 +35,7 @@ def _psnr(a, b):
     return 10.0 * np.log10(255.0**2 / np.mean((a.astype(np.float64) - b) ** 2))
 
 
-def test_calibrated_photographs_show_a_third_one(found):
+def test_calibrated_photographs_show_a_third_one_and_themselves(found):
     views = prepare_trilinear_views(found, K=SCENE.K[6], config=SMALL)
     R, C = SCENE.R, SCENE.C
     baseline = np.linalg.norm(C[7] - C[6])
@@ -46,9 +46,6 @@ def test_calibrated_photographs_show_a_third_one(found):
     gain = truth[100:300, 130:400].mean() / picture[100:300, 130:400].mean()
     inner = (slice(60, -60), slice(80, -80))
     assert _psnr(gain * picture[inner], truth[inner]) > _psnr(_photograph(7)[inner], truth[inner]) + 3.0
-
-
-def test_at_their_own_places_the_photographs_are_seen_again(found):
     guessed = prepare_trilinear_views(found, config=SMALL)
     np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
     reported = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))

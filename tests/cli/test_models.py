@@ -51,7 +51,7 @@ def test_the_table_the_json_and_the_page_say_the_same(models, tmp_path, capsys):
     assert len(page) < 2_500_000
 
 
-def test_limits_have_an_exit_code(models, capsys):
+def test_limits_have_an_exit_code_and_what_is_missing_is_beyond_any(models, capsys, tmp_path):
     found, command = compare_models(*models), ["compare", *map(str, models)]
     largest = {"centre": found.centre_error.max(), "rotation": found.rotation_error_deg.max()}
     largest["focal"] = 100.0 * np.abs(found.focal_error_rel).max()
@@ -63,9 +63,6 @@ def test_limits_have_an_exit_code(models, capsys):
     assert run_command([*command, "--max-centre-error", str(0.9 * largest["centre"])]) == 4
     worst = found.names[int(found.centre_error.argmax())]
     assert f"limit: the centre error of {worst} is {largest['centre']:.4g}" in capsys.readouterr().out
-
-
-def test_a_missing_camera_and_an_unknown_error_are_beyond_any_limit(tmp_path, capsys):
     cameras = json.loads(COURTYARD.read_text(encoding="utf-8"))["cameras"]
     (tmp_path / "two.json").write_text(json.dumps({"cameras": cameras[:2]}), encoding="utf-8")
     assert (

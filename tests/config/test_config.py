@@ -213,7 +213,7 @@ def test_a_zooming_camera_keeps_the_rest():
     assert strange.shared[:, 3].tolist() == [0, 1, 2]
 
 
-def test_exif_is_used_on_request():
+def test_exif_is_used_on_request_and_images_without_it_share_one_focal():
     options = IntrinsicsOptions(exif=True, focal_std_rel=0.2)
     got = stages_view(options, exif=(3000.0, np.nan, 4000.0))
     assert got.focal_known.tolist() == [True, False, True]
@@ -221,9 +221,6 @@ def test_exif_is_used_on_request():
     known = stages_view(IntrinsicsOptions(focal="known", focal_px=3000.0))
     assert not known.std[:, 0].any()
     assert known.focal_known.all()
-
-
-def test_images_without_exif_share_one_focal_and_are_reported():
     options = IntrinsicsOptions(focal="known", exif=True)
     sizes = [(4000, 3000)] * 5
     exif = np.array([3000.0, np.nan, 3000.0, np.nan, 3500.0])

@@ -145,7 +145,7 @@ def test_matches_between_windows_do_not_determine_a_facade():
     assert contradicted >= 9
 
 
-def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
+def test_a_wrong_f_of_the_right_plane_competes_with_the_right_one_and_a_far_one_must_explain_more():
     """All matches of a plane and few others; a wrong F fits some of these."""
     rng = np.random.default_rng(3)
     flat = make_pair(300, np.random.default_rng(8), planar=True)
@@ -162,9 +162,6 @@ def test_a_wrong_f_of_the_right_plane_has_the_right_one_as_competing_model():
     assert degeneracy.competing_margin < 0.0
     assert np.mean(np.abs(two_view.sampson_residuals(degeneracy.competing_model, xy1, xy2)) < 0.9) > 0.97
     assert any("another F" in reason for reason in degeneracy.reasons)
-
-
-def test_a_model_far_from_the_estimate_must_also_explain_much_more():
     for error, gained, differs in [(2.0, 100.0, True), (0.5, 100.0, False), (2.0, 0.0, False)]:
         other = assessment._CompetingModel(np.ones(9), lost=20.0, gained=gained, error=error, apart=0.1)
         assert other.differs(1.0) == differs

@@ -119,7 +119,7 @@ def _numbers(*arrays):
     return " ".join(f"{v:.12g}" for a in arrays for v in np.ravel(a))
 
 
-def test_cameras_of_data_sets(tmp_path):
+def test_cameras_of_data_sets_are_read_and_damaged_ones_refused(tmp_path):
     model = _model()
     lines = [f"{v.name} {_numbers(v.K, v.R, v.t)}" for v in model.views]
     (tmp_path / "dino_par.txt").write_text("\n".join([str(len(lines)), *lines]))
@@ -142,9 +142,6 @@ def test_cameras_of_data_sets(tmp_path):
             np.testing.assert_allclose(a.R, b.R, atol=1e-8)
             np.testing.assert_allclose(a.t, b.t, atol=1e-8)
     assert compare_models(folders[1], tmp_path / "dino_par.txt").centre_error.max() < 1e-8
-
-
-def test_damaged_cameras_of_data_sets_are_refused(tmp_path):
     (tmp_path / "par.txt").write_text("2\na.png 1 2 3\n")
     refuses(UsageError, "2 cameras are announced, 1 follow", read_model, tmp_path / "par.txt")
     (tmp_path / "cams").mkdir()

@@ -121,7 +121,7 @@ def test_covariances_are_those_of_the_textbook_and_useless_parameters_harmless()
     assert np.isfinite(answer.covariance).all()
 
 
-def test_states_outside_the_domain_are_refused_not_raised():
+def test_states_outside_the_domain_and_singular_systems_are_refused_not_raised(monkeypatch):
     def residual(x):
         return np.where(x > 0.0, np.log(np.maximum(x, 1e-300)) - 2.0, np.nan)
 
@@ -129,9 +129,6 @@ def test_states_outside_the_domain_are_refused_not_raised():
     np.testing.assert_allclose(answer.x, np.exp(2.0), rtol=1e-6)
     refuses(ValueError, "finite", least_squares.minimize_residuals, residual, np.array([-1.0]))
     refuses(ValueError, "finite", least_squares.minimize_residuals, lambda x: x[:1], np.array([1.0, np.nan]))
-
-
-def test_guards_of_the_linear_algebra(monkeypatch):
     assert solve_positive(-np.eye(2), np.ones(2)) is None
     assert solve_positive(np.array([[np.nan]]), np.ones(1)) is None
     assert np.isinf(least_squares.invert_information(np.array([[np.nan]]))).all()

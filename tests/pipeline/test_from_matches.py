@@ -31,7 +31,7 @@ def focal_is_right(result, scene=SCENE):
     return camera.K[0, 0]
 
 
-def test_rows_positions_and_pairs_in_the_other_order_give_the_same_cameras(from_rows):
+def test_rows_positions_tracks_and_pairs_in_the_other_order_give_the_same_cameras(from_rows):
     focal_px = focal_is_right(from_rows)
     assert from_rows.summary["trusted"]
     k = SCENE.keypoints
@@ -41,18 +41,12 @@ def test_rows_positions_and_pairs_in_the_other_order_give_the_same_cameras(from_
     turned = {(j, i): rows[:, ::-1] for (i, j), rows in SCENE.matches.items()}
     result = reconstruct_from_matches(SCENE.keypoints, turned, SCENE.sizes)
     assert np.array_equal(result.points, from_rows.points)
-
-
-def test_tracks_give_the_same_focal_length_although_some_are_wrong(from_rows):
     tracks = SCENE.tracks
     tracks.xy[::25] += 20.0
     result = reconstruct_from_tracks(tracks, SCENE.sizes)
     assert focal_is_right(result) == pytest.approx(from_rows.cameras[0].K[0, 0], rel=1e-2)
     assert result.tracks.n_points == 200
-
-
-def test_a_keypoint_at_the_position_of_another_does_not_split_its_tracks(from_rows):
-    """SIFT repeats a position with another orientation; both rows are matched."""
+    # SIFT repeats a position with another orientation; both rows are matched.
     keypoints = [np.concatenate([xy, xy[:50]]) for xy in SCENE.keypoints]
     matches = {pair: np.concatenate([rows, rows[:50] + 200]) for pair, rows in SCENE.matches.items()}
     matches[0, 1] = np.concatenate([SCENE.matches[0, 1][50:], SCENE.matches[0, 1][:50] + 200])

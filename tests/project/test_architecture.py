@@ -21,7 +21,7 @@ OPTIONAL = {"runtime": {"dask", "distributed"}, "testing": {"pytest"}}
 """Optional dependencies by folder, imported only on request."""
 
 
-def test_the_package_imports_only_its_core_dependencies():
+def test_the_package_imports_only_its_core_and_mathematics_touches_no_file():
     allowed = {*sys.stdlib_module_names, "thesisrecon", *CORE}
     for path in MODULES:
         nodes = [*ast.walk(tree_of(path))]
@@ -29,16 +29,10 @@ def test_the_package_imports_only_its_core_dependencies():
         names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
         optional = OPTIONAL.get(path.parent.name, set())
         assert {name.split(".")[0] for name in names} <= allowed | optional, path
-
-
-def test_chapters_export_nothing():
-    """A name is imported from the module that defines it; only ``thesisrecon`` itself exports names."""
+    # A name is imported from the module that defines it; only ``thesisrecon`` itself exports names.
     code = {path: tree_of(path).body[1:] for name in CHAPTERS for path in PACKAGE.glob(f"{name}/__init__.py")}
     assert [path for path, body in code.items() if body] == []
-
-
-def test_mathematics_touches_no_file():
-    """Global randomness is refused by ruff, logging by ``lint-imports``."""
+    # Global randomness is refused by ruff, logging by ``lint-imports``.
     files = {"open", "load", "savez", "mkdir", "unlink", "read_text", "read_bytes"}
     files |= {"write_text", "write_bytes"}
     for path in (path for name in CHAPTERS for path in (PACKAGE / name).rglob("*.py")):

@@ -65,7 +65,7 @@ def test_runs_that_stopped_early_say_how_far_they_got():
         assert text in page
 
 
-def test_strata_are_told_apart(page):
+def test_strata_are_told_apart_and_captions_state_omitted_points(page):
     projective = render_report(synthetic.projective_run())
     assert projective.count('<span class="state open">projective camera</span>') == 8
     assert ">registered<" not in projective
@@ -73,9 +73,6 @@ def test_strata_are_told_apart(page):
     assert 'id="affine-figure"' in page
     without = render_report(replace(synthetic.made_up_run(), affine=None))
     assert 'id="affine-figure"' not in without
-
-
-def test_the_caption_states_omitted_points():
     data = synthetic.made_up_run(points=200)
     assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()

@@ -97,7 +97,7 @@ def test_a_texture_beyond_the_limit_is_reduced(monkeypatch):
     assert 0.9 * 100 * 100 < picture.width * picture.height <= 100 * 100
 
 
-def test_flat_models_and_fans_about_a_stray_are_shown():
+def test_flat_models_are_shown_and_strays_take_no_resolution():
     flat = TexturedMesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0, 1, 2]]))
     data = data_of(flat)
     assert np.isfinite(corners(data)).all()
@@ -106,9 +106,6 @@ def test_flat_models_and_fans_about_a_stray_are_shown():
     rim = np.column_stack([np.cos(angle), np.sin(angle), np.full(40, 4.0)])
     faces = np.array([[k, (k + 1) % 40, 40] for k in range(40)])
     assert len(corners(data_of(TexturedMesh(np.vstack([rim, [[0.0, 0.0, 1000.0]]]), faces)))) == 40
-
-
-def test_a_stray_does_not_take_the_resolution_of_the_rest():
     mesh = synthetic.sphere_model()
     far = np.array([[500.0, 0, 0], [501, 0, 0], [500, 1, 0]])
     n = len(mesh.vertices)

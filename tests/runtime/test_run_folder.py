@@ -49,7 +49,7 @@ def some_metric():
     return records.MetricResult(reconstruction, intervals, {"checked": 1.0}, False, ("a doubt",))
 
 
-def test_records_survive_the_disk_and_equal_ones_give_equal_bytes(tmp_path):
+def test_records_survive_the_disk_under_their_key_and_damage_is_reported(tmp_path):
     folder = StageFolder(tmp_path / "01")
     folder.save("a", "key", some_features())
     folder.save("b", "key", some_metric())
@@ -63,9 +63,6 @@ def test_records_survive_the_disk_and_equal_ones_give_equal_bytes(tmp_path):
     assert metric.reconstruction.registered.dtype == np.bool_
     assert bytes_from_record(some_metric(), "k") == bytes_from_record(some_metric(), "k")
     assert bytes_from_record(some_features(1.0), "k") != bytes_from_record(some_features(2.0), "k")
-
-
-def test_another_key_or_absence_recomputes_and_damage_is_reported(tmp_path):
     folder = StageFolder(tmp_path)
     assert folder.load("a", "key") is None
     folder.save("a", "key", some_features())
@@ -164,7 +161,7 @@ def refused(path, words="npz: "):
 REPORT = {"type": "StageReport", "fields": {"stage": "x", "seconds": 1.0}}
 
 
-def test_only_records_are_made(tmp_path):
+def test_only_records_are_made_and_nothing_is_unpacked(tmp_path):
     path = tmp_path / "a.npz"
     assert read_record(saved(path, REPORT), "k").stage == "x"
     assert read_record(path, "other") is None
@@ -175,9 +172,6 @@ def test_only_records_are_made(tmp_path):
     path.write_bytes(sealed(path.read_bytes()))
     assert refused(path, "allow_pickle")
     assert read_record(saved(path, {"array": "array0"}, array0=np.arange(3)), "k").tolist() == [0, 1, 2]
-
-
-def test_nothing_is_unpacked(tmp_path):
     path = saved(tmp_path / "a.npz", REPORT, packed=True)
     assert refused(path, "not compressed")
     with zipfile.ZipFile(path, "w") as archive:

@@ -59,7 +59,7 @@ def test_a_critical_motion_is_named(motion, by_hand):
         assert by_hand or nearness < 1e-3
 
 
-def test_cameras_that_hardly_turned_nor_moved_have_the_name_of_the_nearer_motion():
+def test_small_motions_have_the_name_of_the_nearer_one_and_general_ones_are_far_from_all():
     scene = make_sequence(Motion.TRANSLATION, np.random.default_rng(2))
     far = scene.X + 60.0 * scene.R[0, 2] * np.linalg.norm(scene.C.std(axis=0))
     cameras = replace(true_cameras(scene), X=far)
@@ -68,9 +68,6 @@ def test_cameras_that_hardly_turned_nor_moved_have_the_name_of_the_nearer_motion
     turns = Rotation.from_rotvec(np.radians(np.random.default_rng(3).normal(0.0, 2.0, (len(scene.R), 3))))
     turned = replace(cameras, R=turns.as_matrix() @ cameras.R, C=1e-3 * cameras.C)
     assert nearest_critical_motion(measure_motion(turned))[0] == "pure rotation"
-
-
-def test_general_motions_are_far_from_all_and_thickness_forgives_a_few_far_points():
     for seed in range(20):
         scene = make_sequence(Motion.GENERAL, np.random.default_rng(seed))
         assert nearest_critical_motion(measure_motion(true_cameras(scene)))[1] > 2.0

@@ -220,7 +220,7 @@ def views_of(walled, **options):
     }
 
 
-def test_an_undistorted_view_equals_the_view_without_distortion(walled):
+def test_undistorted_and_smaller_views_have_the_camera_of_their_pixels(walled):
     straight = make_walled(on_arc((-14.0, -5.0, 4.0, 13.0)))
     for i, view in views_of(walled).items():
         assert (view.rgb[~view.seen] == 0).all()
@@ -229,9 +229,6 @@ def test_an_undistorted_view_equals_the_view_without_distortion(walled):
         assert np.median(np.abs(apart[view.seen])) < 2.0
         plain = pinhole_view(straight.images[i], straight.reconstruction, i)
         assert (plain.rgb == straight.images[i].rgb).all()
-
-
-def test_a_smaller_view_has_the_camera_of_its_pixels(walled):
     view, small = views_of(walled)[1], views_of(walled, max_side=120)[1]
     assert small.seen.shape == (SIZE[1] // 2, SIZE[0] // 2)
     X = _sparse_points(walled.reconstruction).X

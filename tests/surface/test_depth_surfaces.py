@@ -120,7 +120,7 @@ def test_an_edge_is_not_smeared(slant):
     assert pieces == 2
 
 
-def test_a_cut_may_end_within_the_surface():
+def test_a_cut_may_end_within_the_surface_and_small_pieces_join_it():
     """A step that fades out: apart where it is large, one surface where it ends, exact on both sides."""
     y, x = np.indices(SHAPE)
     step = np.clip((45.0 - y) / 45.0, 0.0, 1.0) * 0.1
@@ -129,9 +129,6 @@ def test_a_cut_may_end_within_the_surface():
     near_the_end = (np.abs(y - 42) < 8) & (np.abs(x - 39.5) < 8)
     assert np.abs(error)[~near_the_end].max() < 5.0 * noise
     assert pieces == 1
-
-
-def test_small_pieces_become_the_surface_about_them_or_nothing():
     rho = np.full(SHAPE, 0.2)
     known = np.zeros(SHAPE, dtype=bool)
     known[:, :60] = True

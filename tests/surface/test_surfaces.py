@@ -110,7 +110,7 @@ def test_seen_through_points_are_removed(ring):
     assert together < 1e-3
 
 
-def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
+def test_the_surface_of_one_map_passes_its_points_and_keeps_edges_and_holes_without_crumbs():
     P = looking_at_origin(0.3, 0.0, 3.5)
     given = sphere_map(0, P)
     behind = np.where(np.isnan(given.depth), np.float32(6.0), given.depth)
@@ -124,9 +124,6 @@ def test_the_surface_of_one_map_passes_its_points_and_breaks_at_edges():
     centre = -np.linalg.solve(P[:, :3], P[:, 3])
     assert ((np.cross(b - a, c - a) * (centre - a)).sum(1) > 0).all()
     assert len(np.unique(_mesh.connected_parts(mesh.faces, len(mesh.vertices)))) == 2
-
-
-def test_holes_stay_holes_and_steps_thin_out():
     given = sphere_map(0, looking_at_origin(0.0, 0.0, 3.5))
     full, coarse = _mesh.surface_from_depth(given), _mesh.surface_from_depth(given, step=3)
     assert len(coarse.faces) == pytest.approx(len(full.faces) / 9, rel=0.15)
@@ -134,9 +131,6 @@ def test_holes_stay_holes_and_steps_thin_out():
     depth[55:65, 75:85] = np.nan
     holed = _mesh.surface_from_depth(replace(given, depth=depth))
     assert len(full.faces) - len(holed.faces) == 2 * 11 * 11 - 4  # the corners keep a half
-
-
-def test_crumbs_are_dropped():
     grid = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     vertices, colors = np.concatenate([grid, 0.01 * grid + 5.0]), np.arange(24, dtype=np.uint8).reshape(8, 3)
     faces = np.array([[0, 1, 2], [1, 3, 2], [4, 5, 6], [5, 7, 6]])
@@ -367,7 +361,7 @@ def test_blocks_and_threads_leave_no_seams(monkeypatch):
     assert len(one.faces) < 2 * len(simplified(waves, 1e-3).faces)
 
 
-def test_a_closed_surface_stays_closed_and_keeps_its_volume():
+def test_closed_surfaces_keep_their_volume_and_noise_costs_no_faces():
     ball, rng = fused_sphere(), np.random.default_rng(1)
     shaken = replace(ball, vertices=ball.vertices + 1e-3 * rng.normal(size=ball.vertices.shape))
     small = simplified(shaken, 5e-3)
@@ -376,9 +370,6 @@ def test_a_closed_surface_stays_closed_and_keeps_its_volume():
     assert after == pytest.approx(before, rel=5e-3)
     before, after = ((sides(mesh.faces)[1] == 1).sum() for mesh in (ball, small))
     assert after <= before
-
-
-def test_fused_noise_costs_no_faces_and_the_error_stays_below_it():
     noisy = [sphere_map(m.view, m.P, noise=0.01) for m in ring_of()]
     fine, small = (VolumetricFusion(tolerance=t).fuse(noisy) for t in (0.0, 0.25))
     assert len(small.faces) < 0.4 * len(fine.faces)

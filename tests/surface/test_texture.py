@@ -114,7 +114,7 @@ def test_charts_are_large_and_use_views_that_see_them(sphere):
     assert charts < min(0.5 * before, 40)
 
 
-def test_rectangles_do_not_overlap():
+def test_rectangles_do_not_overlap_in_an_atlas_no_larger_than_allowed(sphere):
     sizes = np.random.default_rng(0).integers(0, 40, (200, 2))
     places, (width, height) = _pack_rectangles(sizes)
     taken = np.zeros((height, width), dtype=int)
@@ -124,9 +124,6 @@ def test_rectangles_do_not_overlap():
         assert y + h <= height
     assert taken.max() == 1
     assert width * height < 1.5 * sizes.prod(axis=1).sum()
-
-
-def test_the_atlas_is_no_larger_than_allowed(sphere):
     mesh = texture_mesh(sphere, [photograph(m) for m in ring_of()], max_texels=20_000)
     assert mesh.texture.shape[0] * mesh.texture.shape[1] < 40_000  # with the patches of unseen faces
     assert np.sqrt(np.mean(difference(mesh) ** 2)) < 20.0

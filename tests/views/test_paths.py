@@ -80,16 +80,13 @@ def test_the_orbit_looks_at_the_middle_upright_and_turns_with_the_world(seed):
     np.testing.assert_allclose((centres_of(path) - shift) @ turn, centres_of(same), atol=1e-6)
 
 
-def test_an_orbit_of_one_side_stays_on_that_side_and_closes():
+def test_an_orbit_stays_on_the_side_of_its_cameras_and_avoids_obstacles():
     centres = centres_of(paths.orbit(ring(np.radians([-50.0, -20.0, 5.0, 45.0])), ball(), 61))
     seen = np.degrees(np.arctan2(centres[:, 0], -centres[:, 2]))
     np.testing.assert_allclose([seen.min(), seen.max()], [-50.0, 45.0], atol=2.0)
     steps = np.linalg.norm(np.roll(centres, -1, axis=0) - centres, axis=1)
     assert steps[-1] < 1.1 * steps.max()
-
-
-def test_an_orbit_avoids_obstacles_and_shows_the_model():
-    """A long wall: at its ends the cameras' median distance would lead through it."""
+    # A long wall: at its ends the cameras' median distance would lead through it.
     wall = np.random.default_rng(0).uniform([-6, -1, -0.2], [6, 1, 0.2], (3000, 3))
     cameras = ring(np.radians(np.arange(0, 360, 30.0)), -0.5, 5.0)
     for camera in paths.orbit(cameras, wall, 36):

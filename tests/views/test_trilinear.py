@@ -266,23 +266,17 @@ def test_off_the_baseline_too(synthesis, translation):
     assert _psnr(picture[inner], _truth(camera)[inner]) > 30.0
 
 
-def test_pixels_that_see_nothing_in_any_direction_are_black(synthesis):
+def test_hidden_pixels_come_from_the_other_image_and_exposures_go_over(synthesis):
     wide = calibration_matrix(40.0, 40.0, 140.0, 100.0)
     picture = synthesis.render(VirtualCamera(*STILL, wide, SIZE))
     assert 0.02 < (picture == 0).all(axis=2).mean() < 0.1
     assert picture[90:110, 130:150].min() > 0
-
-
-def test_pixels_hidden_in_one_image_are_taken_from_the_other():
     images, places, hidden = _photographs()
     for known, not_seen in zip(places, hidden, strict=True):
         assert 100 < not_seen.sum() < 0.4 * not_seen.size
         known[not_seen] = np.nan
     camera = camera_at(PAIR, 0.5, sizes=(SIZE, SIZE))
     assert _psnr(prepare_synthesis(PAIR, images, places).render(camera), _truth(camera)) > 33.0
-
-
-def test_exposures_go_over_into_each_other():
     (one, two), places, _ = _photographs()
     synthesis = prepare_synthesis(PAIR, (one, 0.64 * two), places, gain=np.full(3, 1.0 / 0.64))
     for s, exposure in ((0.0, 1.0), (0.5, 0.8), (1.0, 0.64)):
@@ -305,7 +299,7 @@ def test_the_way_goes_from_one_photograph_to_the_other_with_the_second_ones_size
         assert camera.size == SIZE
 
 
-def test_cameras_beyond_the_scene_or_that_look_away_are_refused(synthesis):
+def test_cameras_shapes_and_places_that_do_not_fit_are_refused(synthesis):
     for rotation, translation in (
         (np.eye(3), (0.0, 0.0, -20.0)),
         (np.diag([-1.0, 1.0, -1.0]), (0.0, 0.0, 0.0)),
@@ -313,9 +307,6 @@ def test_cameras_beyond_the_scene_or_that_look_away_are_refused(synthesis):
     ):
         camera = VirtualCamera(rotation, np.array(translation), K, SIZE)
         refuses(StageFailure, "sees almost nothing of the scene", synthesis.render, camera)
-
-
-def test_shapes_and_places_that_do_not_fit_are_refused():
     image, nowhere = np.zeros((6, 8, 3)), np.full((6, 8, 2), np.nan, np.float32)
     both = (image, image), (nowhere, nowhere)
     refuses(StageFailure, "no dense correspondence", prepare_synthesis, PAIR, *both)
