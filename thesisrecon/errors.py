@@ -11,8 +11,7 @@ from os import PathLike, environ, fspath
 from pathlib import Path
 from typing import Any, TypeVar
 
-WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""Errors that only writing causes."""
+WRITE_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # Errors that only writing causes
 NOT_MADE = "output-not-made"
 """Code of the warning about a figure, page or file that could not be made; the result is complete without."""
 STRICT_VARIABLE = "THESISRECON_STRICT"

@@ -277,8 +277,7 @@ class SparseModel(Record):
         return replace(self, views=views, X=similarity.apply(self.X))
 
 
-THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
-"""Distances of points, relative to the size of the scene."""
+THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)  # Distances of points, relative to the size of the scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,8 +52,7 @@ from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Tracks
 from thesisrecon.results import RunResult
 
-Chosen = I64 | B8 | Sequence[int]
-"""Numbers of cameras or points, or a mask."""
+Chosen = I64 | B8 | Sequence[int]  # Numbers of cameras or points, or a mask
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
     "k3": (7,),

@@ -35,8 +35,7 @@ from thesisrecon.results import (
 )
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
 
-_INLIER_SIGMAS = 3.37
-"""99 % of the lengths of three-dimensional normal residuals are shorter."""
+_INLIER_SIGMAS = 3.37  # 99 % of the lengths of three-dimensional normal residuals are shorter
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,7 @@ from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.relative_pose import pose_in_front, poses_from_homography
 
-Calibration = F64 | Camera
-"""K (3, 3), or a camera, whose lens counts too and whose pose does not."""
+Calibration = F64 | Camera  # K (3, 3), or a camera, whose lens counts too and whose pose does not
 
 
 class RelativePose(NamedTuple):

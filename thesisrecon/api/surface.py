@@ -24,8 +24,7 @@ from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, d
 from thesisrecon.stereo.rectification import rectify as best_rectification
 from thesisrecon.surface.model import SurfaceModel
 
-ImagesInput = str | Path | Sequence[ImageInput]
-"""A folder, or images as files or arrays."""
+ImagesInput = str | Path | Sequence[ImageInput]  # A folder, or images as files or arrays
 
 
 def rectify(

@@ -26,8 +26,7 @@ from thesisrecon.views import tensor
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
 from thesisrecon.views.render import Shading, render_mesh
 
-_COARSE = 4
-"""Reduction at which the largest disparity of a rectified pair is searched, up to half its width."""
+_COARSE = 4  # Reduction at which the largest disparity of a rectified pair is searched, up to half its width
 
 
 def interpolate_view(

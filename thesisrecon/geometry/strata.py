@@ -154,8 +154,7 @@ def nearest_rotation(A: F64) -> F64:
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-ABSOLUTE_CONIC = np.eye(3)
-"""Omega on the plane at infinity of a metric frame (3.2)."""
+ABSOLUTE_CONIC = np.eye(3)  # Omega on the plane at infinity of a metric frame (3.2)
 ABSOLUTE_DUAL_QUADRIC = np.diag([1.0, 1.0, 1.0, 0.0])
 """Its tangent planes in a metric frame (section 3.4.6, figure 3.7)."""
 

@@ -21,8 +21,7 @@ from thesisrecon.io._files import read_json, read_text
 from thesisrecon.lens import simplest_row
 from thesisrecon.results import SparseModel, SparseView
 
-LOOKS_BACK = np.diag([1.0, -1.0, -1.0])
-"""From axes x right, y down, z forward to x right, y up, z back."""
+LOOKS_BACK = np.diag([1.0, -1.0, -1.0])  # From axes x right, y down, z forward to x right, y up, z back
 _MOST_OF_A_MATRIX = 2000  # bytes
 
 

@@ -22,8 +22,7 @@ from thesisrecon.records import Features, PairChoice, Seeds, TwoView
 # Seeds of each scale that represent an image, upright and rotated.
 PER_SCALE = 200
 ROWS_AT_ONCE = 4096
-FEW_VIEWS = 40
-"""Up to this number of views no pair is rejected: few pairs are redundant then."""
+FEW_VIEWS = 40  # Up to this number of views no pair is rejected: few pairs are redundant then
 STRONG = 0.1
 """A pair is strong if it has this fraction of the matches, or common points, of the best pair of one of its
 views."""

@@ -43,8 +43,7 @@ MAX_CUT, MIN_SIDE = 0.1, 0.3
 """Largest fraction of the common points of a part that a cut may sever (images of a single place have no such
 cut), and smallest fraction of the views on either side."""
 OVERLAP = 12  # views of each of two neighbouring parts that the other one contains too
-MIN_COMMON = 3
-"""Common cameras that determine the similarity between two parts."""
+MIN_COMMON = 3  # Common cameras that determine the similarity between two parts
 MAX_OFFSET_REL, MIN_AGREEMENT = 0.005, 0.5
 """Largest distance, relative to the long side, between the projections of a point that two parts agree on,
 and the fraction of the common points that must agree; otherwise two parts are not aligned."""

@@ -174,8 +174,7 @@ def _light_rows(shading: Shading, origin: F64) -> F64:
     return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
-GREY = np.array([0.299, 0.587, 0.114])
-"""Luma weights of Rec. 601."""
+GREY = np.array([0.299, 0.587, 0.114])  # Luma weights of Rec. 601.
 
 
 def covered_pixels(rendered: RenderedView) -> B8:

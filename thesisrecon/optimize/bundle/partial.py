@@ -39,8 +39,7 @@ from thesisrecon.optimize.bundle.projective import (
 )
 from thesisrecon.optimize.least_squares import DenseSystem, invert_information, run_levenberg_marquardt
 
-_BLOCK = 8192
-"""Points whose derivatives are in memory at a time."""
+_BLOCK = 8192  # Points whose derivatives are in memory at a time
 TriangulationMethod = Literal["polynomial", "linear", "midpoint", "iterated", "optimal"]
 
 

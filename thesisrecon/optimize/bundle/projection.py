@@ -117,8 +117,7 @@ def away_from_zero(w: float) -> float:
 
 _MORTON_BITS = 31
 TINY = 1e-12
-LENS = 5 + BASE
-"""Column of the base of the lens, in tables of twelve columns; others are radial."""
+LENS = 5 + BASE  # Column of the base of the lens, in tables of twelve columns; others are radial
 
 
 class Observations(NamedTuple):
