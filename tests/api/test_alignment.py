@@ -70,7 +70,7 @@ def test_wrong_positions_are_found_and_the_noise_is_measured(count, wrong, seed)
     assert f"{report.inlier.sum()} of {count} positions used" in text
 
 
-def test_too_few_and_collinear_positions_are_refused():
+def test_a_missing_position_costs_one_image_and_too_few_or_collinear_ones_are_refused():
     model = make_model(6)
     positions = true_positions(model)
     few = {name: positions[name] for name in ("0.jpg", "1.jpg")}
@@ -92,9 +92,6 @@ def test_too_few_and_collinear_positions_are_refused():
     street = [SparseView(v.name, v.R, v.t + rng.normal(0, 0.02, 3)) for v in line]
     noisy = {view.name: view.centre + rng.normal(0, 0.05, 3) for view in line}
     refuses(UsageError, "rotation about it undetermined", align_to_positions, SparseModel(street), noisy)
-
-
-def test_a_missing_position_costs_one_image():
     model = make_model(10)
     for missing in ([0.0, np.nan, 1.0], None, [None] * 3, np.ma.masked_all(3)):
         moved, report = align_to_positions(model, true_positions(model) | {"4.jpg": missing})

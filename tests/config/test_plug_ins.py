@@ -75,16 +75,13 @@ def by_function(tmp_path_factory):
     return reconstruct(images(3), tmp_path_factory.mktemp("function") / "out", config=config, until="matches")
 
 
-def test_functions_detect_and_match(by_function):
+def test_functions_detect_and_match_and_their_matches_are_joined_to_tracks(by_function, caplog):
     assert [len(f.xy) for f in by_function.features] == [300] * 3
     assert all(pair.candidates >= pair.inliers for pair in by_function.pairs)
     assert by_function.pairs[0].accepted
     assert (by_function.pairs[0].index1 == -1).all()
     pair = match_pair(*images(2), config=PipelineConfig(images=SMALL, matching=mutual, verification=FEW))
     assert pair.inliers == by_function.pairs[0].inliers
-
-
-def test_matches_of_a_function_are_joined_to_tracks(by_function, caplog):
     given = {"map_all": one_by_one, "rng": np.random.default_rng(0)}
     tracks = PlainTracks().build([None] * 3, by_function.pairs, **given)
     assert (np.bincount(tracks.point_index) == 3).sum() > 5

@@ -45,7 +45,7 @@ def verified(pair, *, outliers):
     return PairVerification().verify(as_matches(xy1, xy2), fit, np.random.default_rng(0)), fit
 
 
-def test_a_good_pair_keeps_its_inliers_and_is_accepted():
+def test_a_good_pair_and_a_plane_are_accepted_and_the_plane_is_reported_at_much_noise_too():
     pair, fit = verified(make_pair(300, np.random.default_rng(0)), outliers=0.3)
     assert (pair.accepted, pair.reason, pair.configuration, pair.undetermined) == (True, "", "general", False)
     assert (pair.i, pair.j, pair.candidates, pair.inliers) == (2, 5, 300, fit.inliers.sum())
@@ -54,9 +54,6 @@ def test_a_good_pair_keeps_its_inliers_and_is_accepted():
     assert len(pair.affine) == pair.inliers
     assert pair.homography_inlier_ratio < 0.5
     assert pair.degeneracy is not None
-
-
-def test_a_plane_is_accepted_and_reported_at_much_noise_too():
     pair, _ = verified(make_pair(300, np.random.default_rng(1), planar=True), outliers=0.2)
     assert (pair.accepted, pair.configuration, pair.undetermined) == (True, "plane", True)
     assert pair.homography_inlier_ratio > 0.97

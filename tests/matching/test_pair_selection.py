@@ -179,7 +179,7 @@ def test_of_many_pairs_the_best_and_some_of_the_rest_are_taken(windows, monkeypa
         assert len(chosen) <= CROPS * (most + spread) + CROPS
 
 
-def test_every_photograph_is_paired_and_all_hang_together_with_blank_ones_too(windows):
+def test_every_photograph_is_paired_and_all_hang_together_with_any_number_of_threads(windows):
     strict = with_constants(type(ESTIMATE), min_evidence=1e9)(nearest=1)
     pairs = choose(strict, CROPS, windows.features).pairs
     assert set(pairs.ravel().tolist()) == set(range(CROPS))
@@ -190,8 +190,6 @@ def test_every_photograph_is_paired_and_all_hang_together_with_blank_ones_too(wi
     assert CROPS - 1 in choice.pairs
     assert len(choose(ESTIMATE, 5, [blank] * 5).pairs) >= 4
 
-
-def test_the_number_of_threads_changes_nothing(windows):
     def in_threads(function, items):
         with ThreadPoolExecutor(3) as pool:
             return list(pool.map(function, items))

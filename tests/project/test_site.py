@@ -252,7 +252,7 @@ def exists(name):
     return False
 
 
-def test_every_numbered_equation_has_code_with_a_test_and_every_section_code():
+def test_every_numbered_equation_and_section_has_code_and_tests_that_exist():
     covered = {r.number for row in theory.rows() if row.tests for r in row.references if r.kind == "equation"}
     wanted = {f"3.{k}" for k in range(1, 43)} | {"4.1"} | {f"5.{k}" for k in range(1, 7)}
     assert wanted - covered == set()
@@ -261,9 +261,6 @@ def test_every_numbered_equation_has_code_with_a_test_and_every_section_code():
         assert [s for s in sections if s not in numbers] == []
     assert theory.chapters_of("geometry.strata.dual") == ["geometry"]
     assert theory.chapters_of("load") == []
-
-
-def test_rows_name_code_and_tests_that_exist():
     rows = theory.rows()
     assert len(rows) > 150
     assert [row.name for row in rows if not exists(row.name)] == []

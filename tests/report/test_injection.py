@@ -67,7 +67,7 @@ def scripts(page):
     return re.findall(r"<script>(.*?)</script>", page, re.S) + library
 
 
-def test_names_add_no_element_and_no_attribute(pages):
+def test_names_add_no_element_and_no_attribute_and_headers_are_nowhere(pages):
     plain, evil = (path.read_text(encoding="utf-8") for path in pages)
     one, other = Structure(plain), Structure(evil)
     # How a number is worded may differ between runs; what stands around it may not.
@@ -82,9 +82,6 @@ def test_names_add_no_element_and_no_attribute(pages):
     assert "<script>alert(7)" in reported
     for block in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', evil, re.S):
         json.loads(block)
-
-
-def test_headers_of_photographs_are_nowhere(pages):
     for path in pages[1].parent.rglob("*"):
         if path.is_file():
             assert MARK.encode() not in path.read_bytes()

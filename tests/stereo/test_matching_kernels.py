@@ -22,7 +22,7 @@ def random_side(rng, height=13, width=21, channels=3):
     return bits, values, valid
 
 
-def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
+def test_channels_and_census_of_valid_and_invalid_pixels():
     image = np.array([[[0.0, 255.0], [10.1, np.nan]], [[300.0, -4.0], [np.inf, 1.0]]], np.float32)
     channels, grey = np.empty((2, 2, 2), np.int16), np.empty((2, 2), np.int16)
     valid = np.empty((2, 2), np.uint8)
@@ -31,9 +31,6 @@ def test_channels_are_quarter_levels_and_invalid_pixels_are_rejected():
     assert channels[0].tolist() == [[0, 40], [1020, 0]]
     assert channels[1].tolist() == [[1020, 0], [0, 4]]
     assert (grey == channels.sum(axis=0)).all()
-
-
-def test_census():
     bits, channels, _ = random_side(np.random.default_rng(1))
     grey = channels.sum(axis=0)
     around = sliding_window_view(np.pad(grey, 2, mode="edge"), (5, 5)).reshape(*grey.shape, 25)

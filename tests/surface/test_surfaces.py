@@ -37,7 +37,7 @@ def outward(mesh):
     return (normal * middle).sum(1) / np.linalg.norm(normal, axis=1) / np.linalg.norm(middle, axis=1)
 
 
-def test_the_fused_sphere_is_round_closed_and_outward():
+def test_the_fused_sphere_is_round_closed_and_outward_and_averages_noise(ring):
     mesh = fused_sphere()
     footprint = 2.5 / 150.0
     off = np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1.0)
@@ -53,9 +53,6 @@ def test_the_fused_sphere_is_round_closed_and_outward():
     _, count = np.unique(sides[seen[sides].all(axis=1)], axis=0, return_counts=True)
     assert (count == 2).mean() > 0.999
     assert _mesh.face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi, rel=0.05)
-
-
-def test_fusion_averages_noise(ring):
     mesh = VolumetricFusion().fuse([sphere_map(m.view, m.P, noise=0.01) for m in ring])
     error = np.linalg.norm(mesh.vertices, axis=1) - 1.0
     assert np.sqrt(np.mean(error**2)) < 0.5 * 0.01
@@ -302,7 +299,7 @@ def test_waves_are_left_by_no_more_than_the_limit(limit):
     assert count.max() == 2
 
 
-def test_density_follows_curvature_and_limit():
+def test_density_follows_curvature_and_faces_lie_on_both_sides():
     roof = grid(lambda x, y: 0.2 * np.abs(x - 0.5) + 0.0 * y)
     small = simplified(roof, 1e-4)
     ridge = np.abs(small.vertices[:, 0] - 0.5) < 0.02
@@ -312,9 +309,6 @@ def test_density_follows_curvature_and_limit():
     uneven = simplify_surface(noise, limits, longest=0.3)
     left = uneven.vertices[:, 0] < 0.5
     assert left.sum() > 5 * (~left).sum()
-
-
-def test_faces_lie_on_both_sides_of_a_curved_surface():
     bowl = grid(lambda x, y: x**2 + y**2, 80)
     small = simplified(bowl, 2e-3)
     x, y, z = points_on(small).T

@@ -175,16 +175,13 @@ def test_upright_cameras_at_one_height_stay_upright_and_level_between(seed):
         assert np.linalg.det(camera.R) == pytest.approx(1.0)
 
 
-def test_turning_on_the_spot_takes_its_time():
+def test_turning_takes_its_time_and_coincident_cameras_stand_still():
     still = [Camera(K, c.R, np.zeros(3), SIZE) for c in ring(np.linspace(0, 1, 4), 0.0)]
     np.testing.assert_allclose(turns_of(paths.interpolate_cameras(still, 31)), 1.0 / 30, rtol=1e-6)
     # Half a turn at one place of a way: no frame jumps.
     far = [Camera(K, c.R, -c.R @ np.array([3.0 * k, 0, 0]), SIZE) for k, c in enumerate(still)]
     turned = Camera(K, -far[1].R * [[1], [-1], [1]], far[1].t * [-1, 1, -1], SIZE)
     assert max(turns_of(paths.interpolate_cameras([*far[:2], turned, *far[2:]], 100))) < 0.25
-
-
-def test_coincident_cameras_and_one_camera_stand_still():
     camera = ring(np.array([0.3]))[0]
     for cameras in ([camera], [camera] * 3):
         path = paths.interpolate_cameras(cameras, 5)
