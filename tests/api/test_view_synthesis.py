@@ -85,9 +85,8 @@ def test_cameras_in_one_place_and_one_image_twice_are_refused(found):
     picture = _photograph(6)
     halves, words = [picture[:, :-32].copy(), picture[:, 32:].copy()], "no parallax: the camera only rotated"
     refuses(StageFailure, words, match_images, *halves, config=SMALL)
-    first, second = found.images
-    for images, words in (((first, second, first), "2 images; got 3"), ((first, first), "the same image")):
-        refuses(UsageError, words, trilinear_sequence, images, 5, config=SMALL, seed=0, threads=1)
+    twice = found.images[:1] * 2
+    refuses(UsageError, "the same image", trilinear_sequence, twice, 5, config=SMALL, seed=0, threads=1)
 
 
 def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
