@@ -1,7 +1,5 @@
 """The camera: calibration, pose, image size and lens; projection with and without the record."""
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Mapping
@@ -107,7 +105,7 @@ class Camera(Record):
             object.__setattr__(self, name, value)
 
     @classmethod
-    def from_matrix(cls, P: F64, size: tuple[int, int]) -> Camera:
+    def from_matrix(cls, P: F64, size: tuple[int, int]) -> "Camera":
         """Return the camera of a matrix of any scale and sign, by RQ decomposition (HZ 6.2.4).
 
         Parameters
@@ -188,7 +186,7 @@ class Camera(Record):
             return np.asarray(rays @ self.R)
         return np.asarray((rays * (z / rays[:, 2])[:, None] - self.t) @ self.R)
 
-    def scaled(self, factor: float) -> Camera:
+    def scaled(self, factor: float) -> "Camera":
         """Return the camera of the resized image: x goes to (x + 0.5) s - 0.5 along each side.
 
         Parameters

@@ -1,7 +1,5 @@
 """The records that stages take and return, from images to the result of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -228,7 +226,7 @@ class Reconstruction(Record):
         t, keep = self.tracks, self.inlier
         return np.asarray(common_points(t.view_index[keep], t.point_index[keep], t.n_views).toarray())
 
-    def with_reasons(self, min_points: int) -> Reconstruction:
+    def with_reasons(self, min_points: int) -> "Reconstruction":
         """Give each unregistered view without a reason the number of reconstructed points that it sees.
 
         Parameters
@@ -272,7 +270,7 @@ class IntrinsicsPrior(Record):
     @classmethod
     def unshared(
         cls, mean: F64, std: F64, *, kind: I64 | None = None, spread: F64 | None = None
-    ) -> IntrinsicsPrior:
+    ) -> "IntrinsicsPrior":
         """Return a prior whose rows share no value; ``kind`` None: no kinds."""
         shared = np.repeat(np.arange(len(mean))[:, None], mean.shape[1], axis=1)
         return cls(mean, std, shared, np.full(len(mean), -1) if kind is None else kind, spread)

@@ -3,8 +3,6 @@
 Also how many matches agree with a wrong model by chance.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -60,7 +58,7 @@ class PairFrame:
     scale: float
 
     @classmethod
-    def of(cls, xy1: F64, xy2: F64) -> PairFrame:
+    def of(cls, xy1: F64, xy2: F64) -> "PairFrame":
         """The frame in which the mean squared coordinate over both images is 1."""
         c1, c2 = xy1.sum(axis=0) / len(xy1), xy2.sum(axis=0) / len(xy2)
         d1, d2 = (xy1 - c1).ravel(), (xy2 - c2).ravel()
@@ -199,7 +197,7 @@ class NoiseMixture:
     log_likelihood: float
 
     @classmethod
-    def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> NoiseMixture:
+    def fit(cls, residuals: F64, sigma: float, *, spread: float, parameters: int = 7) -> "NoiseMixture":
         """Fit to ascending residuals by expectation-maximisation; ``spread`` is the prior of wrong ones."""
         # At most 600 of them, evenly spaced in order.
         step = max(len(residuals) // 300, 1)

@@ -1,7 +1,5 @@
 """The essential matrix of matches with outliers: five points, RANSAC, least Sampson distance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +71,7 @@ class _Pair:
     x2: F64
 
     @classmethod
-    def of(cls, frame: PairFrame, xy1: F64, xy2: F64, K1: F64, K2: F64) -> _Pair:
+    def of(cls, frame: PairFrame, xy1: F64, xy2: F64, K1: F64, K2: F64) -> "_Pair":
         inverse1, inverse2 = np.linalg.inv(np.stack(frame.transforms) @ np.stack([K1, K2]))
         points = frame.points(xy1, xy2)
         x1, x2 = homogenize(points[:, :2]) @ inverse1.T, homogenize(points[:, 2:]) @ inverse2.T

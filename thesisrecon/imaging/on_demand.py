@@ -1,7 +1,5 @@
 """Values that are computed when they are used, in least-recently-used caches of a number of bytes."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
@@ -55,9 +53,9 @@ class OnDemand(Sequence[Value]):
     def __getitem__(self, number: int) -> Value: ...
 
     @overload
-    def __getitem__(self, number: slice) -> OnDemand[Value]: ...
+    def __getitem__(self, number: slice) -> "OnDemand[Value]": ...
 
-    def __getitem__(self, number: int | slice) -> Value | OnDemand[Value]:
+    def __getitem__(self, number: int | slice) -> "Value | OnDemand[Value]":
         if isinstance(number, slice):
             some = range(self._count)[number]
             return OnDemand(len(some), lambda n: self[some[n]])

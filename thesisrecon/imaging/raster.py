@@ -1,7 +1,5 @@
 """Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -157,7 +155,7 @@ class Raster:
         _interpolate(self.face, self.weights, faces, np.ascontiguousarray(values, dtype=np.float32), out)
         return out
 
-    def __getitem__(self, rows: slice) -> Raster:
+    def __getitem__(self, rows: slice) -> "Raster":
         """Return some rows, without a copy."""
         return Raster(self.depth[rows], self.face[rows], self.weights[rows])
 

@@ -3,8 +3,6 @@
 Resizing by s maps x to (x + 0.5) s - 0.5, so that the corners of the image area stay fixed.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
@@ -306,7 +304,7 @@ class Rectification(Record, ABC):
         inside = np.all((xy >= -0.5) & (xy <= np.array(self.size) - 0.5), axis=1)
         return np.where(inside[:, None], xy, np.nan)
 
-    def reduced(self, scale: float) -> Rectification:  # noqa: ARG002
+    def reduced(self, scale: float) -> "Rectification":  # noqa: ARG002
         """The frame with ``scale`` times as many pixels per side, or itself where its size is bounded."""
         return self
 

@@ -1,7 +1,5 @@
 """Selection of the image pairs to match: all, a sequence window, a list, or by estimated overlap."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -184,7 +182,7 @@ class OverlapEstimate:
         how = f"pairs with overlap evidence among {len(compared)} compared pairs, and {best}"
         return PairChoice(chosen, how, compared=len(compared))
 
-    def _subsets(self, features: Features) -> tuple[_Subset, _Subset]:
+    def _subsets(self, features: Features) -> "tuple[_Subset, _Subset]":
         if features.seeds is None:
             raise UsageError(
                 f"the overlap of more than {self.all_up_to} images is estimated from seeds, which these "

@@ -1,7 +1,5 @@
 """Projective model in progress: tracks and first pair (6.2), triangulation and adjustment (6.3 to 6.7)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -234,7 +232,7 @@ class ProjectiveModel:
     cell: I64
 
     @staticmethod
-    def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> ProjectiveModel:
+    def empty(tracks: Tracks, sizes: I64, *, sigma_px: float, noise_floor_px: float) -> "ProjectiveModel":
         """Create a model without cameras; ``sizes`` (V, 2) are the image sizes."""
         n = tracks.n_views
         return ProjectiveModel(

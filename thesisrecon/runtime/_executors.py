@@ -4,8 +4,6 @@ Threads are the default, since compiled kernels release the GIL. Other :class:`c
 objects receive and return pickled bytes, so no shared memory or disk is needed and tasks can be repeated.
 """
 
-from __future__ import annotations
-
 import concurrent.futures as futures
 import hashlib
 import logging
@@ -203,7 +201,7 @@ class Workers:
         """The pool of threads that processes the tasks, for parts of a task; None without one."""
         return self._remote.executor if self.in_process and self._remote is not None else None
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> "Workers":
         """Connect to the cluster; processes start when needed."""
         self._open_stack = ExitStack()
         if is_dask_address(self.executor):
@@ -261,7 +259,7 @@ class Workers:
                 pool.abandon()
 
 
-def _processes(count: int) -> ProcessPool | None:
+def _processes(count: int) -> "ProcessPool | None":
     """Start worker processes; None, with a warning, if the system starts none."""
     with ExitStack() as opened:
         try:

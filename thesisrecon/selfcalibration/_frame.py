@@ -3,8 +3,6 @@
 With H = [[K_r, 0], [-p' K_r, 1]], P H is metric if the plane at infinity p and K_r are right (HZ 19.2).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,7 +61,7 @@ class ReferenceFrame:
         groups = range(int(self.group.max()) + 1)
         return np.stack([np.median(values[..., self.group == g], axis=-1) for g in groups], axis=-1)
 
-    def subset(self, keep: I64) -> ReferenceFrame:
+    def subset(self, keep: I64) -> "ReferenceFrame":
         """Return the same frame with the cameras at some places, the reference among them."""
         kept, groups = np.unique(self.group[keep], return_inverse=True)
         return replace(
@@ -192,7 +190,7 @@ class SolverUnknowns:
         scale = np.where(known, self.std, 1.0)
         return np.where(known, (unknowns - self.mean) / scale, 0.0)
 
-    def with_focal_prior(self) -> SolverUnknowns:
+    def with_focal_prior(self) -> "SolverUnknowns":
         """Replace missing focal priors: 1.2 long sides within a factor of 2.5."""
         mean, std = self.mean.copy(), self.std.copy()
         unknown = self.focals[~np.isfinite(std[self.focals])]

@@ -11,8 +11,6 @@ c^3 = -l0 / l3 both -l2 / (l3 c) and l1 / (l3 c^2) equal 1 + 2 cos(angle); their
 near the solution.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 
@@ -75,7 +73,7 @@ class CheiralityRegion:
     @classmethod
     def of(
         cls, frame: _frame.ReferenceFrame, reconstruction: Reconstruction, rng: np.random.Generator
-    ) -> CheiralityRegion:
+    ) -> "CheiralityRegion":
         """Compute the region by up to ``MAX_POINTS`` points of three views or more; no polytopes below eight.
 
         A wrong point of two views would exclude the true plane; points without consistent depths are omitted.

@@ -1,7 +1,5 @@
 """Fusion of correspondences with several views into the inverse depth of each pixel (thesis, section 2.5)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -45,7 +43,7 @@ def inverse_depths(P: F64, P_other: F64, pair: Correspondence) -> tuple[F32, F32
     return rho, std
 
 
-def fuse_inverse_depths(found: Sequence[tuple[F32, F32]], shape: tuple[int, ...]) -> InverseDepth:
+def fuse_inverse_depths(found: Sequence[tuple[F32, F32]], shape: tuple[int, ...]) -> "InverseDepth":
     """Average the largest group of inverse depths (H, W) that agree, by inverse variances."""
     none = np.full(shape, np.nan, dtype=np.float32)
     rho, std = (np.stack(part) for part in zip(*(found or [(none, none)]), strict=True))
@@ -72,7 +70,7 @@ def _agree(a: F32, sa: F32, b: F32, sb: F32) -> B8:
     return np.asarray((a - b) ** 2 <= np.float64(GATE) ** 2 * (sa * sa + sb * sb))
 
 
-def update_kalman(state: InverseDepth, new: tuple[F32, F32], alive: B8) -> None:
+def update_kalman(state: "InverseDepth", new: tuple[F32, F32], alive: B8) -> None:
     """Update the one-dimensional Kalman filter of every pixel (H, W) in place; ``views`` are measurements."""
     # A missing measurement, or an innovation beyond `GATE` standard deviations, ends a chain: `alive` =
     # False.

@@ -5,8 +5,6 @@ a half-plane: phi covers the full circle (Pollefeys, Koch and Van Gool, ICCV 199
 Normalised coordinates are z = (x - centre) / unit with a unit of about one focal length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -78,14 +76,14 @@ class EpipolarPencil:
         c, s = np.cos(about), np.sin(about)
         return np.asarray(about + np.arctan2(c * p[..., 1] - s * p[..., 0], c * p[..., 0] + s * p[..., 1]))
 
-    def half_lines(self, side: int, phi: F64) -> HalfLines:
+    def half_lines(self, side: int, phi: F64) -> "HalfLines":
         """Half epipolar lines of angles (...)."""
         l, e = unit_normals(plane_from_angle(phi) @ self.lines[side].T), self.epipole(side)
         e = e / max(np.hypot(e[0], e[1]), abs(e[2]))
         along = np.stack([-l[..., 1], l[..., 0]], axis=-1)
         return HalfLines(-l[..., 2:] * l[..., :2], along, l[..., 2], e)
 
-    def chords(self, side: int, phi: F64) -> tuple[HalfLines, F64, F64]:
+    def chords(self, side: int, phi: F64) -> "tuple[HalfLines, F64, F64]":
         """Half-lines of angles (N,), and where they enter and leave the image; entry > exit if they miss."""
         lines, last = self.half_lines(side, phi), np.array(self.sizes[side]) - 1.0
         low, high = self.normalized(side, np.zeros(2)), self.normalized(side, last)

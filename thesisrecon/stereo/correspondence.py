@@ -1,7 +1,5 @@
 """Dense correspondence of two views: rectify, match, and map the disparities back to the original pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -58,7 +56,7 @@ class PairMatching:
 
     def match_two_views(
         self, image1: Image, image2: Image, F: F64, xy1: F64, xy2: F64, *, planar: bool = False
-    ) -> RectifiedPair:
+    ) -> "RectifiedPair":
         """See `thesisrecon.config.DepthEstimator.match_two_views`."""
         pair = pair_of_fundamental(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1])
         frame = rectify(pair, PLANAR if planar else METHODS)

@@ -1,7 +1,5 @@
 """Multi-view stereo: depth maps from neighbouring views, and their consistency (thesis, section 2.6)."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -242,7 +240,7 @@ class MultiViewScene:
     neighbours: Mapping[int, tuple[int, ...]]  #: neighbours of each view, the most useful first
     matched: Mapping[int, PinholeView] = field(default_factory=dict)  #: in the size used for stereo matching
 
-    def subset(self, numbers: Collection[int]) -> MultiViewScene:
+    def subset(self, numbers: Collection[int]) -> "MultiViewScene":
         """Restrict the scene to some views, which reduces the data sent to a worker."""
         views, matched = (
             {i: given[i] for i in given if i in numbers} for given in (self.views, self.matched)

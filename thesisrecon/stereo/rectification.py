@@ -6,8 +6,6 @@ phi in both views. The methods differ in phi, the unit of length and the first r
 Koch and Van Gool, ICCV 1999) have half epipolar lines as rows; they allow epipoles anywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -82,7 +80,7 @@ class PlanarRectification(Rectification):
     H: F64
     size: tuple[int, int]
 
-    def reduced(self, scale: float) -> PlanarRectification:
+    def reduced(self, scale: float) -> "PlanarRectification":
         width, height = (max(2, int(np.ceil(scale * side))) for side in self.size)
         return PlanarRectification(resizing_transform(scale) @ self.H, (width, height))
 
@@ -461,7 +459,7 @@ class RectifiedImages(Record):
     @classmethod
     def of(
         cls, frame: Rectification, images: tuple[U8 | F32, U8 | F32], disparities: tuple[int, int]
-    ) -> RectifiedImages:
+    ) -> "RectifiedImages":
         """Resample two images; one moves to the right by whole columns so that disparities begin at 0."""
         shift, (width, height) = disparities[0], frame.size
         moved = np.full((2, height, width + max(-shift, 0), 3), np.nan, dtype=np.float32)

@@ -1,7 +1,5 @@
 """Robust B-spline surfaces fitted to depth maps (thesis, section 2.6: parametric surfaces)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -138,7 +136,7 @@ class _Spline(NamedTuple):
     pattern: tuple[I32, I32, I32]  #: rows, starts of the columns, and (M, 256) places of the normal matrix
 
     @classmethod
-    def over(cls, domain: Domain, knot_px: int) -> _Spline:
+    def over(cls, domain: Domain, knot_px: int) -> "_Spline":
         """Divide a domain into pieces and number their coefficients."""
         # A node has one coefficient for every connected part of the surface within its sixteen cells, so that
         # both sides of a cut are separate and the surface is smooth around the end of a cut.

@@ -8,8 +8,6 @@ the other image; it takes the depth of the nearest surrounding surface that woul
 anything the other image shows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +62,7 @@ class CalibratedPair(Record):
         return np.asarray(-self.R.T @ self.t)
 
     @property
-    def swapped(self) -> CalibratedPair:
+    def swapped(self) -> "CalibratedPair":
         """The same cameras in the other order."""
         return CalibratedPair(self.K2, self.K1, self.R.T, self.centre2)
 
@@ -166,7 +164,7 @@ class VirtualTensor:
             design[i, :, i] = -self.P2[:, 3]
         return np.asarray(np.linalg.lstsq(design.reshape(9, 4), self.T.reshape(9, 3), rcond=None)[0].T)
 
-    def moved(self, rotation: F64, translation: F64, *, K: F64 | None = None) -> VirtualTensor:
+    def moved(self, rotation: F64, translation: F64, *, K: F64 | None = None) -> "VirtualTensor":
         """Return the tensor after a motion of the third camera from X_3 to R X_3 + t."""
         K = self.K if K is None else K
         turn, shift = K @ rotation @ np.linalg.inv(self.K), K @ translation

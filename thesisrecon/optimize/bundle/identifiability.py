@@ -7,8 +7,6 @@ decides: a turntable leaves the scale along its axis and the aspect ratio undete
 both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -263,7 +261,7 @@ class CalibrationProblem:
             ),
         )  # fmt: skip
 
-    def with_free_intrinsics(self, fit: MetricBundleResult) -> CalibrationProblem:
+    def with_free_intrinsics(self, fit: MetricBundleResult) -> "CalibrationProblem":
         """The problem at the solution ``fit`` with a free aspect and principal point per focal."""
         std = np.full_like(self.prior.std, 1e3)
         std[:, 3:5] *= self.longest.max()

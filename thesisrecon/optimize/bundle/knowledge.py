@@ -4,8 +4,6 @@ A prior of a point or of a camera centre becomes two observations more of a poin
 three deviations in standard deviations and a zero: the elimination of the points needs no other case.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -66,7 +64,7 @@ class PositionPrior:
     position: F64
     root: F64
 
-    def in_frame(self, origin: F64, scale: float) -> PositionPrior:
+    def in_frame(self, origin: F64, scale: float) -> "PositionPrior":
         """The prior in the coordinates scale (X - origin)."""
         return PositionPrior(self.index, scale * (self.position - origin), self.root / scale)
 
@@ -121,7 +119,7 @@ class KnowledgeTerms:
     prior_root: F64
 
     @classmethod
-    def of(cls, knowledge: BundleKnowledge, o: SortedObservations, given: int) -> KnowledgeTerms:
+    def of(cls, knowledge: BundleKnowledge, o: SortedObservations, given: int) -> "KnowledgeTerms":
         """Return the terms of the ``given`` observations and those of priors behind them."""
         priors = knowledge.centres, knowledge.points
         root = np.concatenate([prior.root for prior in priors])

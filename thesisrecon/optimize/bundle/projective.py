@@ -3,8 +3,6 @@
 Unit cameras and points move in their tangent spaces, spanned by Householder reflections.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -41,7 +39,7 @@ class UnitState(NamedTuple):
     bX: F64
 
     @classmethod
-    def at(cls, P: F64, X: F64) -> UnitState:
+    def at(cls, P: F64, X: F64) -> "UnitState":
         """Return the state of unit cameras (V, 12) and points (N, 4)."""
         vP, vX, bP, bX = np.empty_like(P), np.empty_like(X), np.empty(len(P)), np.empty(len(X))
         tangent_reflectors(P, vP, bP)
