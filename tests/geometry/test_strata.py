@@ -48,6 +48,22 @@ def volume(X):
 
 
 @holds_for_every(groups)
+def test_3_4_2_cross_ratios_are_kept_by_all_transforms_and_by_images(rng, group):
+    G = random_transform(group, rng)
+    base, direction = random_points(rng, 2)
+    x = base + np.array([-1.0, 0.2, 1.1, 2.7])[:, None] * direction
+    true = (-1.0 - 1.1) * (0.2 - 2.7) / ((-1.0 - 2.7) * (0.2 - 1.1))
+    P, *_ = random_camera(rng)
+    for points, rel in ((x, 1e-6), (strata.transform(G, x, "points"), 1e-6), (x @ P.T / 1000.0, 1e-4)):
+        assert strata.cross_ratio(points) == pytest.approx(true, rel=rel)
+    x = np.vstack([x[:3], direction])
+    assert strata.cross_ratio(x[[0, 1, 2, 0]]) == np.inf
+    refuses(ValueError, "three of the four", strata.cross_ratio, x[[0, 0, 0, 1]])
+    refuses(ValueError, "collinear", strata.cross_ratio, np.eye(4))
+    refuses(ValueError, "four finite points", strata.cross_ratio, np.eye(3))
+
+
+@holds_for_every(groups)
 def test_table_3_3_images_do_not_change_and_planes_and_lines_keep_their_points(rng, group):
     G, (P, *_), X = random_transform(group, rng), random_camera(rng), random_points(rng, 6)
     moved = strata.transform(G, X, "points") @ strata.transform(G, P, "cameras").T

@@ -95,6 +95,26 @@ def metric_from_projective(dual_quadric: F64) -> F64:
     return np.asarray(np.linalg.inv(V * size))
 
 
+def cross_ratio(X: F64) -> float:
+    """(l1 - l3)(l2 - l4) / ((l1 - l4)(l2 - l3)) of four collinear points X_i ~ X + l_i X' (3.4.2).
+
+    At most two of the homogeneous points may be equal; inf if X1 = X4 or X2 = X3.
+    """
+    if X.ndim != 2 or X.shape[0] != 4 or not np.isfinite(X).all():
+        raise ValueError(f"cross_ratio needs four finite points (4, d); got {X.shape}")
+    unit = X / np.maximum(np.linalg.norm(X, axis=1, keepdims=True), 1e-300)
+    _, s, Vt = np.linalg.svd(unit)
+    if len(s) > 2 and s[2] > 1e-6:
+        raise ValueError(f"cross_ratio needs collinear points; they deviate by {s[2]:.2g}")
+    a, b = Vt[:2] @ unit.T
+    difference = np.outer(a, b) - np.outer(b, a)
+    above = difference[0, 2] * difference[1, 3]
+    below = difference[0, 3] * difference[1, 2]
+    if max(abs(above), abs(below)) < 1e-24:
+        raise ValueError("cross_ratio does not exist if three of the four points are equal")
+    return float(above / below) if below != 0.0 else np.inf
+
+
 def upgrade_cameras(P: F64, K: F64, metric_from_projective: F64) -> tuple[F64, F64, F64]:
     """Rotations (V, 3, 3) and translations (V, 3) nearest to C = K^-1 P H^-1 = s [R t], and singular values.
 
