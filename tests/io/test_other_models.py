@@ -144,7 +144,6 @@ def test_cameras_of_data_sets_are_read_and_damaged_ones_refused(tmp_path):
     assert compare_models(folders[1], tmp_path / "dino_par.txt").centre_error.max() < 1e-8
     (tmp_path / "par.txt").write_text("2\na.png 1 2 3\n")
     refuses(UsageError, "2 cameras are announced, 1 follow", read_model, tmp_path / "par.txt")
-    (tmp_path / "cams").mkdir()
     (tmp_path / "cams" / "0_cam.txt").write_text("extrinsic\n1 0 0 0\nintrinsic\n1 0 0\n")
     refuses(UsageError, "NAME_cam.txt with extrinsic and intrinsic", read_model, tmp_path / "cams")
     (tmp_path / "skew").mkdir()
