@@ -145,6 +145,21 @@ def test_cameras_of_a_room_without_a_prior(lens: str, views: int, given: str) ->
         assert (np.abs(camera.distortion[2:4] - k[2:4]) < 3.5 * np.array(stds)).all()
 
 
+def test_points_in_the_middle_leave_the_corners_uncertain() -> None:
+    rng, views = np.random.default_rng(4), 10
+    X = rng.uniform(-2.0, 2.0, (1200, 3))
+    angles = np.radians(np.linspace(-60.0, 60.0, views))
+    R = Rotation.from_euler("yx", np.column_stack([angles, rng.normal(0.0, 0.1, views)])).as_matrix()
+    row = lens_row("fisheye", np.array([-0.02]))
+    xy = np.stack([image_of_directions(X @ turn.T + [0.0, 0.0, 9.0], row) for turn in R]) * 420.0 + CENTRE
+    result = reconstruct_from_tracks(xy + rng.normal(0.0, 0.3, xy.shape), [SIZE] * views)
+    camera = result.cameras[0]
+    assert camera.std is not None
+    assert abs(camera.K[0, 0] - 420.0) < 3.0 * camera.std["focal_px"]
+    assert result.metric is not None
+    assert "of the half diagonal" in str(result.metric.warnings)
+
+
 @pytest.mark.slow
 def test_bent_photographs_give_the_cameras_of_straight_ones(tmp_path: Path) -> None:
     k, shrink = np.array([-0.35, -0.05, DIVISION]), 0.7

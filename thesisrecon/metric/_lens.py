@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from thesisrecon.arrays import B8
+from thesisrecon.errors import Notice
 from thesisrecon.lens import ANGLE, DIVISION, directions_of_image
 from thesisrecon.metric import _model
 from thesisrecon.metric._adjustment import MetricAdjustment, predicts_better
 from thesisrecon.metric._model import BASES, FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
+from thesisrecon.optimize.bundle.identifiability import TOLERANCES
 from thesisrecon.optimize.bundle.projection import LENS
+from thesisrecon.records import IntrinsicInterval
+
+MAX_CORNER_STD = 0.03
+"""Standard deviation of the angle of the corners from the axis, over the angle, of a determined lens."""
+MIN_REACH = 0.8  # of the half diagonal, within which 99 % of the points of a determined lens do not lie
+FORWARD = float(np.cos(np.radians(10.0)))  # cosine of the angle of a forward motion from the optical axis
 
 
 def with_best_lens(
@@ -57,3 +66,39 @@ def with_lens(model: MetricEstimate, rows: B8, base: int) -> MetricEstimate:
         known = np.isfinite(rays[:, 0]) & (rays[:, 2] > 0.0)
         table[row] = refitted_lens(table[row], base, radii[known], rays[known, 0] / rays[known, 2])
     return replace(model, cameras=replace(model.cameras, intrinsics=table))
+
+
+def undetermined_lens(
+    model: MetricEstimate, intervals: Sequence[Mapping[str, IntrinsicInterval]], motion: Mapping[str, float]
+) -> tuple[str, ...]:
+    """A sentence if the rays of the corners are uncertain, with what leaves the lens undetermined."""
+    where = "its model images nothing at the corners"
+    if all("corner_deg" in own for own in intervals if own):
+        corners = [own["corner_deg"] for own in intervals if own]
+        worst = max(corners, key=lambda corner: corner.std / corner.value)
+        if worst.std <= MAX_CORNER_STD * worst.value:
+            return ()
+        where = f"the corners are {worst.value:.1f} ± {worst.std:.1f} degrees from the axis"
+    return (Notice("lens-undetermined", where, _reason(model, motion)),)
+
+
+def _reason(model: MetricEstimate, motion: Mapping[str, float]) -> str:
+    """Why the lens is not determined: points in the middle, parallel views of a plane, or forward motion."""
+    t, views = model.tracks, np.flatnonzero(model.registered)
+    sizes = model.sizes[t.view_index[model.inlier]]
+    off = 2.0 * t.xy[model.inlier] - (sizes - 1.0)
+    reach = float(np.quantile(np.linalg.norm(off, axis=1) / np.linalg.norm(sizes, axis=1), 0.99))
+    if reach < MIN_REACH:
+        return (
+            f"99 % of the points lie within {reach:.0%} of the half diagonal. Fill the images with the scene"
+        )
+    flat, parallel = (
+        motion[name] < TOLERANCES[name] for name in ("scene_planarity_ratio", "infinity_shift_beyond_roll")
+    )
+    if flat and parallel:
+        return "parallel views of a flat scene exchange its relief and the lens (Wu, 2014). Tilt the camera"
+    steps = np.diff(model.cameras.centres[views], axis=0)
+    along = np.abs(np.einsum("va,va->v", steps, model.cameras.R[views[:-1], 2]))
+    if np.median(along / np.maximum(np.linalg.norm(steps, axis=1), 1e-300)) > FORWARD:
+        return "the camera moved along its axis. Add images from the sides"
+    return "add images that turn the camera, with the same points in the middle and at the corners"

@@ -17,7 +17,7 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import check_returned, doubtful_views, returned_cameras, self_check
-from thesisrecon.metric._lens import with_best_lens
+from thesisrecon.metric._lens import undetermined_lens, with_best_lens
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
@@ -127,6 +127,7 @@ def _assess(
         failed_checks.append(Notice("focal-by-camera-model", deviations))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
+    warnings += undetermined_lens(model, intervals, motion)
     return records.MetricResult(
         _as_reconstruction(model, reasons), tuple(intervals), check, not failed_checks, tuple(failed_checks),
         warnings, (*enlarged, *limitations), report, poses,
