@@ -56,6 +56,47 @@ def test_truth_lies_within_the_stated_covariance():
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.4
 
 
+@pytest.mark.parametrize(("lens", "k", "free"), [
+    ("brown", [-0.1, 0.03, 0.002, -0.003], ("k1", "k2", "p1", "p2")), ("division", [-0.2], ("k1",)),
+    ("fisheye", [-0.03, 0.01, 0.002, -0.001], ("k1", "k2", "k3", "k4")),
+    ("thin-prism-fisheye", [-0.03, 0.01, 0.002, -0.003], ("k1", "k2", "p1", "p2")),
+])  # fmt: skip
+def test_every_lens_is_within_its_covariance(lens, k, free):
+    rng, names = np.random.default_rng(3), ("focal_px", "principal_x_px", "principal_y_px", *free)
+    K, scores = np.array([[330.0, 0, 325.0], [0, 330.0, 236], [0, 0, 1]]), []
+    near = K * [[1.01], [1.01], [1.0]]
+    for _ in range(4):
+        R = Rotation.from_rotvec(rng.normal(0.0, 0.5, (8, 3))).as_matrix()
+        R = np.concatenate([R, R @ Rotation.from_euler("y", 180, degrees=True).as_matrix()])
+        true = [Camera(K, r, 0.3 * rng.normal(size=3), (640, 480), np.array(k), lens=lens) for r in R]
+        X = rng.normal(size=(800, 3))
+        X *= rng.uniform(2.0, 4.0, (800, 1)) / np.linalg.norm(X, axis=1, keepdims=True)
+        xy = np.stack([camera.project(X) for camera in true])
+        ahead = np.stack([(X @ c.R.T + c.t)[:, 2] > 0.3 for c in true])
+        seen = ahead & (xy > 0.0).all(axis=2) & (xy < [639.0, 479.0]).all(axis=2)
+        xy = np.where(seen[..., None], xy + NOISE * rng.normal(size=xy.shape), np.nan)
+        start = [Camera(near, c.R, c.t, c.size, 0.8 * np.array(k), lens=lens) for c in true]
+        found = bundle_adjust(start, X, xy, free=("focal", "principal_point", *free))
+        assert found.converged
+        assert found.sigma_px == pytest.approx(NOISE, rel=0.1)
+        one = found.cameras[0]
+        assert one.lens == lens
+        off = [*(one.K - K)[[0, 0, 1], [0, 2, 2]], *(one.distortion[: len(k)] - k)]
+        scores.append(np.array(off) / [one.std[name] for name in names])
+        assert found.intrinsics_covariance.shape == (16, 11, 11)
+    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.6
+
+
+def test_coefficients_that_a_lens_lacks_are_refused():
+    cameras, X, xy = _scene()
+    refuses(ValueError, "k4 is a coefficient of fisheye", bundle_adjust, cameras, X, xy, free=("k4",))
+    bent = [Camera(c.K, c.R, c.t, c.size, np.array([-0.1]), lens="division") for c in cameras]
+    refuses(ValueError, "a division lens has k1 only", bundle_adjust, bent, X, xy, free=("k2",))
+    prism = np.array([0, 0, 0, 0, 0, 0, 0.01, 0.0])
+    thin = [Camera(c.K, c.R, c.t, c.size, prism, lens="thin-prism-fisheye") for c in cameras]
+    refuses(ValueError, "takes lenses with k1 to k4, p1 and p2", bundle_adjust, thin, X, xy)
+
+
 def test_cameras_are_shared_by_size_or_number_or_not_at_all():
     focals = (900.0, 900.0, 900.0, 700.0, 700.0, 700.0)
     cameras, X, xy = _scene(focals=focals)

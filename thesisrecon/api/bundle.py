@@ -13,7 +13,7 @@ from thesisrecon.api.given import (
     as_cameras,
     as_sparse_model,
     cameras_of_model,
-    radial_coefficients,
+    lens_table,
 )
 from thesisrecon.arrays import (
     B8,
@@ -28,9 +28,10 @@ from thesisrecon.arrays import (
     whole_number,
     whole_numbers,
 )
-from thesisrecon.camera import Camera
+from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import counted, require_word
 from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.lens import ANGLE, BASE, DIVISION
 from thesisrecon.optimize.bundle import metric
 from thesisrecon.optimize.bundle.knowledge import (
     LOSSES,
@@ -40,6 +41,7 @@ from thesisrecon.optimize.bundle.knowledge import (
     remaining_gauge,
 )
 from thesisrecon.optimize.bundle.projection import (
+    LENS,
     POSE_DOF,
     MetricCameras,
     MetricModel,
@@ -55,10 +57,12 @@ from thesisrecon.results import RunResult
 Chosen = I64 | B8 | Sequence[int]  # Numbers of cameras or points, or a mask
 COLUMNS: Mapping[str, tuple[int, ...]] = {
     "focal": (0,), "aspect": (1,), "skew": (2,), "principal_point": (3, 4), "k1": (5,), "k2": (6,),
-    "k3": (7,),
+    "k3": (7,), "k4": (8,), "p1": (9,), "p2": (10,),
 }  # fmt: skip
 """Rows and columns of each intrinsic in the covariance."""
-STD_NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1", "k2", "k3")
+STD_NAMES = (
+    "focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1", "k2", "k3", "k4", "p1", "p2",
+)  # fmt: skip
 """Names of the standard deviations in :attr:`thesisrecon.Camera.std`."""
 
 
@@ -79,7 +83,8 @@ class BundleAdjustment(Record):
     cost: float  #: 1/2 sum rho with the priors, in units of the noise that weighted the residuals
     #: (V, 6, 6) of the motion x -> exp(w) x + d in the camera frame, (w in rad, d); infinite if unseen
     pose_covariance: F64
-    #: (V, 8, 8) in the order focal, aspect, skew, principal x and y, k1, k2, k3; zero where not free
+    #: (V, 8, 8) in the order focal, aspect, skew, principal x and y, k1, k2, k3; (V, 11, 11) with k4, p1, p2
+    #: if a lens has them or is not radial; zero where not free
     intrinsics_covariance: F64
     point_covariance: F64  #: (N, 3, 3), infinite for points in fewer than two views
     #: distance of the cameras from the minimum in standard deviations, by the gradient: none is farther
@@ -130,7 +135,8 @@ def bundle_adjust(
         True: images of the same size share their free intrinsics, which start at their mean; False: each
         image has its own; or a camera number per image.
     free : sequence of str
-        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3".
+        Intrinsics to refine: "focal", "aspect", "skew", "principal_point", "k1", "k2", "k3", of lenses that
+        are not "division" "p1", "p2", and of fisheye lenses "k4". A division lens has k1 alone.
     prior : mapping of str to float or (V,), optional
         Standard deviations of free intrinsics about the given cameras, of shared ones about their mean:
         relative for "focal", in pixels for "principal_point" and "skew"; in an array 0 fixes the value of an
@@ -179,8 +185,8 @@ def bundle_adjust(
     -----
     The covariances are those of the linearised problem at the minimum, with the noise estimated from the
     residuals (``sigma_px`` only weights the data against the prior). The blocks of the points follow from the
-    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation. Lenses are radial, as those of
-    :class:`thesisrecon.Camera`; tangential distortion (p1, p2) is not estimated.
+    Schur complement, V^-1 + V^-1 W' S^-1 W V^-1, without approximation. Points that fisheye lenses see at 90
+    degrees from their axis or farther are not adjusted to.
 
     Examples
     --------
@@ -203,11 +209,13 @@ def bundle_adjust(
     chosen = _free(free)
     loss_px, sigma_px = _noise_options(loss, loss_px, sigma_px, max_iterations)
     start = _start(views, shared, chosen)
+    chosen = chosen[: start.intrinsics.shape[1]]
     prior = {} if prior is None else prior
     expected = _prior(start.intrinsics, prior, chosen, free)
     # Only for its checks of the list.
     sort_observations(observed, len(views), len(X))
     root, inside = _whitening(covariances, dense, observed), _inside(views, observed)
+    inside &= _in_front_of_fisheye(start, X, observed)
     observed = observed.at(inside)
     known = BundleKnowledge(
         loss if loss_px is None or loss_px < np.inf else "squared", None if root is None else root[inside],
@@ -229,14 +237,14 @@ def bundle_adjust(
     K, std = fit.cameras.K, np.sqrt(np.diagonal(fit.intrinsics_covariance, axis1=1, axis2=2))
     rows, unseen = fit.cameras.intrinsics, np.isin(np.arange(len(views)), observed.view_index, invert=True)
     poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
-    stds = [dict(zip(STD_NAMES, row, strict=True)) for row in std.tolist()]
+    stds = [dict(zip(STD_NAMES, row, strict=False)) for row in std.tolist()]
     R, t = fit.cameras.R, fit.cameras.t
     refined = tuple(
-        replace(view, K=K[i], R=R[i], t=t[i], distortion=rows[i, 5:], std=stds[i])
+        camera_of_row((K[i], R[i], t[i]), view.size, rows[i, 5:], std=stds[i], as_stored=view.as_stored)
         for i, view in enumerate(views)
     )
     return BundleAdjustment(
-        refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance,
+        refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance[:, :LENS, :LENS],
         fit.point_covariance, fit.sigmas_to_minimum * scale,
     )  # fmt: skip
 
@@ -310,8 +318,8 @@ def _problem(
 
 
 def _free(names: Sequence[str]) -> B8:
-    """Columns (8,) of the intrinsics to refine."""
-    chosen = np.zeros(len(STD_NAMES), dtype=bool)
+    """Columns (12,) of the intrinsics to refine."""
+    chosen = np.zeros(LENS + 1, dtype=bool)
     for name in names:
         chosen[list(COLUMNS[require_word("intrinsic in free", name, COLUMNS)])] = True
     return chosen
@@ -327,13 +335,23 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
         number = whole_numbers("bundle_adjust", "shared, or True or False", shared)
         if number.shape != (n,):
             raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
-    table = np.zeros((n, len(STD_NAMES)))
+    lenses = lens_table("bundle_adjust", views, BASE + 1 if free[8:].any() else 3)
+    table = np.column_stack([np.zeros((n, 5)), lenses])
+    _require_free(table, free)
     for row, K in zip(table, (view.K for view in views), strict=True):
         row[:5] = K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2]
-    table[:, 5:] = radial_coefficients("bundle_adjust", views)
     R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
-    sharing = np.where(free, number[:, None], np.arange(n)[:, None])
+    sharing = np.where(free[: table.shape[1]], number[:, None], np.arange(n)[:, None])
     return MetricCameras(R, t, table, np.arange(n), sharing)
+
+
+def _require_free(table: F64, free: B8) -> None:
+    """Raise ``ValueError`` if a lens in the table lacks a coefficient that is free."""
+    bases = table[:, LENS] if table.shape[1] > LENS else np.zeros(len(table))
+    if free[6:].any() and (bases == DIVISION).any():
+        raise ValueError("a division lens has k1 only: leave k2, k3, k4, p1 and p2 out of free")
+    if free[8] and (bases != ANGLE).any():
+        raise ValueError("k4 is a coefficient of fisheye lenses only: leave it out of free")
 
 
 def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequence[str]) -> IntrinsicsPrior:
@@ -419,6 +437,19 @@ def _inside(views: Sequence[Camera], o: Observations) -> B8:
     return ~far
 
 
+def _depths(cameras: MetricCameras, X: F64, o: Observations) -> F64:
+    """Depths (K,) of the points of observations."""
+    view = o.view_index
+    return np.asarray(np.einsum("ka,ka->k", cameras.R[view, 2], X[o.point_index]) + cameras.t[view, 2])
+
+
+def _in_front_of_fisheye(start: MetricCameras, X: F64, o: Observations) -> B8:
+    """Observations (K,) but those of fisheye lenses at 90 degrees from the axis or farther."""
+    if start.intrinsics.shape[1] <= LENS:
+        return np.ones(len(o.xy), dtype=bool)
+    return np.asarray((_depths(start, X, o) > 0.0) | (start.intrinsics[o.view_index, LENS] != ANGLE))
+
+
 def _placed(
     start: MetricCameras, X: F64, known: BundleKnowledge, gauge: str
 ) -> tuple[MetricCameras, F64, BundleKnowledge]:
@@ -473,8 +504,7 @@ def _check_convention(start: MetricCameras, X: F64, o: Observations) -> None:
     given, best, said = _misfit(_residuals(start, X, seen)), np.inf, ""
     for name, (R, t) in poses.items():
         other = replace(start, R=np.ascontiguousarray(R), t=np.ascontiguousarray(t))
-        in_front = np.einsum("ka,ka->k", other.R[seen.view_index, 2], X[seen.point_index])
-        in_front = (in_front + other.t[seen.view_index, 2] > 0.0)[:, None]
+        in_front = (_depths(other, X, seen) > 0.0)[:, None]
         misfit = _misfit(np.where(in_front, _residuals(other, X, seen), np.inf))
         if misfit < best:
             best, said = misfit, name
@@ -512,7 +542,7 @@ def _check(
     """Raise ``ValueError`` if most points are behind the cameras, or for fewer equations than unknowns."""
     view, point = observed.view_index, observed.point_index
     require_finite("bundle_adjust, for points with observations,", X[point])
-    depth = np.einsum("kb,kb->k", start.R[view, 2], X[point]) + start.t[view, 2]
+    depth = _depths(start, X, observed)
     behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
     # Of most points only if the poses use another convention.
     if behind > 0.5:

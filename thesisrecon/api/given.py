@@ -14,7 +14,7 @@ from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._models import read_model
-from thesisrecon.lens import simplest_row
+from thesisrecon.lens import BASE, simplest_row
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult, SparseModel, SparseView
 
@@ -181,15 +181,17 @@ def points_of_reconstruction(r: Reconstruction) -> tuple[F64, I64, I64, F64]:
     return X, view[tracks.view_index[used]], point[tracks.point_index[used]], tracks.xy[used]
 
 
-def radial_coefficients(caller: str, views: Sequence[Camera]) -> F64:
-    """Distortion k1, k2, k3 (V, 3) of cameras; ``ValueError`` if one has further coefficients."""
-    table = np.zeros((len(views), 3))
-    for row, view in zip(table, views, strict=True):
-        lens = np.zeros(0) if view.distortion is None else view.distortion
-        if view.lens != "radial":
-            raise ValueError(f"{caller} takes radial lenses (k1, k2, k3); got one that is {view.lens}")
-        row[: len(lens[:3])] = lens[:3]
-    return table
+def lens_table(caller: str, views: Sequence[Camera], width: int) -> F64:
+    """Rows (V, C) of the lenses of cameras, of ``width`` columns or seven: k1 to k4, p1, p2 and the base.
+
+    ``ValueError`` if a lens has other coefficients that are not 0.
+    """
+    rows = [simplest_row(view.lens, np.zeros(0) if (k := view.distortion) is None else k) for view in views]
+    for row, view in zip(rows, views, strict=True):
+        if np.any(row[BASE + 1 :]):
+            raise ValueError(f"{caller} takes lenses with k1 to k4, p1 and p2; got one that is {view.lens}")
+    wide = max(width, *(BASE + 1 if len(row) > 3 else 3 for row in rows))
+    return np.array([np.append(row, np.zeros(wide))[:wide] for row in rows])
 
 
 def calibrated_arrays(caller: str, K: F64, R: F64, t: F64) -> tuple[F64, F64, F64]:
