@@ -240,6 +240,15 @@ def angles_of_view(K: F64, size: tuple[int, int], lens: F64) -> tuple[float, flo
     return float(angle[:2].sum()), float(angle[2:].max())
 
 
+def widest_angle(K: F64, size: tuple[int, int], lens: F64) -> float:
+    """Largest angle of a ray of a pixel on the border of an image from the axis, radians."""
+    x, y = (np.linspace(0.0, side - 1.0, 33) for side in size)
+    sides = [np.column_stack([x, np.full(33, end)]) for end in y[[0, -1]]]
+    sides += [np.column_stack([np.full(33, end), y]) for end in x[[0, -1]]]
+    rays = viewing_rays(K, np.concatenate(sides), lens)
+    return float(np.nanmax(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2])))
+
+
 def compose_camera(K: F64, R: F64, t: F64) -> F64:
     """Return P (..., 3, 4) = K [R t], with t = -R C the thesis' K [R' | -R' C] (3.18 - 3.21)."""
     return np.asarray(K @ np.concatenate([R, t[..., None]], axis=-1))

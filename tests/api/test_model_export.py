@@ -4,6 +4,7 @@ import json
 import struct
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import PIL.Image
@@ -17,6 +18,7 @@ from thesisrecon.api import export as export_module
 from thesisrecon.cli.commands import run_command
 from thesisrecon.io import _images
 from thesisrecon.io._pixels import MemoryBudget
+from thesisrecon.lens import lens_row
 from thesisrecon.results import SparseModel, SparseView
 
 SIZE = (160, 120)
@@ -203,6 +205,52 @@ def test_undistorted_exports_project_known_points(tmp_path, images, to, read, sk
         assert len(inside) > 30
         assert np.abs(error).max() < 1.0
         assert np.abs(error.mean(axis=0)).max() < 0.2
+
+
+@pytest.mark.parametrize("to", ["colmap-undistorted", "nerfstudio"])
+def test_wide_images_are_divided_into_pinhole_images(tmp_path, images, to):
+    pytest.importorskip("pycolmap")
+    read = {"colmap-undistorted": read_colmap, "nerfstudio": read_nerfstudio}[to]
+    model, rng = make_model(BARREL, BARREL), np.random.default_rng(5)
+    K, lens = np.array([[58.0, 0, 79.0], [0, 58.0, 60.0], [0, 0, 1]]), lens_row("fisheye", np.array([-0.02]))
+    X = rng.normal(size=(300, 3))
+    X *= 6.0 / np.linalg.norm(X, axis=1, keepdims=True)
+    views = [replace(v, K=K, distortion=lens, t=0.1 * v.t, R=v.R) for v in model.views]
+    true = [Camera(K, v.R, v.t, SIZE, np.array([-0.02]), lens="fisheye") for v in views]
+    xy = np.stack([one.project(X) for one in true])
+    angle = [np.arccos((X @ one.R.T + one.t)[:, 2] / np.linalg.norm(X - one.centre, axis=1)) for one in true]
+    seen = (xy > 2.0).all(axis=2) & (xy < np.array(SIZE) - 3.0).all(axis=2) & (np.array(angle) < 1.9)
+    view, point = np.nonzero(seen)
+    model = SparseModel(views, X, np.zeros((300, 3), np.uint8), view, point, xy[view, point])
+    report = export(model, tmp_path / "out", to=to, images=images)
+    assert "are divided into images of 90 degrees" in report.notes[-1]
+    found, reached = read(tmp_path / "out"), 0
+    for i, one in enumerate(true):
+        stem = Path(WRITTEN[NAMES[i]])
+        for face in ("front", "left", "right", "up", "down"):
+            name = stem.with_stem(f"{stem.stem}_{face}").as_posix()
+            if name not in found:
+                continue
+            project, size = found[name]
+            pixels = pixels_of(tmp_path / "out" / "images" / name)
+            masks = [p for p in (tmp_path / "out" / "masks").rglob("*") if Path(name).stem in p.name]
+            mask = pixels_of(masks[0]) > 0
+            turned = export_module._FACES[face] @ one.R
+            ahead = (X @ turned.T + export_module._FACES[face] @ one.t)[:, 2] > 0.1
+            index = np.flatnonzero(ahead & seen[i])
+            used = project(X[index])
+            inside = ((used > 1.0) & (used < np.array(size) - 2.0)).all(axis=1)
+            columns, rows = np.rint(used[inside]).astype(int).T
+            good = mask[rows, columns]
+            assert good.mean() > 0.9
+            assert not pixels[~mask].any()
+            off = pixels[rows, columns, :2][good] / SLOPE - xy[i, index[inside]][good]
+            assert np.abs(off).max() < 1.5
+            assert np.abs(off.mean(axis=0)).max() < 0.3
+            reached += int(good.sum())
+    # All but points near the edges of the image are in one of its pinhole images.
+    assert reached > 0.9 * seen.sum()
+    assert len(found) > 2 * len(true)
 
 
 MASKED = np.s_[30:70, 40:90]

@@ -5,13 +5,15 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
-from thesisrecon.arrays import F64, flag, rows_of_views
+from thesisrecon.arrays import F64, I64, flag, rows_of_views
+from thesisrecon.camera import angles_of_view, viewing_rays, widest_angle
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
@@ -25,7 +27,14 @@ from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
-from thesisrecon.lens import Lens, directions_of_image, growing_radius, named_lens, undistort
+from thesisrecon.lens import (
+    Lens,
+    directions_of_image,
+    growing_radius,
+    image_of_directions,
+    named_lens,
+    undistort,
+)
 from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
@@ -53,6 +62,15 @@ _DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] 
     "kalibr": formats.write_kalibr,
 }
 """Formats of cameras with distortion, which need no images."""
+WIDE = 110.0  # degrees along the long side, of which an image is divided into several pinhole images
+_FACES = {
+    name: Rotation.from_euler(axis, angle, degrees=True).as_matrix()
+    for name, axis, angle in (
+        ("front", "y", 0), ("left", "y", 90), ("right", "y", -90), ("up", "x", -90), ("down", "x", 90)
+    )
+}  # fmt: skip
+"""Rotations from the axes of a wide camera to those of its pinhole images of 90 x 90 degrees."""
+LEAST_SEEN = 0.05  # of a pinhole image, which is written from there on
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
 _LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
 """Lenses that a format has; others have all, or no distortion."""
@@ -88,7 +106,8 @@ def export(
         Folder of the export; created if missing.
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
-        cameras too; ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
+        cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
+        ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
     images : path, optional
         Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
         are used as stored, without EXIF rotation.
@@ -145,15 +164,21 @@ def export(
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
             file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
-    undistorted = _undistorted(model)
+    undistorted, numbers, turns = _undistorted(model)
+    divided = any(turn is not None for turn in turns)
+    notes += [_divided_note(model, len(numbers))] if divided else []
     may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
+    may_mask = may_mask or divided
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
     _require_distinct(names, "have the mask")
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
     paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
-        has_mask = _write_images(folder, model, undistorted, paths, found, names, threads)
+        pinholes = [list[_Pinhole]() for _ in model.views]
+        for n, (i, turn) in enumerate(zip(numbers, turns, strict=True)):
+            pinholes[i].append(_Pinhole(undistorted.views[n], turn, names[n] if may_mask else None))
+        has_mask = _write_images(folder, model, pinholes, paths, found, threads)
         masked = masks is not None or any(has_mask)
         notes += [_images.USELESS_MASKS] if masked and not any(has_mask) else []
         # Programs want a mask for every image or for none.
@@ -231,22 +256,83 @@ def _recorded(model: Model, name: str) -> Path | None:
     return Path(folder) if isinstance(folder, str) else None
 
 
-def _undistorted(model: SparseModel) -> SparseModel:
-    """The model with pinhole views, observations in their pixels, and names of files that can be written."""
+class _Pinhole(NamedTuple):
+    """A pinhole view, its rotation from the axes of the image if it is one of several, and its mask file."""
+
+    view: SparseView
+    turn: F64 | None
+    mask: str | None
+
+
+def _divided_note(model: SparseModel, written: int) -> str:
+    said = f"the {len(model.views)} images gave {written} pinhole images"
+    return f"{said}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees"
+
+
+def _undistorted(model: SparseModel) -> tuple[SparseModel, list[int], list[F64 | None]]:
+    """The model with pinhole views, observations in their pixels, and names of files that can be written.
+
+    Also the number of the image of each view, and its rotation if it is one of several of this image.
+    """
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
-    views, xy = list[SparseView](), model.xy.copy()
+    views, xy, view_index = list[SparseView](), model.xy.copy(), model.view_index.copy()
+    source, turns = list[int](), list[F64 | None]()
     rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         K, size, distortion = view.intrinsics
+        if angles_of_view(K, size, distortion)[0] > WIDE:
+            faces = _faces(view)
+            xy[rows[i]], face = _in_faces(view, faces, xy[rows[i]])
+            view_index[rows[i]] = len(views) + face
+            views += faces.values()
+            source += [i] * len(faces)
+            turns += [_FACES[name] for name in faces]
+            continue
         key = (K.tobytes(), distortion.tobytes(), size)
         if key not in frames:
             frames[key] = _pinhole_frame(view)
         K, size = frames[key]
         here, name = rows[i], _file_name(view.name)
         xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
+        view_index[here] = len(views)
         views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
+        source.append(i)
+        turns.append(None)
     _require_distinct([view.name for view in views], "be written as")
-    return replace(model, views=views, xy=xy)
+    return replace(model, views=views, xy=xy, view_index=view_index), source, turns
+
+
+def _faces(view: SparseView) -> dict[str, SparseView]:
+    """The pinhole views of 90 x 90 degrees of a wide view of which enough is seen, by name."""
+    K, size, lens = view.intrinsics
+    side = 2 * max(int(K[0, 0]), 8)
+    middle, path = (side - 1.0) / 2.0, PurePath(_file_name(view.name))
+    own = np.array([[side / 2.0, 0.0, middle], [0.0, side / 2.0, middle], [0.0, 0.0, 1.0]])
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 33)] * 2), axis=-1).reshape(-1, 2)
+    most, answer = widest_angle(K, size, lens), dict[str, SparseView]()
+    for name, turn in _FACES.items():
+        rays = homogenize(grid) @ turn
+        rays = rays[np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]) <= most]
+        places = image_of_directions(rays, lens) @ K[:2, :2].T + K[:2, 2]
+        inside = ((places >= 0.0) & (places <= np.array(size) - 1.0)).all(axis=1)
+        if inside.sum() > LEAST_SEEN * len(grid):
+            file = path.with_stem(f"{path.stem}_{name}").as_posix()
+            answer[name] = replace(
+                view, name=file, R=turn @ view.R, t=turn @ view.t, K=own, size=(side, side),
+                distortion=np.zeros(3), std=None,
+            )  # fmt: skip
+    return answer
+
+
+def _in_faces(view: SparseView, faces: Mapping[str, SparseView], xy: F64) -> tuple[F64, I64]:
+    """Pixels (N, 2) of a wide view in the face that looks most in their direction, and its number (N,)."""
+    K, _, lens = view.intrinsics
+    rays = np.nan_to_num(viewing_rays(K, xy, lens), nan=1.0)
+    turns = np.stack([_FACES[name] for name in faces])
+    face = np.argmax(rays @ turns[:, 2].T, axis=1)
+    turned = np.einsum("nab,nb->na", turns[face], rays)
+    own = next(iter(faces.values())).intrinsics[0]
+    return dehomogenize(turned @ own.T), face
 
 
 def _require_distinct(names: Sequence[str], what: str) -> None:
@@ -311,17 +397,17 @@ def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
 
 
 def _write_images(
-    folder: Path, model: SparseModel, pinholes: SparseModel, paths: Sequence[Path], masks: Mapping[str, Path],
-    mask_names: Sequence[str], threads: int,
+    folder: Path, model: SparseModel, pinholes: Sequence[Sequence[_Pinhole]], paths: Sequence[Path],
+    masks: Mapping[str, Path], threads: int,
 ) -> list[bool]:  # fmt: skip
-    """Undistort the images of a model into a folder, and their masks; return which have one."""
+    """Write the pinhole images of a model's images into a folder, and their masks; return which have one."""
     whole = int(np.iinfo(np.int32).max)
 
-    def write(i: int) -> bool:
+    def write(i: int) -> list[bool]:
         K, size, distortion = model.views[i].intrinsics
-        pinhole_K, pinhole_size, _ = pinholes.views[i].intrinsics
+        written = math.prod(pinholes[i][0].view.intrinsics[1])
         # Measured: 17 bytes per pixel of the original and of the result.
-        with _budget.reserve(17 * (math.prod(size) + math.prod(pinhole_size))):
+        with _budget.reserve(17 * (math.prod(size) + written)):
             (image,) = _images.read_image(paths[i], max_size_px=whole, as_stored=model.as_stored).images
             if image.size != size:
                 rule = _images.rotation_words(model.as_stored)
@@ -330,19 +416,23 @@ def _write_images(
             mask, file = image.mask, masks.get(model.names[i])
             if file is not None:
                 mask = _images.read_mask(file, image, as_stored=model.as_stored)
-            rgb, used = image.rgb, mask
-            if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
-                frames = K, distortion, pinhole_K, pinhole_size
-                rgb, _ = undistort_image(rgb, *frames)
-                if mask is not None:
-                    _, used = undistort_image(mask[:, :, None].astype(np.uint8), *frames, mask=mask)
-            write_image(folder / "images" / pinholes.views[i].name, rgb)
-            if used is not None and mask_names:
-                write_image(folder / mask_names[i], np.where(used, 255, 0).astype(np.uint8))
-            return mask is not None
+            for pinhole in pinholes[i]:
+                rgb, used = image.rgb, mask
+                pinhole_K, pinhole_size, _ = pinhole.view.intrinsics
+                if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
+                    frames = K, distortion, pinhole_K, pinhole_size
+                    rgb, seen = undistort_image(rgb, *frames, turn=pinhole.turn)
+                    used = seen if pinhole.turn is not None else None
+                    if mask is not None:
+                        levels = mask[:, :, None].astype(np.uint8)
+                        _, used = undistort_image(levels, *frames, mask=mask, turn=pinhole.turn)
+                write_image(folder / "images" / pinhole.view.name, rgb)
+                if used is not None and pinhole.mask is not None:
+                    write_image(folder / pinhole.mask, np.where(used, 255, 0).astype(np.uint8))
+            return [mask is not None or pinhole.turn is not None for pinhole in pinholes[i]]
 
     with ThreadPool(threads or available_threads()) as pool:
-        return list(pool.map(write, range(len(paths))))
+        return [there for each in pool.map(write, range(len(paths))) for there in each]
 
 
 def write_mesh(path: str | Path, mesh: TexturedMesh) -> None:
