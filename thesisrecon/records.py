@@ -141,7 +141,8 @@ class FundamentalFit(Record):
     F: F64  #: (3, 3) of unit Frobenius norm
     inliers: B8  #: (M,)
     sigma_px: float  #: standard deviation of one image coordinate, estimated from the inliers
-    covariance: F64  #: (9, 9) of the entries of F, row by row
+    #: (9, 9) of the entries of F, row by row, by noise alone: a wrong match near its line is not in it
+    covariance: F64
     iterations: int = 0  #: number of samples
     #: (K, 3, 3) other results of the search, best first; F is ambiguous if they explain as many matches
     competing_models: F64 = field(default_factory=lambda: np.empty((0, 3, 3)))

@@ -62,6 +62,9 @@ def test_alignment_finds_the_true_place_under_gain_and_bias(affine_std):
     found, maps, score = align(one, two, xy1, start, affine, (12, affine_std, 3.0, 1.0))
     assert (score > 0.9).mean() > 0.95
     assert np.median(np.linalg.norm(found - xy2, axis=1)) < 0.05
+    # More iterations move no window.
+    further = align(one, two, xy1, start, affine, (60, affine_std, 3.0, 1.0))[0]
+    assert np.linalg.norm(found - further, axis=1).max() < 0.001
     assert np.abs(np.linalg.det(maps[score > 0.9]) / slope[score > 0.9] - 1).mean() < 0.1
 
 

@@ -7,10 +7,11 @@ from tests.metric.metric_stage import refine, scatter, with_few_points, with_xy
 from tests.synthetic import make_scene
 from thesisrecon.metric import _uncertainty, refinement
 from thesisrecon.metric._adjustment import tail_width
+from validation.metrics.cameras import pose_scores
 
 
 def test_deviations_and_noise_are_of_the_stated_size_on_normal_noise():
-    deviations, noise = [], []
+    deviations, noise, poses = [], [], []
     for seed in range(16):
         scene = make_scene(sigma_px=0.5, points=300, seed=seed, principal_shift=(5.0, -3.0))
         result, K = refine(scene), scene.K[0]
@@ -20,9 +21,11 @@ def test_deviations_and_noise_are_of_the_stated_size_on_normal_noise():
         # Three unknowns of each point and six of each pose take their share of the residuals.
         left = 1.0 - (3 * scene.tracks.n_points + 6 * scene.tracks.n_views) / (2 * len(scene.tracks.xy))
         noise.append(result.reconstruction.sigma_px / 0.5 / np.sqrt(left))
+        poses.append(pose_scores(result, scene.R, scene.centres))
     # 48 squares of normal numbers: a standard error of 0.1.
     assert 0.7 < np.sqrt(np.mean(np.square(deviations))) < 1.32
     assert np.mean(noise) == pytest.approx(1.0, abs=0.04)
+    assert 0.8 < np.sqrt(np.mean(np.square(poses))) < 1.2
 
 
 def test_the_last_model_is_at_the_minimum_of_its_inliers_which_have_no_wrong_pixel(monkeypatch):

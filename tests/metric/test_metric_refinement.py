@@ -14,7 +14,9 @@ from thesisrecon.camera import project_camera
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
 from thesisrecon.metric import refinement
+from thesisrecon.metric._model import normalized_observations
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.optimize.bundle.projection import MetricCameras
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 
@@ -109,6 +111,11 @@ def test_a_fixed_principal_point_is_reported_as_assumed_and_a_known_calibration_
 def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():
     distortion, scene = np.array([-0.03, 0.02, -0.02]), make_scene(points=500, seed=2)
     bent = with_poses(replace(scene, k1=distortion), scene.R, scene.centres)
+    intrinsics, t = np.array([[1500.0, 1.0, 0.0, *scene.K[0, :2, 2], *distortion]]), bent.tracks
+    cameras = MetricCameras(scene.R, scene.t, intrinsics, np.zeros(t.n_views, np.int64))
+    straight = np.einsum("kab,kb->ka", scene.R[t.view_index], scene.X[t.point_index]) + scene.t[t.view_index]
+    normalized = normalized_observations(cameras, t.view_index, t.xy)
+    np.testing.assert_allclose(normalized, straight[:, :2] / straight[:, 2:], atol=1e-9)
     noise = 0.05 * np.random.default_rng(0).normal(size=scene.tracks.xy.shape)
     result = refine(replace(bent, tracks=replace(bent.tracks, xy=bent.tracks.xy + noise)), cameras="shared")
     r = np.linspace(0.1, 0.6, 20)

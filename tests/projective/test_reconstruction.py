@@ -22,10 +22,13 @@ from thesisrecon.records import DegeneracyReport, Tracks
 VARIANTS = [incremental.IncrementalProjective(), incremental.SequentialProjective()]
 
 
+def reprojected(found):
+    t = found.tracks
+    return dehomogenize(np.einsum("kab,kb->ka", found.P[t.view_index], found.X[t.point_index]))
+
+
 def residuals(found):
-    t, k = found.tracks, found.inlier
-    xh = np.einsum("kab,kb->ka", found.P[t.view_index[k]], found.X[t.point_index[k]])
-    return np.linalg.norm(dehomogenize(xh) - t.xy[k], axis=1)
+    return np.linalg.norm((reprojected(found) - found.tracks.xy)[found.inlier], axis=1)
 
 
 def projective_error(found, scene):
@@ -59,7 +62,13 @@ def test_noise_comes_back_as_residual_and_wrong_observations_are_left_out():
     method = incremental.IncrementalProjective()
     found = method.reconstruct(replace(t, xy=xy), true_pairs(scene), scene.sizes, rng=rng)
     assert found.registered.all()
-    assert found.sigma_px == pytest.approx(0.5, rel=0.25)
+    # Eleven unknowns of each camera and three of each point take their share of the residuals.
+    left = 1.0 - (11 * t.n_views + 3 * t.n_points) / (2 * found.inlier.sum())
+    assert found.sigma_px == pytest.approx(0.5 * np.sqrt(left), rel=0.1)
+    longer = with_constants(incremental.IncrementalProjective, bundle_iterations=20, final_rounds=6)()
+    further = longer.reconstruct(replace(t, xy=xy), true_pairs(scene), scene.sizes, rng=rng)
+    moved = (reprojected(further) - reprojected(found))[found.inlier & further.inlier]
+    assert np.sqrt(np.mean(moved**2)) < 0.001 * 0.5
     far = wrong & (np.linalg.norm(xy - t.xy, axis=1) > 30.0)
     assert found.inlier[far].mean() < 0.02
     assert found.inlier[~wrong].mean() > 0.9

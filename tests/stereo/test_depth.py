@@ -15,9 +15,9 @@ from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.imaging.resampling import pinhole_view
-from thesisrecon.records import DepthMap, DisparityMap, Image
+from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView
 from thesisrecon.stereo import correspondence, depth
-from thesisrecon.stereo._depth_fusion import _concatenated, inverse_depths
+from thesisrecon.stereo._depth_fusion import _concatenated, fuse_inverse_depths, inverse_depths
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
 from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
 from thesisrecon.stereo.depth import (
@@ -62,6 +62,18 @@ def test_depth_matches_the_scene_and_its_std_predicts_the_error(walled, links):
         assert 0.05 < np.nanmedian(np.abs(z)) < 2.0
         assert np.array_equal(found.views >= 1, np.isfinite(found.depth))
         assert np.array_equal(np.isnan(found.depth), np.isnan(found.std))
+
+
+def test_depths_of_normal_noise_are_as_far_off_as_they_state():
+    rng, shape = np.random.default_rng(0), (60, 80)
+    found = [(0.2 + s * rng.normal(size=shape), np.full(shape, s)) for s in (4e-3, 2e-3, 1e-3)]
+    fused = fuse_inverse_depths([tuple(np.float32(part)) for part in found], shape)
+    view = PinholeView(0, np.eye(3, 4), np.zeros((*shape, 3), np.uint8), np.ones(shape, bool))
+    depths = depth._depth_map(view, fused, view.seen)
+    z = (depths.depth - 5.0) / depths.std
+    # Scatter that is larger by chance widens some of the intervals.
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(0.92, abs=0.06)
+    assert abs(z.mean()) < 4.0 / np.sqrt(z.size)
 
 
 def test_the_same_bytes_with_any_number_of_threads(walled):
