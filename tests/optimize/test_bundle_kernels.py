@@ -428,7 +428,7 @@ def test_the_scatter_of_a_street_is_that_of_dense_information(monkeypatch, own):
     np.testing.assert_array_equal(_gram_matrix(A), (A.T @ A).toarray())
 
 
-def test_faults_of_the_camera_model_move_the_poses_as_an_adjustment_does():
+def test_faults_of_the_camera_model_move_the_cameras_as_an_adjustment_does():
     block, eps = make_block(points=200), 1e-4
     q = block.cameras.intrinsics[block.cameras.group[block.view]]
     exact, linear, _ = _scatter(block, block.xy)
@@ -444,6 +444,11 @@ def test_faults_of_the_camera_model_move_the_poses_as_an_adjustment_does():
         stated, found = (a - a.mean(axis=0) for a in (stated, angle))
         assert np.abs(angle).max() > 0.0
         np.testing.assert_allclose(stated, -found, atol=0.03 * np.abs(stated).max())
+        rows = moved.cameras.intrinsics[0], exact.cameras.intrinsics[0]
+        change = np.append(np.log(rows[0][0] / rows[1][0]), (rows[0] - rows[1])[1:])[FREE]
+        stated = eps * poses.intrinsic_fault[:, n]
+        own = np.sqrt(np.diag(poses.covariance))
+        np.testing.assert_allclose(stated / own, change / own, atol=0.03 * np.abs(stated / own).max())
 
 
 def _own_focals(block, populations):

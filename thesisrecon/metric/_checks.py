@@ -8,7 +8,6 @@ which the pipeline replaces by the file name.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -128,6 +127,22 @@ class Join(NamedTuple):
         """Share of inliers."""
         return self.inliers / max(self.tracks, 1)
 
+    @property
+    def sentence(self) -> str:
+        """The failed check if it is doubtful."""
+        return Notice("doubtful-join", _named(self.views), self.inliers, self.tracks)
+
+
+class SelfCheck(NamedTuple):
+    """``numbers`` by name, sentences for ``failed`` checks (none: trusted) and ``limitations``, which leave
+    the cameras right, and the join of the images that is ``doubtful``.
+    """
+
+    numbers: dict[str, float]
+    failed: list[str]
+    limitations: list[str]
+    doubtful: Join | None
+
 
 def weakest_join(model: _model.MetricEstimate, near: B8) -> Join | None:
     """Find the two parts of the images whose common tracks agree least with the model; None without any.
@@ -207,11 +222,8 @@ def _own_camera(model: _model.MetricEstimate, view: int, index: I64) -> tuple[fl
 
 def self_check(
     model: _model.MetricEstimate, calibration: SelfCalibration, intervals: Intervals, *, sigmas: float
-) -> tuple[dict[str, float], list[str], list[str]]:
-    """Check a metric model: numbers, sentences for failed checks (none: trusted), limitations (chapter 7).
-
-    A limitation leaves the cameras right; ``intervals`` as in ``MetricResult``, ``sigmas``: inlier gate.
-    """
+) -> SelfCheck:
+    """Check a metric model (chapter 7); ``intervals`` as in ``MetricResult``, ``sigmas``: inlier gate."""
     views = np.flatnonzero(model.registered).tolist()
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
@@ -251,9 +263,10 @@ def self_check(
     join = weakest_join(model, near)
     check["joined_share_weakest"] = np.nan if join is None else join.share
     failed, limitations = _failed_views(each, model)
-    if join is not None and join.share < MIN_JOINED_SHARE:
-        failed.append(Notice("doubtful-join", _named(join.views), join.inliers, join.tracks))
-    return check, [*failed, *_failed_model(check)], limitations
+    doubtful = None if join is None or join.share >= MIN_JOINED_SHARE else join
+    if doubtful is not None:
+        failed.append(doubtful.sentence)
+    return SelfCheck(check, [*failed, *_failed_model(check)], limitations, doubtful)
 
 
 def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> tuple[list[str], list[str]]:
@@ -289,12 +302,6 @@ def _named(views: I64) -> str:
     if len(numbers) == 1:
         return f"Image {numbers[0]}"
     return f"Images {', '.join(numbers[:-1])} and {numbers[-1]}"
-
-
-def doubtful_views(sentence: str) -> list[int]:
-    """The views that a failed check names as the smaller of two parts whose join is doubtful."""
-    named = getattr(sentence, "code", "") == "doubtful-join"
-    return [int(number) for number in re.findall(r"#(\d+)", sentence)] if named else []
 
 
 def _range(shares: F64) -> str:

@@ -32,6 +32,7 @@ MODEL_FLOOR_REL = 1e-3
 to one or two parts in a thousand."""
 MIN_BLOCKS = 4  # fewer blocks give no inflation
 UNVERIFIED_SHARING = "shared focal length that the images cannot verify: small zoom differences allowed for"
+FAULTS = "bundle adjustment; the interval contains errors of a fixed aspect ratio, skew and decentring"
 CAMERA_MODEL = "bundle adjustment; the interval contains the difference to a richer camera model"
 _COLUMNS = {
     "focal_px": FOCAL, "aspect": ASPECT, "skew_px": SKEW,
@@ -187,11 +188,16 @@ def focal_shrinkage(
 
 
 def intrinsic_intervals(
-    model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter, shrinkage: FocalShrinkage
-) -> Intervals:
-    """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval."""
+    model: MetricEstimate, adjustment: MetricAdjustment, scatter: BlockScatter, shrinkage: FocalShrinkage,
+    uncertainty: PoseUncertainty,
+) -> Intervals:  # fmt: skip
+    """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval.
+
+    They contain the errors of a fixed aspect, skew and decentring as those of the poses do.
+    """
     floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
     share = lack_of_fit(scatter, model.tail)
+    faults = MODEL_FLOOR_REL * np.sqrt(share) * np.linalg.norm(uncertainty.intrinsic_fault, axis=1)
     answer: list[dict[str, IntrinsicInterval]] = [{} for _ in model.registered]
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]
@@ -204,11 +210,15 @@ def intrinsic_intervals(
             ratios = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
             inflation, floor = _inflation(scatter, *ratios, share), float(floors[g, column])
             # A value that the images leave to its prior is as uncertain as the prior is wrong.
-            measured = float(np.hypot(inflation * np.sqrt(variance), scatter.pull[g, column]))
+            noise = float(np.hypot(inflation * np.sqrt(variance), scatter.pull[g, column]))
+            fault = float(faults[uncertainty.number[g, column]])
+            measured = float(np.hypot(noise, fault))
             std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
             if floor > measured:
                 how = "bundle adjustment; the interval is the camera-model error floor"
                 how += f" of {floor:.1%}" if column == FOCAL else ""
+            elif fault > noise:
+                how = FAULTS
             else:
                 factor, why = inflation * adjustment.inflation, "from the scatter between blocks of the scene"
                 how = f"bundle adjustment; standard deviation x {factor:.1f} {why}"

@@ -16,7 +16,7 @@ from thesisrecon import records
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
-from thesisrecon.metric._checks import check_returned, doubtful_views, returned_cameras, self_check
+from thesisrecon.metric._checks import Join, check_returned, returned_cameras, self_check
 from thesisrecon.metric._lens import undetermined_lens, with_best_lens
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
@@ -64,45 +64,48 @@ class MetricRefinement:
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         settled = settle_camera_model(finish_metric(model, adjustment))
-        result = _assess(settled, reconstruction.tracks, calibration, reasons)
-        if result.trusted:
-            return result
-        return _trusted_part(result, model, adjustment, reconstruction.tracks, calibration) or result
+        assessed = _assess(settled, reconstruction.tracks, calibration, reasons)
+        if assessed[0].trusted:
+            return assessed[0]
+        part = _trusted_part(assessed, model, adjustment, reconstruction.tracks, calibration)
+        return assessed[0] if part is None else part
 
 
 def _trusted_part(
-    result: records.MetricResult, model: MetricEstimate, adjustment: MetricAdjustment,
+    assessed: tuple[records.MetricResult, Join | None], model: MetricEstimate, adjustment: MetricAdjustment,
     tracks: records.Tracks, calibration: records.SelfCalibration,
 ) -> records.MetricResult | None:  # fmt: skip
     """The model without the views whose join is doubtful, adjusted again; None if that is not trusted."""
+    result, doubtful = assessed
     joins, reasons, before = list[str](), list(result.reconstruction.reasons), model.registered.sum()
     while not result.trusted:
-        doubtful = [sentence for sentence in result.failed_checks if doubtful_views(sentence)]
-        views = [view for sentence in doubtful for view in doubtful_views(sentence)]
-        registered = model.registered.copy()
-        registered[views] = False
-        for view in views:
-            reasons[view] = Notice("doubtful-side")
-        joins += doubtful
-        if not views or registered.sum() < 3:
+        if doubtful is None:
             return None
+        joins.append(doubtful.sentence)
+        registered = model.registered.copy()
+        registered[doubtful.views] = False
+        if registered.sum() < 3:
+            return None
+        for view in doubtful.views.tolist():
+            reasons[view] = Notice("doubtful-side")
         model = _model.retriangulate_tracks(replace(model, registered=registered), sigmas=LATE_SIGMAS)
         if model.inlier.sum() < _adjustment.MIN_OBSERVATIONS:
             return None
         settled = settle_camera_model(finish_metric(model, adjustment))
-        result = _assess(settled, tracks, calibration, tuple(reasons))
+        result, doubtful = _assess(settled, tracks, calibration, tuple(reasons))
     check = {**result.self_check, "views_left_out": float(before - model.registered.sum())}
     return replace(result, self_check=check, warnings=(*result.warnings, *joins))
 
 
 def _assess(
     settled: _Settled, tracks: records.Tracks, calibration: records.SelfCalibration, reasons: tuple[str, ...]
-) -> records.MetricResult:
-    """State the intervals of a final model with all ``tracks``, and check it."""
+) -> tuple[records.MetricResult, Join | None]:
+    """State the intervals of a final model with all ``tracks``, and check it; also its doubtful join."""
     final, sharing, enlarged, difference = settled
     model, adjustment, own, fit, scatter = final
     shrinkage = _uncertainty.focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
-    intervals = _uncertainty.intrinsic_intervals(model, adjustment, scatter, shrinkage)
+    uncertainty = pose_uncertainty(fit)
+    intervals = _uncertainty.intrinsic_intervals(model, adjustment, scatter, shrinkage, uncertainty)
     intervals = _uncertainty.widen_unverified_focals(intervals, sharing.focal_std)
     intervals = _uncertainty.widen_by_camera_model(intervals, difference, sharing.misfit)
     complete = _model.with_tracks(model, tracks)
@@ -113,14 +116,13 @@ def _assess(
     )
     intervals = _uncertainty.widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
     report = check_returned(model, adjustment, motion, intervals)
-    uncertainty = pose_uncertainty(fit)
     poses = _uncertainty.pose_std(model, uncertainty, scatter, intervals)
     intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
     model = complete
-    check, failed_checks, limitations = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
+    checked = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.
     start = [] if enlarged or adjustment.prior.lens is not None else _contradiction(calibration)
-    failed_checks = [*([] if report.identifiable else report.sentences), *start, *failed_checks]
+    failed_checks = [*([] if report.identifiable else report.sentences), *start, *checked.failed]
     failed_checks += [*_shared_camera.contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
     failed_checks += _shared_camera.inconsistent_principal_point(model, adjustment, scatter)
     if deviations > _adjustment.MAX_CHANGE:
@@ -128,10 +130,11 @@ def _assess(
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
     warnings += undetermined_lens(model, intervals, motion)
-    return records.MetricResult(
-        _as_reconstruction(model, reasons), tuple(intervals), check, not failed_checks, tuple(failed_checks),
-        warnings, (*enlarged, *limitations), report, poses,
+    result = records.MetricResult(
+        _as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
+        tuple(failed_checks), warnings, (*enlarged, *checked.limitations), report, poses,
     )  # fmt: skip
+    return result, checked.doubtful
 
 
 def _contradiction(calibration: records.SelfCalibration) -> list[str]:

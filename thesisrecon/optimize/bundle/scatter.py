@@ -142,7 +142,8 @@ class PoseUncertainty:
     inner gauge: after the similarity that moves the cameras least. ``variance`` (V, 6) is that for known
     intrinsics, ``response`` (V, 6, n) the derivative by each of the n unknown intrinsics, ``covariance``
     (n, n) theirs, ``number`` (G, C) theirs in the table, -1 if fixed. ``fault`` (V, 6, 4) is the change by a
-    unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966).
+    unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966), and
+    ``intrinsic_fault`` (n, 4) that of the intrinsics.
     """
 
     views: I64
@@ -151,6 +152,7 @@ class PoseUncertainty:
     covariance: F64
     number: I64
     fault: F64
+    intrinsic_fault: F64
 
     def variances(self, noise: F64, std: F64, fault: float) -> F64:
         """Total variances (V, 6) for factors ``noise`` (V, 6) on standard deviations, and of other causes.
@@ -180,14 +182,15 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
         rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
         own = known(unit_columns(first, rows))[rows]
         variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
-    moved = fit.solve(np.asarray(fit.J.T @ _faults(fit)))[:first]
+    moved = fit.solve(np.asarray(fit.J.T @ _faults(fit)))
     return PoseUncertainty(
         fit.views,
         np.maximum(variance, 0.0),
         turn @ response,
         fit.solve(unit_columns(D, np.arange(first, D)))[first:],
         fit.values.number,
-        turn @ moved.reshape(n, POSE_DOF, -1),
+        turn @ moved[:first].reshape(n, POSE_DOF, -1),
+        moved[first:],
     )
 
 
