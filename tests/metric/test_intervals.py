@@ -52,7 +52,7 @@ def test_the_last_model_is_at_the_minimum_of_its_inliers_which_have_no_wrong_pix
         assert inlier[~wrong].mean() > 0.998
         assert far < 0.01
     # Adjustments between which inliers are chosen again end at a tenth of a standard deviation.
-    assert np.mean(heavy) < 0.006
+    assert max(heavy) < 0.006
     assert np.mean(accepted) < 0.15
 
 
