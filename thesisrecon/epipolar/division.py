@@ -32,6 +32,8 @@ from thesisrecon.records import Matches
 
 VALUES = (0.1, 0.0, -0.1, -0.2, -0.3, -0.45, -0.6, -0.75, -0.9, -1.05, -1.2, -1.35)
 """Values of k1 that are tried: from a pincushion of a tenth to lenses of about 190 degrees."""
+BENT = -0.45
+"""A value that explains the matches of any lens that bends lines much better than zero does."""
 MAX_MAGNIFICATION = 5.0
 """Points beyond this magnification, 60 degrees or more off the axis, wait for the metric stage."""
 LEAST = 0.1
@@ -124,9 +126,15 @@ def is_nearly_straight(matches: Sequence[Matches], sizes: I64, rng: Generator) -
 
 
 def _small_lens(pairs: Sequence[_Pair], rng: Generator) -> DivisionEstimate | None:
-    """The lens refined from zero; None if it may be larger than k1 near zero."""
-    found = _best_of(pairs, (0.0,), rng)
-    return found if found is not None and found.is_small else None
+    """The lens refined from zero; None if it may be larger than k1 near zero.
+
+    F of a bent lens agrees with the matches of a part of the images, for which zero is a minimum too.
+    """
+    start = _best_value(pairs, (0.0, BENT), rng)
+    if start is None or start[1] != 0.0:
+        return None
+    found = DivisionEstimate(*_adjusted(start[0], np.array([0.0, 0.0, DIVISION]), 1)[1:])
+    return found if found.is_small else None
 
 
 def _chosen_pairs(matches: Sequence[Matches], wanted: int) -> list[Matches]:
@@ -152,21 +160,27 @@ def _sampled(m: Matches, sizes: I64, rng: Generator) -> _Pair:
 
 def _best_of(pairs: Sequence[_Pair], values: Sequence[float], rng: Generator) -> DivisionEstimate | None:
     """The value of k1 by which all pairs together have the least truncated distances, refined."""
-    if len(pairs) < MIN_PAIRS:
+    start = _best_value(pairs, values, rng)
+    if start is None:
         return None
-    trials = [[_fundamental(pair, np.array([k, 0.0, DIVISION]), rng) for pair in pairs] for k in values]
-    best = int(np.argmin([sum(score for score, _ in trial) for trial in trials]))
-    some = [(pair, F) for pair, (_, F) in zip(pairs, trials[best], strict=True) if F.any()]
-    if len(some) < MIN_PAIRS:
-        return None
-    found = _adjusted(some, np.array([values[best], 0.0, DIVISION]), 1)
-    if len(values) == 1:
-        return DivisionEstimate(*found[1:])
+    found = _adjusted(start[0], np.array([start[1], 0.0, DIVISION]), 1)
     found = _adjusted(_searched_again(found, rng), found[1], 2)
     found = _adjusted(_searched_again(found, rng), found[1], 2)
     radial = _adjusted(found[0], _radial_like(found[1]), 2)
     found = min(found, radial, key=_truncated)
     return DivisionEstimate(*found[1:])
+
+
+def _best_value(
+    pairs: Sequence[_Pair], values: Sequence[float], rng: Generator
+) -> tuple[list[tuple[_Pair, F64]], float] | None:
+    """The value of k1 of least truncated distances of all pairs, with F of those that have one; or None."""
+    if len(pairs) < MIN_PAIRS:
+        return None
+    trials = [[_fundamental(pair, np.array([k, 0.0, DIVISION]), rng) for pair in pairs] for k in values]
+    best = int(np.argmin([sum(score for score, _ in trial) for trial in trials]))
+    some = [(pair, F) for pair, (_, F) in zip(pairs, trials[best], strict=True) if F.any()]
+    return None if len(some) < MIN_PAIRS else (some, values[best])
 
 
 def _searched_again(found: _Adjusted, rng: Generator) -> list[tuple[_Pair, F64]]:

@@ -14,9 +14,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from thesisrecon._numba import code_digest
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.config import KINDS, PipelineConfig
 from thesisrecon.config.plug_ins import FunctionMatcher, matches_of
+from thesisrecon.epipolar.division import estimate_division
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.imaging.on_demand import RecentlyUsed
 from thesisrecon.matching._prepared import select_found, strongest_corners, strongest_share
@@ -194,6 +196,7 @@ class FromImages:
             return None
         digests, prior = [image.digest for image in job.inputs.decoded], job.prior
         variants = [run.variant_key(stage) for stage in ("features", "matching")]
+        variants.append([code_digest(estimate_division, seed_matches)])
         key = run.key("pairs", "lens", digests, variants, prior.shared[:, 5], prior.std[:, 5], run.seed)
         found = run.stored("pairs", "lens", key) or {"lens": self._lens(job, matching)}
         lens: F64 | None = run.cached("pairs", "lens", key, lambda: found)["lens"]
