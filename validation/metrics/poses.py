@@ -49,11 +49,9 @@ def _relative(R: F64, C: F64, i: I64, j: I64) -> tuple[F64, F64]:
 
 def recall(errors: F64, thresholds: F64) -> F64:
     """Share of the errors of at most each threshold."""
-    return (
-        np.asarray((errors[:, None] <= np.asarray(thresholds)).mean(axis=0))
-        if len(errors)
-        else np.asarray(thresholds) * np.nan
-    )
+    if not len(errors):
+        return np.asarray(thresholds) * np.nan
+    return np.asarray((errors[:, None] <= np.asarray(thresholds)).mean(axis=0))
 
 
 def area_under_recall(errors: F64, threshold: float) -> float:

@@ -76,18 +76,22 @@ def principal_points_by_pycolmap(folder: Path, names: Sequence[str]) -> F64:
 
 
 def match_with_pycolmap(
-    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None
+    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None, reader: Any = None
 ) -> dict[str, float]:
-    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both."""
+    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both. ``reader``
+    are pycolmap's ImageReaderOptions of a camera whose parameters are given.
+    """
     _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
 
     mode = pycolmap.CameraMode.SINGLE
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
     pycolmap.extract_features(
-        database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
-    )
-    _guess_focals(database)
+        database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu,
+        reader_options=pycolmap.ImageReaderOptions() if reader is None else reader,
+    )  # fmt: skip
+    if reader is None:
+        _guess_focals(database)
     seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
@@ -122,16 +126,12 @@ def _guess_focals(database: Path) -> None:
 
 
 def map_with_pycolmap(
-    images: Path,
-    out: Path,
-    *,
-    matched: Path | None = None,
-    refine_principal_point: bool = False,
-    threads: int = 2,
-    mapper: Literal["incremental", "global"] = "incremental",
-) -> None:
+    images: Path, out: Path, *, matched: Path | None = None, refine_principal_point: bool = False,
+    fixed: bool = False, threads: int = 2, mapper: Literal["incremental", "global"] = "incremental",
+) -> None:  # fmt: skip
     """Map the matches of ``match_with_pycolmap`` in ``out``, or in ``matched``, for :func:`read_run`. The
     models are not read: that would count as COLMAP's work. :class:`StageFailure` if there is no model.
+    The intrinsics of all cameras stay as they are if ``fixed``.
     """
     if matched is not None:
         if not (matched / "seconds.json").is_file():
@@ -148,7 +148,8 @@ def map_with_pycolmap(
     else:
         options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
         options.mapper.num_threads = threads
-        options.ba_refine_principal_point = refine_principal_point
+        options.ba_refine_principal_point = refine_principal_point and not fixed
+        options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
         pycolmap.incremental_mapping(*paths, options)
     seconds["map"] = time.perf_counter() - begun
     write_text(out / "seconds.json", json.dumps(seconds))

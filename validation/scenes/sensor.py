@@ -81,13 +81,9 @@ def take_image(
 
 
 def write_images(
-    folder: Path,
-    world: World,
-    poses: Mapping[int, Pose],
-    size: tuple[int, int],
-    seed: Sequence[int],
+    folder: Path, world: World, poses: Mapping[int, Pose], size: tuple[int, int], seed: Sequence[int],
     threads: int = 2,
-) -> None:
+) -> None:  # fmt: skip
     """Write the images ``0000.png`` and so on of cameras by their number; each has its own noise."""
 
     def write(k: int) -> None:

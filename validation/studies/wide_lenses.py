@@ -1,0 +1,125 @@
+"""Wide lenses without a prior: rendered images of 60 to 180 degrees, beside COLMAP with this kind of lens.
+
+Without a focal length COLMAP registers no image of a fisheye lens. It starts from its own guess, 1.2 times
+the long side, or has the true calibration.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from thesisrecon import Camera, reconstruct
+from thesisrecon.arrays import F64
+from thesisrecon.camera import camera_of_row
+from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.strata import estimate_similarity
+from thesisrecon.records import Reconstruction
+from validation.metrics.poses import area_under_recall, relative_pose_errors
+from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_run
+from validation.references.libraries import pycolmap
+from validation.runs.study import Part, report_progress
+from validation.runs.tables import text_table
+from validation.scenes.courtyard import build_yard
+from validation.scenes.many_views import WIDTH, build_near, walk, walk_street
+from validation.scenes.pose import Pose
+from validation.scenes.sensor import write_images
+from validation.scenes.wide import build_room, lens_camera, walk_inside
+
+SIZE, K1 = (640, 480), -0.02
+AUC_DEG = 0.5
+
+
+class WideSet(NamedTuple):
+    """Rendered images, their true poses, and the true camera."""
+
+    images: Path
+    poses: Sequence[Pose]
+    camera: Camera
+
+
+def render_set(out: Path, scene: str, degrees: float, views: int, threads: int) -> WideSet:
+    """Render the images of a scene by a fisheye lens, if the folder does not hold them."""
+    K, row = lens_camera(SIZE, degrees, "fisheye", np.array([K1]))
+    poses = {"yard": walk, "street": walk_street}.get(scene, walk_inside)
+    found = poses(views, K, row) if scene == "room" else poses(views, SIZE)
+    found = [replace(pose, K=K, lens=row) for pose in found]
+    images = out / f"{scene}-{degrees:g}"
+    if len(list(images.glob("*.png"))) != views:
+        worlds = {int(pose.C[0] // WIDTH) if scene == "street" else 0 for pose in found}
+        for house in sorted(worlds):
+            near = {k: p for k, p in enumerate(found) if scene != "street" or int(p.C[0] // WIDTH) == house}
+            world = {"room": build_room, "yard": lambda _: build_yard(3)}.get(scene, build_near)(house)
+            write_images(images, world, near, SIZE, [5], threads)
+    return WideSet(images, found, camera_of_row((K, np.eye(3), np.zeros(3)), SIZE, row))
+
+
+def run_colmap(given: WideSet, out: Path, threads: int, *, calibrated: bool) -> Reconstruction | None:
+    """COLMAP's model of a set from its guess of the focal length, or with the true calibration."""
+    K, guess = given.camera.K, 1.2 * max(SIZE)
+    start = [guess, guess, SIZE[0] / 2.0, SIZE[1] / 2.0, 0.0, 0.0, 0.0, 0.0]
+    true = [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, K1, 0.0, 0.0, 0.0]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "OPENCV_FISHEYE"
+    reader.camera_params = ", ".join(map(str, true if calibrated else start))
+    match_with_pycolmap(given.images, out, threads=threads, reader=reader)
+    try:
+        map_with_pycolmap(given.images, out, threads=threads, refine_principal_point=True, fixed=calibrated)
+        return read_run(given.images, out)[0]
+    except StageFailure:
+        return None
+
+
+def score(R: F64, C: F64, poses: Sequence[Pose]) -> str:
+    """Registered cameras; RMS error of their centres over the extent; AUC of relative poses."""
+    true_R, true_C = np.array([pose.R for pose in poses]), np.array([pose.C for pose in poses])
+    auc = area_under_recall(relative_pose_errors(R, C, true_R, true_C), AUC_DEG)
+    there = np.isfinite(C).all(axis=1)
+    if there.sum() < 3:
+        return f"{there.sum()}; –; {auc:.3f}"
+    off = estimate_similarity(C[there], true_C[there]).apply(C[there]) - true_C[there]
+    extent = np.sqrt(np.sum((true_C - true_C.mean(axis=0)) ** 2, axis=1).mean())
+    return f"{there.sum()}; {np.sqrt(np.sum(off**2, axis=1).mean()) / extent:.3%}; {auc:.3f}"
+
+
+def wide_lenses_study(
+    out: Path, scenes: Sequence[str] = ("yard", "street", "room"),
+    degrees: Sequence[float] = (60.0, 90.0, 120.0, 150.0, 180.0), views: int = 16, threads: int = 2,
+) -> Iterator[Part]:  # fmt: skip
+    """Reconstruct rendered images of wide lenses without a prior, and with COLMAP."""
+    lines = list[list[object]]()
+    for scene, wide in product(scenes, degrees):
+        given = render_set(out / "images", scene, wide, views, threads)
+        name = given.images.name
+        lines.append([f"{scene}, {wide:g}°", *_ours(given, out / "ours" / name, threads)])
+        for kind, calibrated in (("guess", False), ("true", True)):
+            model = run_colmap(given, out / kind / name, threads, calibrated=calibrated)
+            R, C = np.full((views, 3, 3), np.nan), np.full((views, 3), np.nan)
+            if model is not None and model.K is not None:
+                here = model.registered
+                Rt = np.linalg.solve(model.K[here], model.P[here])
+                R[here], C[here] = Rt[:, :, :3], -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
+            lines[-1].append(score(R, C, given.poses))
+        report_progress(" | ".join(map(str, lines[-1])))
+    head = ["scene, angle", "trusted", "angle of view (true)", "focal length", "cameras; centres; AUC"]
+    yield text_table([*head, "COLMAP from its guess", "COLMAP, true calibration"], lines)
+
+
+def _ours(given: WideSet, out: Path, threads: int) -> list[str]:
+    """Whether our result is trusted, the angle of view, the error of the focal length, and the scores."""
+    n = len(given.poses)
+    R, C = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan)
+    try:
+        result = reconstruct(given.images, out, until="metric", threads=threads, overwrite=True)
+    except StageFailure as failure:
+        return [f"no result: {failure.code}", "", "", score(R, C, given.poses)]
+    for name, camera in result.cameras.items():
+        R[int(name[:4])], C[int(name[:4])] = camera.R, camera.centre
+    one, true = next(iter(result.cameras.values())), given.camera
+    std = (one.std or {}).get("angle_of_view_deg", np.nan)
+    angle = f"{one.angles_of_view[0]:.2f} ± {std:.2f} ({true.angles_of_view[0]:.2f})"
+    focal = f"{abs(one.K[0, 0] / true.K[0, 0] - 1.0):.3%}"
+    return ["yes" if result.summary["trusted"] else "no", angle, focal, score(R, C, given.poses)]
