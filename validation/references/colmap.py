@@ -129,9 +129,8 @@ def map_with_pycolmap(
     images: Path, out: Path, *, matched: Path | None = None, refine_principal_point: bool = False,
     fixed: bool = False, threads: int = 2, mapper: Literal["incremental", "global"] = "incremental",
 ) -> None:  # fmt: skip
-    """Map the matches of ``match_with_pycolmap`` in ``out``, or in ``matched``, for :func:`read_run`. The
-    models are not read: that would count as COLMAP's work. :class:`StageFailure` if there is no model.
-    The intrinsics of all cameras stay as they are if ``fixed``.
+    """Map the matches of ``match_with_pycolmap`` in ``out`` or ``matched``, for :func:`read_run`; ``fixed``
+    intrinsics stay. The models are not read: that would count as COLMAP's work. StageFailure without a model.
     """
     if matched is not None:
         if not (matched / "seconds.json").is_file():

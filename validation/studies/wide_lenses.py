@@ -44,17 +44,18 @@ class WideSet(NamedTuple):
 def render_set(out: Path, scene: str, degrees: float, views: int, threads: int) -> WideSet:
     """Render the images of a scene by a fisheye lens, if the folder does not hold them."""
     K, row = lens_camera(SIZE, degrees, "fisheye", np.array([K1]))
-    poses = {"yard": walk, "street": walk_street}.get(scene, walk_inside)
-    found = poses(views, K, row) if scene == "room" else poses(views, SIZE)
-    found = [replace(pose, K=K, lens=row) for pose in found]
+    straight = walk(views, SIZE) if scene == "yard" else walk_street(views, SIZE)
+    poses = [replace(pose, K=K, lens=row) for pose in straight]
+    if scene == "room":
+        poses = walk_inside(views, K, row)
     images = out / f"{scene}-{degrees:g}"
     if len(list(images.glob("*.png"))) != views:
-        worlds = {int(pose.C[0] // WIDTH) if scene == "street" else 0 for pose in found}
-        for house in sorted(worlds):
-            near = {k: p for k, p in enumerate(found) if scene != "street" or int(p.C[0] // WIDTH) == house}
-            world = {"room": build_room, "yard": lambda _: build_yard(3)}.get(scene, build_near)(house)
-            write_images(images, world, near, SIZE, [5], threads)
-    return WideSet(images, found, camera_of_row((K, np.eye(3), np.zeros(3)), SIZE, row))
+        houses = [int(pose.C[0] // WIDTH) if scene == "street" else 0 for pose in poses]
+        for house in sorted(set(houses)):
+            near = {k: pose for k, pose in enumerate(poses) if houses[k] == house}
+            build = {"room": build_room, "street": build_near}.get(scene)
+            write_images(images, build_yard(3) if build is None else build(house), near, SIZE, [5], threads)
+    return WideSet(images, poses, camera_of_row((K, np.eye(3), np.zeros(3)), SIZE, row))
 
 
 def run_colmap(given: WideSet, out: Path, threads: int, *, calibrated: bool) -> Reconstruction | None:
@@ -115,7 +116,7 @@ def _ours(given: WideSet, out: Path, threads: int) -> list[str]:
     try:
         result = reconstruct(given.images, out, until="metric", threads=threads, overwrite=True)
     except StageFailure as failure:
-        return [f"no result: {failure.code}", "", "", score(R, C, given.poses)]
+        return [f"no result: {failure}", "", "", score(R, C, given.poses)]
     for name, camera in result.cameras.items():
         R[int(name[:4])], C[int(name[:4])] = camera.R, camera.centre
     one, true = next(iter(result.cameras.values())), given.camera
