@@ -9,7 +9,14 @@ import numpy as np
 
 from thesisrecon import arrays
 from thesisrecon.arrays import B8, F64, Record
-from thesisrecon.lens import Lens, directions_of_image, image_of_directions, lens_row, named_lens
+from thesisrecon.lens import (
+    Lens,
+    angles_from_axis,
+    directions_of_image,
+    image_of_directions,
+    lens_row,
+    named_lens,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +243,7 @@ def angles_of_view(K: F64, size: tuple[int, int], lens: F64) -> tuple[float, flo
     cx, cy = K[:2, 2]
     ends = [[-0.5, cy], [x, cy]] if size[0] >= size[1] else [[cx, -0.5], [cx, y]]
     rays = viewing_rays(K, np.array([*ends, [-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]]), lens)
-    angle = np.degrees(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]))
+    angle = np.degrees(angles_from_axis(rays))
     return float(angle[:2].sum()), float(angle[2:].max())
 
 
@@ -246,7 +253,18 @@ def widest_angle(K: F64, size: tuple[int, int], lens: F64) -> float:
     sides = [np.column_stack([x, np.full(33, end)]) for end in y[[0, -1]]]
     sides += [np.column_stack([np.full(33, end), y]) for end in x[[0, -1]]]
     rays = viewing_rays(K, np.concatenate(sides), lens)
-    return float(np.nanmax(np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2])))
+    return float(np.nanmax(angles_from_axis(rays)))
+
+
+def pixels_of_rays(rays: F64, K: F64, lens: F64, widest: float) -> F64:
+    """Pixels (N, 2) of directions in the camera frame; NaN farther than the angle ``widest`` from the axis.
+
+    Beyond the rays of its pixels a lens may image directions a second time.
+    """
+    near = angles_from_axis(rays) <= widest
+    xy = np.full((len(rays), 2), np.nan)
+    xy[near] = image_of_directions(rays[near], lens) @ K[:2, :2].T + K[:2, 2]
+    return xy
 
 
 def compose_camera(K: F64, R: F64, t: F64) -> F64:

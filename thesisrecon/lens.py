@@ -114,6 +114,11 @@ def straight_weights(k: F64, r2: F64) -> tuple[F64, F64]:
     return w, slope
 
 
+def angles_from_axis(X: F64) -> F64:
+    """Angles (N,) of directions (N, 3), of any length, from the optical axis."""
+    return np.asarray(np.arctan2(np.linalg.norm(X[:, :2], axis=1), X[:, 2]))
+
+
 def image_of_directions(X: F64, k: float | F64) -> F64:
     """Images (N, 2) of directions (N, 3), of any length, by one lens (C,)."""
     k = np.atleast_1d(k)

@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePath
 from typing import NamedTuple, get_args
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import F64, I64, flag, rows_of_views
-from thesisrecon.camera import angles_of_view, viewing_rays, widest_angle
+from thesisrecon.camera import angles_of_view, pixels_of_rays, viewing_rays, widest_angle
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.resampling import undistort_image
@@ -27,14 +28,7 @@ from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
-from thesisrecon.lens import (
-    Lens,
-    directions_of_image,
-    growing_radius,
-    image_of_directions,
-    named_lens,
-    undistort,
-)
+from thesisrecon.lens import Lens, directions_of_image, growing_radius, named_lens, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
@@ -164,9 +158,9 @@ def export(
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
             file, more = _DISTORTED[to](folder, model)
         return ExportReport(file, (*notes, *more))
-    undistorted, numbers, turns = _undistorted(model)
-    divided = any(turn is not None for turn in turns)
-    notes += [_divided_note(model, len(numbers))] if divided else []
+    undistorted, pinholes = _undistorted(model)
+    divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
+    notes += [_divided_note(model, len(undistorted.views))] if divided else []
     may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
     may_mask = may_mask or divided
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
@@ -175,10 +169,8 @@ def export(
     paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
-        pinholes = [list[_Pinhole]() for _ in model.views]
-        for n, (i, turn) in enumerate(zip(numbers, turns, strict=True)):
-            pinholes[i].append(_Pinhole(undistorted.views[n], turn, names[n] if may_mask else None))
-        has_mask = _write_images(folder, model, pinholes, paths, found, threads)
+        mask_name = partial(formats.mask_name, to) if may_mask else None
+        has_mask = _write_images(folder, model, pinholes, paths, found, mask_name, threads)
         masked = masks is not None or any(has_mask)
         notes += [_images.USELESS_MASKS] if masked and not any(has_mask) else []
         # Programs want a mask for every image or for none.
@@ -257,11 +249,10 @@ def _recorded(model: Model, name: str) -> Path | None:
 
 
 class _Pinhole(NamedTuple):
-    """A pinhole view, its rotation from the axes of the image if it is one of several, and its mask file."""
+    """A pinhole view of an image, and its rotation from the axes of the image if it is one of several."""
 
     view: SparseView
     turn: F64 | None
-    mask: str | None
 
 
 def _divided_note(model: SparseModel, written: int) -> str:
@@ -269,24 +260,23 @@ def _divided_note(model: SparseModel, written: int) -> str:
     return f"{said}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees"
 
 
-def _undistorted(model: SparseModel) -> tuple[SparseModel, list[int], list[F64 | None]]:
+def _undistorted(model: SparseModel) -> tuple[SparseModel, list[list[_Pinhole]]]:
     """The model with pinhole views, observations in their pixels, and names of files that can be written.
 
-    Also the number of the image of each view, and its rotation if it is one of several of this image.
+    Also the same views by image.
     """
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
     views, xy, view_index = list[SparseView](), model.xy.copy(), model.view_index.copy()
-    source, turns = list[int](), list[F64 | None]()
+    pinholes = list[list[_Pinhole]]()
     rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         K, size, distortion = view.intrinsics
         if angles_of_view(K, size, distortion)[0] > WIDE:
             faces = _faces(view)
-            xy[rows[i]], face = _in_faces(view, faces, xy[rows[i]])
-            view_index[rows[i]] = len(views) + face
+            xy[rows[i]], number = _in_faces(view, faces, xy[rows[i]])
+            view_index[rows[i]] = len(views) + number
             views += faces.values()
-            source += [i] * len(faces)
-            turns += [_FACES[name] for name in faces]
+            pinholes.append([_Pinhole(face, _FACES[name]) for name, face in faces.items()])
             continue
         key = (K.tobytes(), distortion.tobytes(), size)
         if key not in frames:
@@ -296,10 +286,9 @@ def _undistorted(model: SparseModel) -> tuple[SparseModel, list[int], list[F64 |
         xy[here] = _normalized(view, xy[here]) @ K[:2, :2].T + K[:2, 2]
         view_index[here] = len(views)
         views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
-        source.append(i)
-        turns.append(None)
+        pinholes.append([_Pinhole(views[-1], None)])
     _require_distinct([view.name for view in views], "be written as")
-    return replace(model, views=views, xy=xy, view_index=view_index), source, turns
+    return replace(model, views=views, xy=xy, view_index=view_index), pinholes
 
 
 def _faces(view: SparseView) -> dict[str, SparseView]:
@@ -311,9 +300,7 @@ def _faces(view: SparseView) -> dict[str, SparseView]:
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 33)] * 2), axis=-1).reshape(-1, 2)
     most, answer = widest_angle(K, size, lens), dict[str, SparseView]()
     for name, turn in _FACES.items():
-        rays = homogenize(grid) @ turn
-        rays = rays[np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]) <= most]
-        places = image_of_directions(rays, lens) @ K[:2, :2].T + K[:2, 2]
+        places = pixels_of_rays(homogenize(grid) @ turn, K, lens, most)
         inside = ((places >= 0.0) & (places <= np.array(size) - 1.0)).all(axis=1)
         if inside.sum() > LEAST_SEEN * len(grid):
             file = path.with_stem(f"{path.stem}_{name}").as_posix()
@@ -398,7 +385,7 @@ def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
 
 def _write_images(
     folder: Path, model: SparseModel, pinholes: Sequence[Sequence[_Pinhole]], paths: Sequence[Path],
-    masks: Mapping[str, Path], threads: int,
+    masks: Mapping[str, Path], mask_name: Callable[[str], str] | None, threads: int,
 ) -> list[bool]:  # fmt: skip
     """Write the pinhole images of a model's images into a folder, and their masks; return which have one."""
     whole = int(np.iinfo(np.int32).max)
@@ -427,8 +414,9 @@ def _write_images(
                         levels = mask[:, :, None].astype(np.uint8)
                         _, used = undistort_image(levels, *frames, mask=mask, turn=pinhole.turn)
                 write_image(folder / "images" / pinhole.view.name, rgb)
-                if used is not None and pinhole.mask is not None:
-                    write_image(folder / pinhole.mask, np.where(used, 255, 0).astype(np.uint8))
+                if used is not None and mask_name is not None:
+                    place = folder / mask_name(pinhole.view.name)
+                    write_image(place, np.where(used, 255, 0).astype(np.uint8))
             return [mask is not None or pinhole.turn is not None for pinhole in pinholes[i]]
 
     with ThreadPool(threads or available_threads()) as pool:

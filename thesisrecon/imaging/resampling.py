@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64, U8, Record, resizing_transform
-from thesisrecon.camera import widest_angle
+from thesisrecon.camera import pixels_of_rays, widest_angle
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
-from thesisrecon.lens import distort, image_of_directions
+from thesisrecon.lens import distort
 from thesisrecon.records import Image, PinholeView, Reconstruction
 
 MAX_TAPS = 24  #: limit of the filter width: reductions by more than 6 alias
@@ -251,15 +251,10 @@ def undistort_image(
     def lookup(rows: range) -> F64:
         x, y = np.meshgrid(np.arange(float(size[0])), np.arange(float(rows.start), float(rows.stop)))
         rays = homogenize(np.stack([x, y], axis=-1).reshape(-1, 2)) @ inverse.T
-        if turn is None:
-            xy = distort(dehomogenize(rays), distortion)
-        else:
-            rays = rays @ turn
-            # Beyond the rays of its pixels a lens may image directions a second time.
-            seen = np.arctan2(np.linalg.norm(rays[:, :2], axis=1), rays[:, 2]) <= most
-            xy = np.full((len(rays), 2), np.nan)
-            xy[seen] = image_of_directions(rays[seen], distortion)
-        return np.asarray((xy @ K[:2, :2].T + K[:2, 2]).reshape(*x.shape, 2))
+        if turn is not None:
+            return pixels_of_rays(rays @ turn, K, distortion, most).reshape(*x.shape, 2)
+        xy = distort(dehomogenize(rays), distortion) @ K[:2, :2].T + K[:2, 2]
+        return np.asarray(xy.reshape(*x.shape, 2))
 
     given = rgb.astype(np.float32)
     if mask is not None:

@@ -22,6 +22,7 @@ from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
 from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
 from thesisrecon.metric._model import ASPECT, CENTRE, DECENTRING, FOCAL, K1, SKEW, MetricEstimate
+from thesisrecon.optimize.bundle.projection import calibrations
 from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
 from thesisrecon.optimize.least_squares import MAD_FACTOR, student_factor
 from thesisrecon.records import IntrinsicInterval
@@ -327,9 +328,7 @@ def _angles(row: F64, columns: I64, std: F64, size: tuple[int, int]) -> tuple[F6
     """Angles of view (2,) of a row of intrinsics, and slopes (K, 2) by ``columns``; the focal as log f."""
 
     def angles(row: F64) -> F64:
-        f, aspect, skew, cx, cy = row[:5]
-        K = np.array([[f, skew, cx], [0.0, aspect * f, cy], [0.0, 0.0, 1.0]])
-        return np.array(angles_of_view(K, size, row[K1:]))
+        return np.array(angles_of_view(calibrations(row[None])[0], size, row[K1:]))
 
     slopes = np.zeros((len(columns), 2))
     for k, column in enumerate(columns):

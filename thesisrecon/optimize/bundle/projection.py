@@ -173,10 +173,7 @@ class MetricCameras:
     @property
     def K(self) -> F64:
         """Calibration matrices (V, 3, 3)."""
-        f, aspect, skew, cx, cy = self.intrinsics[self.group].T[:5]
-        zero, one = np.zeros_like(f), np.ones_like(f)
-        rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
-        return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+        return calibrations(self.intrinsics[self.group])
 
     @property
     def P(self) -> F64:
@@ -187,6 +184,14 @@ class MetricCameras:
     def centres(self) -> F64:
         """Camera centres (V, 3)."""
         return np.asarray(-np.einsum("vba,vb->va", self.R, self.t))
+
+
+def calibrations(intrinsics: F64) -> F64:
+    """Calibration matrices (V, 3, 3) of rows (V, C) of intrinsics."""
+    f, aspect, skew, cx, cy = intrinsics.T[:5]
+    zero, one = np.zeros_like(f), np.ones_like(f)
+    rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
+    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
 POSE_DOF = 6
