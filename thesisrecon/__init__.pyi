@@ -3,6 +3,9 @@
 
 # Whole runs
 from thesisrecon.api.reconstruct import reconstruct as reconstruct
+from thesisrecon.api.add_images import reconstruct_with_cameras as reconstruct_with_cameras
+from thesisrecon.api.add_images import add_images as add_images
+from thesisrecon.api.add_images import localize as localize
 from thesisrecon.api.from_matches import reconstruct_from_matches as reconstruct_from_matches
 from thesisrecon.api.from_matches import reconstruct_from_tracks as reconstruct_from_tracks
 from thesisrecon.api.from_matches import reconstruct_from_colmap as reconstruct_from_colmap

@@ -194,6 +194,24 @@ class RunResult(Record):
         """The row of each valid point in ``points``."""
         return np.cumsum(self._metric_result("observations").reconstruction.valid) - 1
 
+    def add(self, images: Any, **options: Any) -> RunResult:
+        """Register more images into the model; see :func:`thesisrecon.add_images`.
+
+        Parameters
+        ----------
+        images, **options
+            As of :func:`thesisrecon.add_images`.
+
+        Returns
+        -------
+        RunResult
+            Of all images.
+        """
+        # The call is above the records.
+        import thesisrecon
+
+        return thesisrecon.add_images(self, images, **options)
+
     def observations(self, image: str | int) -> SeenPoints:
         """Return the inlier observations of one image.
 

@@ -270,6 +270,12 @@ CALLS = {
         dict.fromkeys(("out", "masks", "threads", "seed", "max_size", "preset", "cameras", "pairs")),
     ),
     "reconstruct": (lambda **given: tr.reconstruct(out="unused", **given), {"images": None}),
+    "reconstruct_with_cameras": (
+        lambda **given: tr.reconstruct_with_cameras("unused", out="unused", **given),
+        {"cameras": None},
+    ),
+    "add_images": (lambda **given: tr.add_images(images="unused", **given), {"run": None}),
+    "localize": (lambda **given: tr.localize(image="unused", **given), {"run": None}),
 }
 """Calls with valid arguments; None: only wrong ones are tried, since a right one would take long."""
 

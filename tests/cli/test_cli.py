@@ -143,7 +143,7 @@ def test_a_finished_run_is_not_touched_by_another_config_and_its_own_runs_again(
 NAMELESS = "the folder has no name"
 # Commands with words of the one sentence; "''" is an empty word.
 WRONG = [
-    ("reconstruct", "Missing"), ("rebuild", "rebuild"), ("inspect nowhere", "no summary"),
+    ("reconstruct", "give the output folder"), ("rebuild", "rebuild"), ("inspect nowhere", "no summary"),
     ("reconstruct nowhere -o out", "there is no folder nowhere"),
     ("reconstruct . -o out --preset best", "--preset"), ("reconstruct . -o out --cameras two", "--cameras"),
     ("reconstruct . -o out --no-such-option", "--no-such-option"),

@@ -98,6 +98,6 @@ def test_the_metric_stage_registers_it():
     for points, reasons in ((8, {}), (0, {3: ""})):
         found = model(8, MATCHES if points else 0)
         rows = rows_of_views(found.tracks.view_index, 4)
-        grown, rejected = _resection._register_missing(found, np.random.default_rng(0), every, rows)
+        grown, rejected = _resection.register_next(found, np.random.default_rng(0), every, rows)
         assert bool(grown.registered[3]) == bool(points)
         assert rejected == reasons

@@ -62,7 +62,7 @@ def stated(model, **std):
 def doubts_of(model, scene, *, K=None, **std):
     """Values, failed checks and limitations of the self-check."""
     calibration = SelfCalibration(np.eye(4), scene.K if K is None else K, 0.0 * scene.K, True, ())
-    return self_check(model, calibration, stated(model, **std), sigmas=SIGMAS)[:3]
+    return self_check(model, calibration.K, stated(model, **std), sigmas=SIGMAS)[:3]
 
 
 def setting(**known):

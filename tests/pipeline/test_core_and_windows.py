@@ -62,13 +62,13 @@ def test_a_long_street_grows_from_its_core_in_windows(monkeypatch):
     scene = street(60)
     monkeypatch.setattr(_resection, "MANY_VIEWS", 12)
     windows = []
-    adjust = _resection._adjust_window
+    adjust = _resection.adjust_window
 
     def counted(model, adjustment, views):
         windows.append(int(views.sum()))
         return adjust(model, adjustment, views)
 
-    monkeypatch.setattr(_resection, "_adjust_window", counted)
+    monkeypatch.setattr(_resection, "adjust_window", counted)
     found, metric = reconstruct(scene, 12)
     assert found.registered.sum() <= 12
     assert metric.reconstruction.registered.all()

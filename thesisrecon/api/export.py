@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,6 +34,8 @@ from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
 
 _budget = MemoryBudget(_images.MAX_DECODED_BYTES)
+Images = str | Path | Mapping[str, str]
+"""A folder of images, or their files by name."""
 """Separate from the budget for decoding, which each image needs while it occupies this one."""
 
 
@@ -87,7 +89,7 @@ FORMATS = (*_PINHOLE, *_DISTORTED)
 
 def export(
     model: Model, out: str | Path, *, to: str,
-    images: str | Path | None = None, masks: str | Path | None = None, threads: int = 0,
+    images: Images | None = None, masks: str | Path | None = None, threads: int = 0,
     overwrite: bool = False,
 ) -> ExportReport:  # fmt: skip
     """Write a model for another program.
@@ -102,9 +104,9 @@ def export(
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
         cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
         ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
-    images : path, optional
-        Folder of the original images; None: the folder that the run was made from. Those of a COLMAP model
-        are used as stored, without EXIF rotation.
+    images : path or mapping of str to path, optional
+        Folder of the original images, or their files by name; None: those that the run was made from. Those
+        of a COLMAP model are used as stored, without EXIF rotation.
     masks : path, optional
         Folder of the masks of the original images; None: that of the run, if it had masks. Transparent pixels
         of the images are masked too.
@@ -140,7 +142,10 @@ def export(
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
     flag("export", "overwrite", overwrite)
-    images = recorded_images(model) if images is None else as_path("export", "images", images)
+    if images is None:
+        images = recorded_images(model)
+    elif not isinstance(images, Mapping):
+        images = as_path("export", "images", images)
     lost: list[str] = []
     if masks is None:
         masks, lost = recorded_masks(model, to)
@@ -161,12 +166,12 @@ def export(
     undistorted, pinholes = _undistorted(model)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     notes += [_divided_note(model, len(undistorted.views))] if divided else []
-    may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
+    paths = _image_paths(images, model)
+    may_mask = masks is not None or any(map(_images.may_be_transparent, paths))
     may_mask = may_mask or divided
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
     _require_distinct(names, "have the mask")
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
-    paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
         mask_name = partial(formats.mask_name, to) if may_mask else None
@@ -181,14 +186,15 @@ def export(
 
 
 def require_separate(
-    folder: Path, to: str, *, model: str | Path | None = None, images: str | Path | None = None,
+    folder: Path, to: str, *, model: str | Path | None = None, images: Images | None = None,
     masks: str | Path | None = None,
 ) -> None:  # fmt: skip
     """Raise ``UsageError`` if an export would replace the model, images or masks that it reads."""
     written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
     colmap = None if model is None else colmap_model_in(Path(model))
-    given = [Path(path) for path in (colmap, images, masks) if path is not None]
+    places = images.values() if isinstance(images, Mapping) else [images]
+    given = [Path(path) for path in (colmap, masks, *places) if path is not None]
     there = [path for path in written if path.exists()]
     lost = next((path for path in given if path.exists() and any(map(path.samefile, there))), None)
     if lost is not None:
@@ -227,25 +233,33 @@ def _rounding_notes(model: SparseModel) -> list[str]:
     ]
 
 
-def recorded_images(model: Model) -> Path | None:
-    """Return the folder of the images that a run was made from, None if it is not known."""
-    return _recorded(model, "images_folder")
-
-
 def recorded_masks(model: Model, to: str) -> tuple[Path | None, list[str]]:
     """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
-    folder = _recorded(model, "masks_folder") if to in _PINHOLE else None
+    folder = recorded(model, "masks_folder") if to in _PINHOLE else None
     if folder is None or folder.is_dir():
         return folder, []
     return None, [f"no masks are written: the folder {folder} of the run is gone; give --masks (masks=)"]
 
 
-def _recorded(model: Model, name: str) -> Path | None:
-    if not isinstance(model, RunResult | str | os.PathLike):
-        return None
-    summary = model.summary if isinstance(model, RunResult) else read_json(Path(model) / "summary.json")
-    folder = summary.get(name) if isinstance(summary, Mapping) else None
+def recorded_images(model: Model) -> Images | None:
+    """Return the folder of the images of a run, or their files by name; None if they are not known."""
+    folder, elsewhere = recorded(model, "images_folder"), _summary(model).get("images_elsewhere")
+    if folder is None or not elsewhere:
+        return folder
+    return _images.files_by_name(folder) | dict(elsewhere)
+
+
+def recorded(model: Model, name: str) -> Path | None:
+    """Return a folder that the summary of a run names, such as "images_folder"; None if it is not known."""
+    folder = _summary(model).get(name)
     return Path(folder) if isinstance(folder, str) else None
+
+
+def _summary(model: Model) -> Mapping[str, Any]:
+    if not isinstance(model, RunResult | str | os.PathLike):
+        return {}
+    summary = model.summary if isinstance(model, RunResult) else read_json(Path(model) / "summary.json")
+    return summary if isinstance(summary, Mapping) else {}
 
 
 class _Pinhole(NamedTuple):
@@ -376,11 +390,11 @@ def _pinhole_frame(view: SparseView) -> tuple[F64, tuple[int, int]]:
     return K, (int(size[0]), int(size[1]))
 
 
-def _image_paths(images: str | Path | None, model: SparseModel) -> list[Path]:
+def _image_paths(images: Images | None, model: SparseModel) -> list[Path]:
     if images is None:
         message = "the model does not record the folder of its images; give it with --images (images=)"
         raise UsageError(message)
-    return _images.find_images(Path(images), model.names)
+    return _images.find_images(images, model.names)
 
 
 def _write_images(

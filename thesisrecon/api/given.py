@@ -13,10 +13,13 @@ from thesisrecon.arrays import F64, I64, numbers, require_shapes, sizes_of_image
 from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import UsageError, in_words
 from thesisrecon.io._files import require_image_name
+from thesisrecon.io._images import ImageSet
 from thesisrecon.io._models import read_model
 from thesisrecon.lens import BASE, simplest_row
+from thesisrecon.metric.given_cameras import GivenCameras
 from thesisrecon.records import Reconstruction
 from thesisrecon.results import RunResult, SparseModel, SparseView
+from thesisrecon.runtime._run_folder import key_of
 
 Model = str | Path | SparseModel | RunResult | Reconstruction | Mapping[str, Camera] | Sequence[Camera]
 """A model in memory or a folder; what has the interface of ``pycolmap.Reconstruction`` is one, too."""
@@ -101,6 +104,40 @@ def cameras_by_name(caller: str, model: Model) -> Mapping[str, Camera]:
         raise ValueError(f"{caller} needs {kinds}; got a {type(model).__name__}")
     source = model if isinstance(model, str | PathLike) else "the model"
     return cameras_of_model(as_sparse_model(model), source)
+
+
+def known_by_name(caller: str, known: Model, until: str) -> Mapping[str, Camera]:
+    """The cameras that a run is given; ``until`` is its last stage."""
+    if until == "projective":
+        raise UsageError('known cameras leave no projective stage; use until="metric"')
+    cameras = cameras_by_name(caller, as_sparse_model(known, "the known cameras"))
+    if not cameras:
+        raise UsageError(f"{caller} got no known cameras; the model has none")
+    return cameras
+
+
+def source_of_known(cameras: Mapping[str, Camera], refine: bool) -> dict[str, str]:
+    """What identifies the known cameras of a run."""
+    facts = [(n, c.K, c.R, c.t, c.size, c.lens_row, c.std) for n, c in sorted(cameras.items())]
+    return {"name": "known cameras", "digest": key_of(facts, refine)}
+
+
+def given_cameras(
+    cameras: Mapping[str, Camera], inputs: ImageSet, *, refine: bool, of_images: bool = False
+) -> GivenCameras:
+    """The known cameras of the images that were read; UsageError if they do not fit.
+
+    ``of_images``: they were estimated from these images.
+    """
+    found = [cameras.get(image.name) for image in inputs.images]
+    if not any(found) and inputs.images:
+        names = f"the first image is {inputs.images[0].name}, the first camera that of {next(iter(cameras))}"
+        raise UsageError(f"no image has a known camera: {names}")
+    for image, camera in zip(inputs.images, found, strict=True):
+        if camera is not None and camera.size != image.original_size:
+            sizes = "{} x {} pixels, its known camera {} x {}".format(*image.original_size, *camera.size)
+            raise UsageError(f"{image.name} has {sizes}; scale the camera (Camera.scaled) to the image")
+    return GivenCameras.of(found, inputs.images, refine=refine, of_images=of_images)
 
 
 def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:

@@ -6,6 +6,7 @@ from typing import Unpack
 
 import numpy as np
 
+from thesisrecon.api.given import Model, given_cameras, known_by_name, source_of_known
 from thesisrecon.arrays import F64
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.config.text import Config, Pairs, Settings, build_config
@@ -22,8 +23,9 @@ from thesisrecon.results import RunResult
 def reconstruct(
     images: _images.ImageSource, out: str | Path, *, config: Config | None = None, preset: str | None = None,
     max_size: int | None = None, cameras: str | None = None, pairs: Pairs | None = None, set: Settings = (),
-    masks: str | Path | None = None, every: int | None = None, seed: int = 0,
-    progress: Progress | None = None, **options: Unpack[RunOptions],
+    masks: str | Path | None = None, every: int | None = None, known: Model | None = None,
+    refine: bool = False, seed: int = 0, progress: Progress | None = None,
+    **options: Unpack[RunOptions],
 ) -> RunResult:  # fmt: skip
     """Reconstruct metric cameras, points and a textured model from images of one scene.
 
@@ -50,6 +52,12 @@ def reconstruct(
         no features, no depth and no texture; transparent pixels of images give none either.
     every : int, optional
         Take the sharpest of each ``every`` frames; those of a video are written to ``out/00-frames``.
+    known : model, optional
+        Cameras that are known before, by image name, as for :func:`thesisrecon.compare_models`: of a robot,
+        of a phone, or of another program, in original pixels. The model is made in their frame and scale;
+        other images are registered to them.
+    refine : bool
+        Adjust known cameras to the images: their poses, and the intrinsics that have a standard deviation.
     seed : int
         Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
         workers.
@@ -111,16 +119,20 @@ def reconstruct(
     run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
     if masks is not None:
         run.masks_folder = _images.check_masks_folder(masks, run.images_folder)
+    cameras_known = None if known is None else known_by_name("reconstruct", known, until)
+    run.as_stored = cameras_known is not None and any(c.as_stored for c in cameras_known.values())
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
     source = None if frames is None else frames.identity
+    source = source if cameras_known is None else source_of_known(cameras_known, refine)
     with claimed(run, overwrite=overwrite, source=source):
         inputs = _read_inputs(run, frames or images, None if masks is None else Path(masks))
         listed = run.config.pairs
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             listed.check([image.name for image in inputs.images], inputs.refused)
-        job = Job(run, inputs, FromImages(), until, surface_required)
+        given = None if cameras_known is None else given_cameras(cameras_known, inputs, refine=refine)
+        job = Job(run, inputs, FromImages(), until, surface_required, given=given)
         return run_adopted(job, overwrite=overwrite, source=source)
 
 
@@ -142,7 +154,9 @@ def _read_inputs(run: Run, images: _images.ImageSource | FrameSource, masks: Pat
                 run.directory.path, run.workers.threads, run.workers.map_all, run.progress
             )
         size = run.config.images.max_size_px
-        inputs = _images.read_images(images, max_size_px=size, map_all=run.workers.map_all)
+        inputs = _images.read_images(
+            images, max_size_px=size, as_stored=run.as_stored, map_all=run.workers.map_all
+        )
         unused: list[str] = []
         if masks is not None:
             inputs, unused = _images.add_masks(inputs, masks, map_all=run.workers.map_all)

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -58,13 +58,21 @@ Until = Annotated[str | None, typer.Option("--until", help=_UNTIL_HELP)]
 _EXECUTOR_HELP = "Run workers as threads (local), as processes, or on a Dask cluster."
 _EXECUTORS = "local|processes|dask://HOST:PORT"
 Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
+_KNOWN_HELP = "Cameras that are known: cameras.json, COLMAP model, run, or another file of cameras."
+Known = Annotated[Path | None, common.folder_option(_KNOWN_HELP, "--known", metavar="MODEL")]
+_REFINE_HELP = "With --known and --into: adjust these cameras, too."
+Refine = Annotated[bool, typer.Option("--refine", help=_REFINE_HELP)]
+_INTO_HELP = "In place of -o: add the images to this finished run."
+Into = Annotated[Path | None, common.folder_option(_INTO_HELP, "--into", metavar="OUT")]
+Out = Annotated[Path | None, common.folder_option("Output folder.")]
 _OVERWRITE_HELP = "Replace another run, or changed result files, in the output folder."
 OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)]
 
 
 def reconstruct(
-    out: common.OutputFolder, images: Images = None, every: Every = None, source: Source = None,
-    images_folder: ImagesFolder = None, masks: Masks = None, preset: Preset = None, cameras: Cameras = None,
+    images: Images = None, out: Out = None, into: Into = None, every: Every = None, source: Source = None,
+    images_folder: ImagesFolder = None, masks: Masks = None, known: Known = None, refine: Refine = False,
+    preset: Preset = None, cameras: Cameras = None,
     config: Config = None, settings: Settings = None, seed: common.Seed = 0, threads: common.Threads = 0,
     max_size: common.MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
     overwrite: OverwriteRun = False,
@@ -74,14 +82,27 @@ def reconstruct(
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
     chosen |= {"max_size": max_size, "set": settings or [], "masks": masks}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
+    if (out is None) == (into is None):
+        raise UsageError(Notice("no-output-folder"))
+    if into is not None:
+        others = [*chosen.values(), source, images_folder, every, known, seed, overwrite]
+        if images is None or any(others):
+            raise UsageError(Notice("options-of-into"))
+        del options["overwrite"]
+        _run(images, into, {"refine": refine} | options, "add_images")
+        return
+    if refine and known is None:
+        raise UsageError("--refine adjusts the cameras of --known or --into; give one of them")
+    assert out is not None
+    chosen["seed"] = seed
     if source is None:
         if images is None or images_folder is not None:
             raise UsageError(Notice("no-source"))
-        _run(images, out, seed, chosen | options | {"every": every})
+        _run(images, out, chosen | options | {"every": every, "known": known, "refine": refine})
         return
-    if images is not None or chosen.pop("pairs") is not None or every is not None:
+    if images is not None or chosen.pop("pairs") is not None or every is not None or known is not None:
         raise UsageError(Notice("images-of-source"))
-    _run(source, out, seed, chosen | options | {"images": images_folder}, matched=True)
+    _run(source, out, chosen | options | {"images": images_folder}, "reconstruct_from_colmap")
 
 
 def demo(
@@ -92,19 +113,17 @@ def demo(
     from thesisrecon.io._images import demo_images
 
     options = {"threads": threads or None, "overwrite": overwrite}
-    _run(demo_images(), out, 0, {"set": _DEMO_SETTINGS} | options)
+    _run(demo_images(), out, {"set": _DEMO_SETTINGS} | options)
 
 
-def _run(source: Any, out: Path, seed: int, options: Mapping[str, Any], *, matched: bool = False) -> None:
-    from thesisrecon.api import from_matches, reconstruct
+def _run(source: Any, out: Path, options: Mapping[str, Any], call: str = "reconstruct") -> None:
+    import thesisrecon
 
-    function: Callable[..., Any] = reconstruct.reconstruct
-    if matched:
-        function = from_matches.reconstruct_from_colmap
+    function, given = getattr(thesisrecon, call), (out, source) if call == "add_images" else (source, out)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"repeat the command to resume from {printable(str(out))}"
     with common.interruptible(advice), common.progress_bars() as progress:
-        result = function(source, out, seed=seed, progress=progress, **options)
+        result = function(*given, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
 
 
@@ -313,12 +332,13 @@ def export(
         found, report = align_to_positions(found, align)
         typer.echo("\n".join(map(printable, str(report).splitlines())))
     with common.interruptible("repeat the command to write all files"):
-        images, lost = images or recorded_images(model), list[str]()
+        lost = list[str]()
         if masks is None:
             masks, lost = recorded_masks(model, to)
         written = write_export(
-            found, folder, to=to, images=images, masks=masks, threads=threads, overwrite=overwrite
-        )
+            found, folder, to=to, images=images or recorded_images(model), masks=masks, threads=threads,
+            overwrite=overwrite,
+        )  # fmt: skip
     for note in (*lost, *written.notes):
         typer.echo(f"note: {note}")
     typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")

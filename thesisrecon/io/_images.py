@@ -157,9 +157,16 @@ def _common_folder(files: Sequence[Path]) -> tuple[Path, bool]:
     return Path(folder), len({file.name for file in files}) < len(files)
 
 
-def find_images(folder: Path, names: Sequence[str]) -> list[Path]:
-    """Locate image files by name, which may have subfolders, in a folder; UsageError if one is missing."""
-    listed = dict(_named_items(folder))
+def files_by_name(source: ImageSource) -> dict[str, str]:
+    """Absolute paths of the files of images by their names."""
+    found = {name: item for name, item in _named_items(source) if isinstance(item, Path)}
+    return {name: str(path.absolute()) for name, path in found.items()}
+
+
+def find_images(source: str | Path | Mapping[str, str], names: Sequence[str]) -> list[Path]:
+    """Locate image files by name, with subfolders, in a folder or a list; UsageError if one is missing."""
+    folder = Path() if isinstance(source, Mapping) else Path(source)
+    listed = source if isinstance(source, Mapping) else dict(_named_items(folder))
     paths = [Path(listed.get(name, folder / name)) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if not path.is_file()]
     if missing:
@@ -185,13 +192,17 @@ def read_image(source: Any, *, max_size_px: int, as_stored: bool = False) -> Ima
 
 
 def read_images(
-    source: ImageSource, *, max_size_px: int, as_stored: bool = False, map_all: MapAll = map,
+    source: ImageSource | Mapping[str, Any], *, max_size_px: int, as_stored: bool = False,
+    map_all: MapAll = map,
 ) -> ImageSet:  # fmt: skip
-    """Read all images of a folder or a list, reduced to ``max_size_px``; unusable ones get a reason.
+    """Read all images of a folder, a list or by name, reduced to ``max_size_px``; unusable ones get a reason.
 
     ``map_all`` is an ordered map, perhaps of a thread pool. Files are rotated upright unless ``as_stored``.
     """
-    items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
+    if isinstance(source, Mapping):
+        items = list(source.items())
+    else:
+        items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
         if not is_image_name(item[0]):

@@ -191,6 +191,37 @@ class OverlapEstimate:
         return _subsets(features.seeds)
 
 
+@dataclass(frozen=True)
+class PairsOfAdded:
+    """The pairs of a run, and those that add images to it: with the most overlap evidence for each new image.
+
+    Parameters
+    ----------
+    before : ndarray (M, 2)
+        Pairs of the first ``count`` images.
+    count : int
+    """
+
+    before: I64
+    count: int
+
+    def select(
+        self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator
+    ) -> PairChoice:
+        """See `thesisrecon.config.PairSelector.select`."""
+        usual, n = OverlapEstimate(), len(names)
+        new = _pair_array((i, j) for j in range(self.count, n) for i in range(j))
+        if all(found.seeds is not None for found in features):
+            subsets = [_subsets(found.seeds) for found in features if found.seeds is not None]
+            evidence = np.array(map_all(lambda p: _evidence(subsets[p[0]], subsets[p[1]]), new.tolist()))
+            rank = np.where(new >= self.count, _ranks(new, evidence, n).T, n)
+            best = (rank < usual.most).any(axis=1) & (evidence >= usual.min_evidence)
+            new = new[best | (rank < usual.nearest).any(axis=1)]
+        return PairChoice(
+            _pair_array([*self.before, *new]), "the pairs of the run, and the best of each new image"
+        )
+
+
 def _most_similar(words: scipy.sparse.csr_array, count: int) -> I64:
     """Pairs (M, 2), sorted, of each image with the ``count`` most similar ones by word weights (N, W)."""
     n, pairs, inverted = words.shape[0], list[F64](), words.T.tocsr()

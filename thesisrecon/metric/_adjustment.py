@@ -121,7 +121,7 @@ class MetricAdjustment:
         moves, options = self.free(model), self.options(model, iterations=iterations, settled=settled)
         moves = moves if free is None else moves & free[: len(moves)]
         result = refine_metric_bundle(
-            model.cameras, model.X, _inlier_observations(model), free=moves,
+            model.cameras, model.X, inlier_observations(model), free=moves,
             prior=self.row_prior(model), options=options, fixed=fixed,
         )  # fmt: skip
         model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)
@@ -137,7 +137,7 @@ class MetricAdjustment:
     def linearised(self, model: MetricEstimate) -> LinearisedFit:
         """The linearised adjustment of a model at its minimum."""
         noise = self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
-        seen, free, prior = _inlier_observations(model), self.free(model), self.row_prior(model)
+        seen, free, prior = inlier_observations(model), self.free(model), self.row_prior(model)
         return linearise_fit(model.cameras, model.X, seen, free=free, prior=prior, noise=noise)
 
 
@@ -149,7 +149,7 @@ def _shares_a_lens(model: MetricEstimate) -> B8:
     return np.asarray(views[lens] >= 3)
 
 
-def _inlier_observations(model: MetricEstimate) -> Observations:
+def inlier_observations(model: MetricEstimate) -> Observations:
     t, k = model.tracks, np.flatnonzero(model.inlier)
     if len(k) < MIN_OBSERVATIONS:
         raise StageFailure.of("few-metric-inliers", counted(len(k), "inlier observation"), MIN_OBSERVATIONS)

@@ -26,7 +26,7 @@ from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.optimize.least_squares import MAD_FACTOR, noise_from_distances
-from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, SelfCalibration, common_points
+from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, common_points
 
 MIN_OBSERVATIONS = 30
 MIN_INLIER_RATIO, MIN_CONFIRMED_RATIO = 0.5, 0.6
@@ -221,14 +221,17 @@ def _own_camera(model: _model.MetricEstimate, view: int, index: I64) -> tuple[fl
 
 
 def self_check(
-    model: _model.MetricEstimate, calibration: SelfCalibration, intervals: Intervals, *, sigmas: float
+    model: _model.MetricEstimate, initial: F64, intervals: Intervals, *, sigmas: float
 ) -> SelfCheck:
-    """Check a metric model (chapter 7); ``intervals`` as in ``MetricResult``, ``sigmas``: inlier gate."""
+    """Check a metric model (chapter 7); ``initial`` K (V, 3, 3) of self-calibration, zeros where it had none.
+
+    ``intervals`` are as in ``MetricResult``, ``sigmas`` is the gate of inliers.
+    """
     views = np.flatnonzero(model.registered).tolist()
     longest = model.sizes[views].max(axis=1)
     rows = model.cameras.intrinsics[model.cameras.group[views]]
     near = triangulable_observations(model)
-    before = calibration.K[views, 0, 0]
+    before = initial[views, 0, 0]
     both = before > 0
     focals = [intervals[v]["focal_px"] for v in views]
     agree, noise = _model.inlier_mask(model, sigmas=sigmas), _model.residual_norms(model)

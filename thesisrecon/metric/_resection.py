@@ -72,12 +72,12 @@ def _grow(
     share, rounds, adjusted = 0.0, 0, model.registered
     while True:
         before = model.registered
-        model, rejected = _register_missing(model, rng, allowed, rows)
+        model, rejected = register_next(model, rng, allowed, rows)
         joined = model.registered & ~before
         # Of many views everything is adjusted when the number of cameras has grown by a fifth.
         grown = model.registered.sum() > 1.2 * adjusted.sum()
         if joined.any() and not grown and adjusted.sum() > MANY_VIEWS:
-            model = _adjust_window(model, adjustment, joined)
+            model = adjust_window(model, adjustment, joined)
             continue
         if joined.any():
             model = _model.retriangulate_tracks(model, sigmas=EARLY_SIGMAS)
@@ -91,7 +91,7 @@ def _grow(
             return model, rejected
 
 
-def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B8) -> MetricEstimate:
+def adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B8) -> MetricEstimate:
     """Triangulate the points of some views and adjust both; other cameras and shared intrinsics are fixed."""
     t, cameras = model.tracks, model.cameras
     points = np.unique(t.point_index[views[t.view_index]])
@@ -112,7 +112,7 @@ def _adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B
     return replace(model, cameras=part.cameras, X=X, valid=valid, inlier=inlier)
 
 
-def _register_missing(
+def register_next(
     model: MetricEstimate, rng: np.random.Generator, allowed: B8, rows: list[I64]
 ) -> tuple[MetricEstimate, dict[int, str]]:
     """Register every ``allowed`` view that sees enough, those of few points if no other is registered."""

@@ -42,7 +42,7 @@ _COLUMNS = {
 }  # fmt: skip
 
 
-def _columns(width: int) -> Mapping[str, int]:
+def intrinsic_columns(width: int) -> Mapping[str, int]:
     """Columns by name of a table of ``width`` columns."""
     return {name: column for name, column in _COLUMNS.items() if column < width}
 
@@ -203,7 +203,7 @@ def intrinsic_intervals(
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]
         row = model.cameras.intrinsics[g]
-        for name, column in _columns(len(row)).items():
+        for name, column in intrinsic_columns(len(row)).items():
             value, variance = float(row[column]), float(scatter.variance[g, column])
             if not variance > 0.0:
                 intervals[name] = IntrinsicInterval(value, 0.0, "assumed")
@@ -271,7 +271,7 @@ def pose_std(
     number = poses.number
     std = np.sqrt(np.diag(poses.covariance))
     for view in poses.views:
-        for name, column in _columns(number.shape[1]).items():
+        for name, column in intrinsic_columns(number.shape[1]).items():
             unknown = number[model.cameras.group[view], column]
             if unknown >= 0:
                 own = intervals[view][name]

@@ -119,7 +119,7 @@ def _assess(
     poses = _uncertainty.pose_std(model, uncertainty, scatter, intervals)
     intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
     model = complete
-    checked = self_check(model, calibration, intervals, sigmas=LATE_SIGMAS)
+    checked = self_check(model, calibration.K, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.
     start = [] if enlarged or adjustment.prior.lens is not None else _contradiction(calibration)
     failed_checks = [*([] if report.identifiable else report.sentences), *start, *checked.failed]
@@ -131,7 +131,7 @@ def _assess(
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
     warnings += undetermined_lens(model, intervals, motion)
     result = records.MetricResult(
-        _as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
+        as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
         tuple(failed_checks), warnings, (*enlarged, *checked.limitations), report, poses,
     )  # fmt: skip
     return result, checked.doubtful
@@ -250,7 +250,7 @@ def _no_candidate(prior: records.IntrinsicsPrior, tried: int) -> StageFailure:
     )
 
 
-def _as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> records.Reconstruction:
+def as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> records.Reconstruction:
     registered = model.registered
     P = np.where(registered[:, None, None], model.cameras.P, 0.0)
     K = np.where(registered[:, None, None], model.cameras.K, 0.0)

@@ -25,6 +25,7 @@ from thesisrecon.pipeline.stages import (
     build_model,
     estimate_depth_maps,
     known_cameras,
+    metric_of_given,
     model_among,
     reconstruct_projective,
     refine_metric,
@@ -75,15 +76,22 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
     tracks = front.track(job, views, pairs)
     yield (result := replace(result, tracks=tracks))
 
+    # Cameras that are given leave nothing to chapters 6 and 7 but the points, and the other images.
+    if job.given is not None:
+        yield (result := replace(result, metric=metric_of_given(job, tracks, pairs)))
+        assert result.metric is not None
+        report_metric(job, result.metric)
+
     # Chapter 6: projective cameras and points.
-    if until == "projective":
+    elif until == "projective":
         yield (result := replace(result, projective=reconstruct_projective(job, tracks, pairs)))
         report_projective(job, result)
         return
 
     # Chapter 7: self-calibration and metric refinement.
-    for found in metric_cameras(job, result, views, pairs):
-        yield (result := found)
+    else:
+        for found in metric_cameras(job, result, views, pairs):
+            yield (result := found)
     if until == "metric":
         return
 
@@ -203,7 +211,8 @@ def pairs_of_group(job: Job, pairs: Sequence[TwoView]) -> Sequence[TwoView]:
 
 def groups_of(job: Job, pairs: Sequence[TwoView]) -> list[list[int]]:
     """The groups of images that accepted pairs connect, the largest first; none if there is only one."""
-    if not (job.front.divides and job.config.images.groups and any(pair.accepted for pair in pairs)):
+    divides = job.front.divides and job.config.images.groups and job.given is None
+    if not (divides and any(pair.accepted for pair in pairs)):
         return []
     groups = image_groups(len(job.images), pairs)
     return groups if len(groups) > 1 else []
@@ -267,7 +276,7 @@ def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
     """The groups of images that the model of this job leaves over; none without a model."""
     model = result.best_reconstruction
     # A projective run may end at the core of a large set.
-    if model is None or not model.registered.any() or job.until == "projective":
+    if model is None or not model.registered.any() or job.until == "projective" or job.given is not None:
         return []
     pairs = pairs_of_group(job, result.pairs)
     return image_groups(len(job.images), pairs, ~model.registered) if job.config.images.groups else []

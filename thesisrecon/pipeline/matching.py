@@ -24,7 +24,12 @@ from thesisrecon.imaging.on_demand import RecentlyUsed
 from thesisrecon.matching._prepared import select_found, strongest_corners, strongest_share
 from thesisrecon.matching._seeds import seed_matches
 from thesisrecon.matching.growth import SeedsAndGrowth
-from thesisrecon.matching.pair_selection import connected_groups, pairs_to_connect, reject_repeated_structure
+from thesisrecon.matching.pair_selection import (
+    PairsOfAdded,
+    connected_groups,
+    pairs_to_connect,
+    reject_repeated_structure,
+)
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
 from thesisrecon.pipeline.large_sets import has_narrow_cut, tracks_of_part
@@ -151,9 +156,15 @@ def _rejected_pair(pair: tuple[int, int], candidates: int, reason: str) -> TwoVi
 
 
 class FromImages:
-    """The front end that computes everything from the images."""
+    """The front end that computes everything from the images.
+
+    ``pairs`` replaces the method of the settings.
+    """
 
     divides = True
+
+    def __init__(self, pairs: PairsOfAdded | None = None) -> None:
+        self.pairs = pairs
 
     def detect(self, job: Job) -> Sequence[Features]:
         """Detect the features of all images."""
@@ -180,9 +191,10 @@ class FromImages:
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
         """Select the pairs of images to match."""
         run, names = job.run, job.names
-        key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed)
+        more = [] if self.pairs is None else [self.pairs.before, self.pairs.count, code_digest(self.pairs)]
+        key = run.key("pairs", run.variant_key("pairs"), names, run.logs["features"].keys, run.seed, *more)
         run.progress("pairs", 0, 1)
-        select, rng = job.config.pairs.select, stream(run.seed, "pairs")
+        select, rng = (self.pairs or job.config.pairs).select, stream(run.seed, "pairs")
         compute = partial(select, names, features, map_all=run.workers.map_all, rng=rng)
         choice: PairChoice = run.cached("pairs", "choice", key, compute)
         report_choice(job, choice)
@@ -194,13 +206,18 @@ class FromImages:
         run, matching = job.run, job.config.matching
         if not isinstance(matching, SeedsAndGrowth) or len(job.images) < MIN_GROUP:
             return None
-        digests, prior = [image.digest for image in job.inputs.decoded], job.prior
+        # Of images that are added to a run, those of the run were asked before.
+        n, prior = len(job.images) if self.pairs is None else self.pairs.count, job.prior
+        digests = [image.digest for image in job.inputs.decoded[:n]]
         variants = [run.variant_key(stage) for stage in ("features", "matching")]
         variants.append([code_digest(estimate_division, seed_matches)])
-        key = run.key("pairs", "lens", digests, variants, prior.shared[:, 5], prior.std[:, 5], run.seed)
+        key = run.key("pairs", "lens", digests, variants, prior.shared[:n, 5], prior.std[:n, 5], run.seed)
         found = run.stored("pairs", "lens", key) or {"lens": self._lens(job, matching)}
         lens: F64 | None = run.cached("pairs", "lens", key, lambda: found)["lens"]
-        return lens
+        if lens is None or len(lens) == len(job.images):
+            return lens
+        peers = [np.flatnonzero(prior.shared[:n, 5] == number) for number in prior.shared[n:, 5]]
+        return np.vstack([lens, *(lens[own[0]] if len(own) else np.zeros(lens.shape[1]) for own in peers)])
 
     def _lens(self, job: Job, matching: SeedsAndGrowth) -> F64 | None:
         features = self.detect(job)

@@ -63,7 +63,8 @@ def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFail
     result, stages = with_image_names(result), get_args(Until)
     there = read_json(run.directory.path / SUMMARY)
     later = there.get("until") if isinstance(there, dict) and not there.get("failure") else None
-    if failure is not None or later not in stages[stages.index(until) + 1 :]:
+    longer = later in stages[stages.index(until) + 1 :] and not run.directory.continues
+    if failure is not None or not longer:
         return _write(run, result, until, failure)
     # An earlier, longer run in this folder.
     run.warnings.append(Notice("older-outputs", later, "its summary and report are kept"))
@@ -204,7 +205,9 @@ def _write_exports(
     if projective is not None and calibration is not None:
         plane = calibration.plane_at_infinity
         affine = made("the affine points", lambda: upgrade_to_affine(projective, plane), warnings, None)
-    if affine is not None:
+    if affine is None:
+        directory.remove(["affine.ply"])
+    else:
         path, upgraded = directory.path / "affine.ply", affine
         made(path.name, lambda: write_affine(path, upgraded, point_colors(upgraded, images)), warnings, None)
     return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
@@ -253,6 +256,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "seed": run.seed,
         "until": until,
         "images_folder": None if run.images_folder is None else str(run.images_folder),
+        **({"images_elsewhere": run.images_elsewhere} if run.images_elsewhere else {}),
         **({} if run.masks_folder is None else {"masks_folder": str(run.masks_folder)}),
         **({"as_stored": True} if run.as_stored else {}),
         **({"groups": run.groups} if run.groups else {}),
@@ -321,7 +325,8 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         further_models=tuple(_further_models(folder, summary)),
     )  # fmt: skip
     attempts = list[RunResult]()
-    for item, model in stages["projective"].items():
+    # A run of known cameras has no projective model.
+    for item, model in (stages["projective"] or dict.fromkeys(stages["metric"])).items():
         # The last of the metric records of an attempt.
         found = [stages["metric"].get(f"{item}{suffix}") for suffix in ("-joined", "-more", "")]
         metric = next((record for record in found if record is not None), None)

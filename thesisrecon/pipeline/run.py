@@ -24,6 +24,7 @@ from thesisrecon.config.text import table_from_dataclass, tables_from_config
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.io._files import as_path, read_json
 from thesisrecon.io._images import ImageSet
+from thesisrecon.metric.given_cameras import GivenCameras
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
 from thesisrecon.runtime import _run_folder
 from thesisrecon.runtime._executors import Workers, available_threads
@@ -83,6 +84,7 @@ class Run:
     title: str  #: title of the report
     images_folder: Path | None = None  #: folder of all images; None: several folders, or images in memory
     masks_folder: Path | None = None
+    images_elsewhere: dict[str, str] = field(default_factory=dict)  #: files by name outside of that folder
     as_stored: bool = False  #: pixels are those of the files without EXIF rotation, as in COLMAP
     logs: dict[str, _StageLog] = field(default_factory=dict, init=False)
     reports: dict[str, StageReport] = field(default_factory=dict, init=False)
@@ -269,6 +271,8 @@ class Job:
     surface_required: bool = False  # whether a surface that fails is a failure; otherwise it is a warning
     known: IntrinsicsPrior | None = None
     """Prior of the intrinsics, if another model determined them."""
+    given: GivenCameras | None = None
+    """Cameras that are known before, in whose frame the model is."""
 
     @property
     def config(self) -> PipelineConfig:

@@ -21,6 +21,7 @@ from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.matching.pair_selection import reject_repeated_structure
+from thesisrecon.metric.given_cameras import metric_from_given
 from thesisrecon.pipeline.large_sets import align_parts, calibrate_with_core, from_metric, tracks_of_part
 from thesisrecon.pipeline.lens import straight_pair, straight_tracks
 from thesisrecon.pipeline.matching import build_tracks
@@ -92,6 +93,22 @@ def refine_metric(
     return _cached(
         job, "metric", attempt, [job.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], upstream],
         lambda rng: job.config.metric.refine(start, calibration, prior=prior, rng=rng, threads=threads),
+    )  # fmt: skip
+
+
+def metric_of_given(job: Job, tracks: Tracks, pairs: Sequence[TwoView]) -> MetricResult:
+    """Triangulate the points of given cameras, and register the other images in their frame."""
+    given, prior, threads = job.given, job.prior, job.run.workers.threads
+    assert given is not None
+    noise = float(np.median([pair.sigma_px for pair in pairs if pair.accepted]))
+    upstream = [job.run.logs["tracks"].keys, job.sizes, prior.shared, prior.mean, prior.std]
+    facts = [given.known, given.R, given.t, given.intrinsics, given.std, given.refine, noise]
+    code = code_digest(metric_from_given)
+    return _cached(
+        job, "metric", 0, [upstream, facts, code],
+        lambda rng: metric_from_given(
+            given, tracks, job.sizes, noise_px=noise, prior=prior, rng=rng, threads=threads
+        ),
     )  # fmt: skip
 
 

@@ -142,8 +142,6 @@ class StageFolder:
 
     def load(self, item: str, key: str) -> Any:
         """The record of an item, from this run or the shared folder; None if it must be computed."""
-        if self.trial:
-            return self.kept.get(key)
         own, changed = self.path / f"{item}.npz", None
         for place in [own] if self.shared is None else [own, self.shared / f"{key}.npz"]:
             try:
@@ -152,12 +150,12 @@ class StageFolder:
                 changed = error
                 continue
             if record is not None:
-                if place != own:
+                if place != own and not self.trial:
                     _files.link(place, own)
                 return record
         if changed is not None:
             raise changed
-        if (record := self.kept.get(key)) is not None:
+        if (record := self.kept.get(key)) is not None and not self.trial:
             self.save(item, key, record)
         return record
 
@@ -213,6 +211,8 @@ class RunDirectory:
     shared: Path | None = None
     part: bool = False  #: of a group, in the folder of the whole run
     trial: bool = False  #: nothing is written; the run in a folder that repeats it takes what is kept
+    #: a run of more images takes the place of the one in the folder, whose files it keeps
+    continues: bool = False
     kept: dict[str, Any] = field(default_factory=dict)  #: records by key that trial runs computed
 
     def stage(self, folder: str) -> StageFolder:
@@ -222,6 +222,8 @@ class RunDirectory:
 
     def mark(self, stage: StageFolder, item: str) -> None:
         """Set the time of a reused record to that of this run, so that only unused records are older."""
+        if self.trial:
+            return
         with suppress(OSError):
             path, start = stage.path / f"{item}.npz", (self.path / RUN_FILE).stat().st_mtime_ns
             if path.stat().st_mtime_ns < start:
@@ -254,7 +256,7 @@ class RunDirectory:
 
     def adopt(self, identity: Mapping[str, Any], *, overwrite: bool, results: Sequence[str] = ()) -> None:
         """Resume the same run in the claimed folder, or replace another one and remove its ``results``."""
-        if self._check(identity, overwrite, self._outputs):
+        if self._check(identity, overwrite, self._outputs) and not self.continues:
             self.remove(results)
         # A resumed run keeps its file and time: its records are not older.
         if _files.read_json(self.path / RUN_FILE) != _files.as_read(identity):
@@ -284,7 +286,7 @@ class RunDirectory:
         if isinstance(there, dict):
             there = {name: value for name, value in there.items() if name in (*identity, "source")}
         difference = difference or next(_differences(there, _files.as_read(identity)), "")
-        if difference and not overwrite:
+        if difference and not overwrite and not self.continues:
             raise UsageError(Notice("another-run", self.path, difference))
         return bool(difference)
 

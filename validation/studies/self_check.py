@@ -190,7 +190,7 @@ def judge(
         return None
     focals = model.cameras.intrinsics[model.cameras.group, 0]
     stated = [{"focal_px": IntrinsicInterval(float(focal), 0.0, "")} for focal in focals]
-    failed = sharing.failed_checks or self_check(model, calibration, stated, sigmas=LATE)[1]
+    failed = sharing.failed_checks or self_check(model, calibration.K, stated, sigmas=LATE)[1]
     return is_wrong(model, right), bool(failed or contradicted_focal_priors(model, adjustment))
 
 
