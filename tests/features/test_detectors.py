@@ -193,20 +193,19 @@ def test_a_simulated_view_shows_each_pixel_where_it_says(enlargement):
 
 
 @pytest.mark.parametrize("trace_weight", [0.0, 0.04])
-@pytest.mark.parametrize("derivative", [(-0.5, 0.0, 0.5), (0.1, -0.8, 0.0, 0.8, -0.1)])
 @pytest.mark.parametrize("count", [1, 3])
-def test_corner_response_is_that_of_the_moments_summed_over_the_channels(trace_weight, derivative, count):
+def test_corner_response_is_that_of_the_mean_moments_of_the_channels(trace_weight, count):
     channels = np.stack([texture(60, 83, seed).astype(np.float32) for seed in range(count)])
-    taps, along = gaussian_taps(1.5), np.array(derivative, np.float32)
-    found = harris.corner_response(channels, along, taps, trace_weight)
-    gx, gy = (correlate1d(channels.astype(np.float64), along, axis=axis) for axis in (2, 1))
+    taps = gaussian_taps(1.5)
+    found = harris.corner_response(channels, 1.5, trace_weight)
+    gx, gy = (correlate1d(channels.astype(np.float64), (-0.5, 0.0, 0.5), axis=axis) for axis in (2, 1))
     a, m, c = (
-        convolve1d(convolve1d(product.sum(axis=0), taps, axis=0), taps, axis=1)
+        convolve1d(convolve1d(product.mean(axis=0), taps, axis=0), taps, axis=1)
         for product in (gx * gx, gx * gy, gy * gy)
     )
     noble = (a * c - m * m) / (a + c + 1e-6)
     twin = a * c - m * m - trace_weight * (a + c) ** 2 if trace_weight else noble
-    border = len(taps) // 2 + len(along) // 2
+    border = len(taps) // 2 + 1
     inside = (slice(border, -border), slice(border, -border))
     assert np.abs(found[inside] - twin[inside]).max() < 1e-4 * np.abs(twin).max()
     assert not found[:border].any()

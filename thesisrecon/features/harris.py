@@ -14,79 +14,34 @@ from thesisrecon.imaging.resampling import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
 
-@kernel(fastmath=FAST)
-def corner_response(channels: F32, derivative: F32, taps: F32, trace_weight: float) -> F32:
+def corner_response(channels: F32, sigma_px: float, trace_weight: float) -> F32:
     """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
 
-    M holds the products of the gradients sum_k derivative[k] I(x + k) of ``channels`` (C, H, W), summed and
-    smoothed by ``taps``; ``trace_weight``: 0 for det M / trace M, else k of det M - k (trace M)^2. Only the
-    last rows are kept.
+    M holds the products of the gradients of ``channels`` (C, H, W), their mean smoothed by a Gaussian;
+    ``trace_weight``: 0 for det M / trace M, else k of det M - k (trace M)^2.
     """
-    count, height, width = channels.shape
-    reach, size = derivative.size // 2, taps.size
-    out = zeros((height, width), np.float32)
-    ring = zeros((size, 3, width), np.float32)
-    slope = empty((2, width), np.float32)
-    column = empty((3, width), np.float32)
+    gx, gy = np.zeros((2, *channels.shape), np.float32)
+    gx[:, :, 1:-1] = np.float32(0.5) * (channels[:, :, 2:] - channels[:, :, :-2])
+    gy[:, 1:-1] = np.float32(0.5) * (channels[:, 2:] - channels[:, :-2])
+    moments = [smooth((p * q).mean(axis=0), sigma_px) for p, q in ((gx, gx), (gx, gy), (gy, gy))]
+    response: F32 = _measure(np.stack(moments), trace_weight, len(gaussian_taps(sigma_px)) // 2 + 1)
+    return response
+
+
+@kernel(fastmath=FAST)
+def _measure(moments: F32, trace_weight: float, border: int) -> F32:
+    """R (H, W) of the entries of M (3, H, W), zero in the border."""
+    _, height, width = moments.shape
+    response = zeros((height, width), np.float32)
     moment = empty((3, width), np.float32)
-    border = size // 2 + reach
-    for y in range(reach, height - reach):
-        products = ring[y % size]
-        products[:] = np.float32(0.0)
-        for c in range(count):
-            _slopes(channels[c], derivative, y, slope)
-            _add_products(slope, reach, products)
-        if y < size + reach - 1:
-            continue
-        column[:] = np.float32(0.0)
-        for k in range(size):
-            earlier = ring[(y - size + 1 + k) % size]
-            weight = taps[k]
-            for m in range(3):
-                source, target = earlier[m], column[m]
-                for x in range(width):
-                    target[x] += weight * source[x]
-        moment[:] = np.float32(0.0)
-        for m in range(3):
-            target = moment[m, border:]
-            for k in range(size):
-                weight = taps[k]
-                # Slices that start at the first read avoid checks for negative indices in the loops.
-                source = column[m, k + reach :]
-                for x in range(width - 2 * border):
-                    target[x] += weight * source[x]
-        _measure(moment[:, border:], width - 2 * border, trace_weight, out[y - size // 2, border:])
-    return out
+    for y in range(border, height - border):
+        moment[:] = moments[:, y]
+        _measure_row(moment[:, border:], width - 2 * border, trace_weight, response[y, border:])
+    return response
 
 
 @kernel(fastmath=FAST, forceinline=True)
-def _slopes(image: F32, derivative: F32, y: int, out: F32) -> None:
-    """Row y of the derivatives of ``image`` along x and y, from column ``len(derivative) // 2`` on."""
-    reach, width = derivative.size // 2, image.shape[1]
-    out[:] = np.float32(0.0)
-    along, across = out[0, reach:], out[1, reach:]
-    for k in range(derivative.size):
-        weight = derivative[k]
-        if weight == 0.0:
-            continue
-        beside, below = image[y, k:], image[y + k - reach, reach:]
-        for x in range(width - 2 * reach):
-            along[x] += weight * beside[x]
-            across[x] += weight * below[x]
-
-
-@kernel(fastmath=FAST, forceinline=True)
-def _add_products(slope: F32, reach: int, out: F32) -> None:
-    gx, gy = slope[0, reach:], slope[1, reach:]
-    xx, xy, yy = out[0, reach:], out[1, reach:], out[2, reach:]
-    for x in range(slope.shape[1] - 2 * reach):
-        xx[x] += gx[x] * gx[x]
-        xy[x] += gx[x] * gy[x]
-        yy[x] += gy[x] * gy[x]
-
-
-@kernel(fastmath=FAST, forceinline=True)
-def _measure(moment: F32, count: int, trace_weight: float, out: F32) -> None:
+def _measure_row(moment: F32, count: int, trace_weight: float, out: F32) -> None:
     a, b, c = moment[0], moment[1], moment[2]
     if trace_weight == 0.0:
         for x in range(count):
@@ -220,12 +175,9 @@ class CornerMeasure:
 
     def _response(self, channels: F32) -> F32:
         """R (H, W), zero near the border."""
-        derivative = np.array([-0.5, 0.0, 0.5], np.float32)
         channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
-        # R of a grey image does not depend on ``colour``: the mean over the channels; taps are used twice.
-        taps = gaussian_taps(self.integration_sigma_px) / np.float32(np.sqrt(len(channels)))
         weight = self.harris_k if self.formula == "harris" else 0.0
-        return corner_response(channels, derivative, taps, weight)
+        return corner_response(channels, self.integration_sigma_px, weight)
 
     def _find(self, channels: F32) -> tuple[F64, F32]:
         """Corners (N, 2) above the noise and their responses (N,), strongest first; none in tiny images."""

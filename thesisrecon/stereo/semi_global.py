@@ -10,18 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thesisrecon._numba import copy_to, full, kernel, zeros
-from thesisrecon.arrays import F32, I16, U8, U64
+from thesisrecon._numba import copy_to, empty, full, kernel, zeros
+from thesisrecon.arrays import F32, I16, U8
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo import _cost, _postprocessing
 
 TOP = 127  #: upper limit of matching cost plus penalty: the sum of two opposite path costs then fits one byte
-Word8 = tuple[np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64, np.uint64]
-BLOCK = 192  #: rows transposed together for the horizontal paths; a multiple of 8
-TILE = 64  #: columns transposed together; a multiple of 8
-ODD = np.uint64(0x00FF00FF00FF00FF)
-ODD_PAIRS = np.uint64(0x0000FFFF0000FFFF)
-ODD_FOURS = np.uint64(0x00000000FFFFFFFF)
+BLOCK = 192  #: rows transposed together for the horizontal paths
+TILE = 64  #: rows and columns transposed together
 P1, P2, MIN_P2 = 0.43, 1.6, 0.65
 """Penalties of a disparity change of 1, of larger ones, and limit of the adapted P2, in maximal costs."""
 MAX_COST = int(TOP / (1.0 + P2))
@@ -109,85 +105,27 @@ def _sum_opposite(costs: U8, P2: U8, P1: np.uint8, total: U8) -> None:
 
 
 @kernel
-def _swap(a: np.uint64, b: np.uint64, shift: np.uint64, mask: np.uint64) -> tuple[np.uint64, np.uint64]:
-    apart = ((a >> shift) ^ b) & mask
-    return a ^ (apart << shift), b ^ apart
-
-
-@kernel
-def _transposed(rows: Word8) -> Word8:
-    """Transpose 8 x 8 bytes, one row per word: swap bytes, then pairs, then groups of four."""
-    one, two, four = np.uint64(8), np.uint64(16), np.uint64(32)
-    a, b, c, d, e, f, g, h = rows
-    a, b = _swap(a, b, one, ODD)
-    c, d = _swap(c, d, one, ODD)
-    e, f = _swap(e, f, one, ODD)
-    g, h = _swap(g, h, one, ODD)
-    a, c = _swap(a, c, two, ODD_PAIRS)
-    b, d = _swap(b, d, two, ODD_PAIRS)
-    e, g = _swap(e, g, two, ODD_PAIRS)
-    f, h = _swap(f, h, two, ODD_PAIRS)
-    a, e = _swap(a, e, four, ODD_FOURS)
-    b, f = _swap(b, f, four, ODD_FOURS)
-    c, g = _swap(c, g, four, ODD_FOURS)
-    d, h = _swap(d, h, four, ODD_FOURS)
-    return a, b, c, d, e, f, g, h
-
-
-@kernel
-def _load(words: U64, first: int, column: int) -> Word8:
-    """Words of eight rows from ``first`` on."""
-    part = words[first : first + 8, column]
-    return part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7]
-
-
-@kernel
-def _store(square: Word8, words: U64, first: int, column: int) -> None:
-    part = words[first : first + 8, column]
-    part[0], part[1], part[2], part[3] = square[0], square[1], square[2], square[3]
-    part[4], part[5], part[6], part[7] = square[4], square[5], square[6], square[7]
-
-
-@kernel
-def _transpose_rows(source: U8, out: U8) -> None:
-    """Transpose (N, D, W) to (W', D, N'), N <= BLOCK; W' and N' are the next multiples of 8."""
-    # Tiles avoid cache conflicts of row lengths that are multiples of a large power of two.
+def _transpose(source: U8, out: U8) -> None:
+    """Transpose (N, D, W) to (W, D, N)."""
+    # Tiles stay in the cache; their rows are longer than a power of two, which would map them to few lines.
     rows, n, width = source.shape
-    words = out.view(np.uint64)
-    tile = zeros((BLOCK, TILE // 8 + 1), np.uint64)
-    bytes_of = tile.view(np.uint8)
+    tile = empty((TILE, TILE + 8), np.uint8)
     for q in range(n):
-        plane = words[:, q]
-        for start in range(0, width, TILE):
-            size = min(TILE, width - start)
-            for y in range(rows):
-                copy_to(bytes_of[y, :size], source[y, q, start : start + size])
-            for x in range(0, size, 8):
-                for y in range(0, rows, 8):
-                    _store(_transposed(_load(tile, y, x >> 3)), plane, start + x, y >> 3)
-
-
-@kernel
-def _transpose_back(source: U8, out: U8) -> None:
-    """Inverse of :func:`_transpose_rows`."""
-    rows, n, width = out.shape
-    words = source.view(np.uint64)
-    tile = zeros((BLOCK, TILE // 8 + 1), np.uint64)
-    bytes_of = tile.view(np.uint8)
-    for q in range(n):
-        plane = words[:, q]
-        for start in range(0, width, TILE):
-            size = min(TILE, width - start)
-            for x in range(0, size, 8):
-                for y in range(0, rows, 8):
-                    _store(_transposed(_load(plane, start + x, y >> 3)), tile, y, x >> 3)
-            for y in range(rows):
-                copy_to(out[y, q, start : start + size], bytes_of[y, :size])
+        for top in range(0, rows, TILE):
+            high = min(TILE, rows - top)
+            for left in range(0, width, TILE):
+                wide = min(TILE, width - left)
+                for y in range(high):
+                    copy_to(tile[y, :wide], source[top + y, q, left : left + wide])
+                for x in range(wide):
+                    column = out[left + x, q, top : top + high]
+                    for y in range(high):
+                        column[y] = tile[y, x]
 
 
 def scratch_size(height: int, disparities: int, width: int) -> int:
     """Bytes of a block of transposed costs."""
-    return (width + 7) // 8 * 8 * disparities * ((min(height, BLOCK) + 7) // 8 * 8)
+    return width * disparities * min(height, BLOCK)
 
 
 @kernel
@@ -200,15 +138,14 @@ def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
     # Horizontal paths are sequential in x: transposed rows are vectorised over y.
     for start in range(0, height, BLOCK):
         rows = min(BLOCK, height - start)
-        wide, high = (width + 7) // 8 * 8, (rows + 7) // 8 * 8
-        transposed = scratch[0, : wide * n * high].reshape((wide, n, high))
-        summed = scratch[1, : wide * n * high].reshape((wide, n, high))
-        _transpose_rows(costs[start : start + rows], transposed)
-        p2 = zeros((width, high), np.uint8)
+        transposed = scratch[0, : width * n * rows].reshape((width, n, rows))
+        summed = scratch[1, : width * n * rows].reshape((width, n, rows))
+        _transpose(costs[start : start + rows], transposed)
+        p2 = zeros((width, rows), np.uint8)
         for y in range(rows):
             copy_to(p2[:, y], P2[0, start + y])
-        _sum_opposite(transposed[:width], p2, P1, summed[:width])
-        _transpose_back(summed, total[0, start : start + rows])
+        _sum_opposite(transposed, p2, P1, summed)
+        _transpose(summed, total[0, start : start + rows])
     _sum_opposite(costs, P2[1], P1, total[1])
 
 
