@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.stereo import _depth_fusion, _postprocessing
-from thesisrecon.stereo._cost import census, cost_volume, split_channels, support_masks
+from thesisrecon.stereo._cost import census, cost_volume, prepare_stereo_images, support_masks
 from thesisrecon.stereo.correspondence import Correspondence
 from thesisrecon.stereo.scanline import NO_MATCH, OCCLUDED, _solve_row
 from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
@@ -17,16 +17,13 @@ from thesisrecon.stereo.semi_global import adaptive_P2, scratch_size, sum_paths
 def random_side(rng, height=13, width=21, channels=3):
     values = rng.integers(0, 200, (channels, height, width)).astype(np.int16)
     valid = np.where(rng.random((height, width)) < 0.9, 255, 0).astype(np.uint8)
-    bits = np.empty((height, width), np.int32)
-    census(values.sum(axis=0, dtype=np.int16), bits)
-    return bits, values, valid
+    return census(np.pad(values.sum(axis=0, dtype=np.int16), 2, mode="edge")), values, valid
 
 
 def test_channels_and_census_of_valid_and_invalid_pixels():
     image = np.array([[[0.0, 255.0], [10.1, np.nan]], [[300.0, -4.0], [np.inf, 1.0]]], np.float32)
-    channels, grey = np.empty((2, 2, 2), np.int16), np.empty((2, 2), np.int16)
-    valid = np.empty((2, 2), np.uint8)
-    split_channels(image, channels, grey, valid)
+    side = prepare_stereo_images(image, image)[0]
+    channels, grey, valid = side.channels, side.grey, side.valid
     assert valid.tolist() == [[255, 0], [255, 0]]
     assert channels[0].tolist() == [[0, 40], [1020, 0]]
     assert channels[1].tolist() == [[1020, 0], [0, 4]]
@@ -87,8 +84,7 @@ def test_sums_of_paths(shape):
     height, _, width = shape
     costs = rng.integers(0, 49, shape).astype(np.uint8)
     grey = rng.integers(0, 3000, (height, width)).astype(np.int16)
-    jumps = np.empty((2, height, width), np.uint8)
-    adaptive_P2(grey, np.float32(70.0), np.float32(30.0), np.float32(200.0), jumps)
+    jumps = adaptive_P2(grey, 70.0, 30.0, 200.0)
 
     def penalty(y, x, v, u):
         return int(max(30.0, 70.0 * 200.0 / (200.0 + abs(int(grey[y, x]) - int(grey[v, u])))))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
-from thesisrecon.arrays import F32, I16, I32, U8, U16
+from thesisrecon.arrays import I16, I32, U8, U16
 
 LEVELS = 4  #: integer steps of one grey level: resampled images have fractional levels
 ARM = 2  #: maximal length of a support arm in pixels
@@ -64,12 +64,12 @@ def prepare_stereo_images(left: ArrayLike, right: ArrayLike) -> tuple[StereoImag
 def _side(image: NDArray[np.generic]) -> StereoImage:
     if image.ndim not in (2, 3) or 0 in image.shape or (image.ndim == 3 and image.shape[2] > 4):
         raise ValueError(f"an image must be (H, W) or (H, W, K) with K <= 4; got {image.shape}")
-    height, width, n = (*image.shape, 1)[:3]
-    channels, grey = np.empty((n, height, width), np.int16), np.empty((height, width), np.int16)
-    valid = np.empty((height, width), np.uint8)
-    levels = np.ascontiguousarray(image.reshape(height, width, n), dtype=np.float32)
-    split_channels(levels, channels, grey, valid)
-    return StereoImage(channels, grey, valid)
+    levels = np.moveaxis(image.reshape(*image.shape[:2], -1).astype(np.float32), 2, 0) * np.float32(LEVELS)
+    known = np.isfinite(levels)
+    levels = np.clip(np.where(known, levels, np.float32(0.0)), np.float32(0.0), np.float32(255.0 * LEVELS))
+    channels = np.ascontiguousarray(levels + np.float32(0.5)).astype(np.int16)
+    valid = np.where(known.all(axis=0), 255, 0).astype(np.uint8)
+    return StereoImage(channels, channels.sum(axis=0, dtype=np.int16), valid)
 
 
 def estimate_noise(image: StereoImage) -> float:
@@ -103,49 +103,25 @@ def _count_ones(word: np.int32) -> np.uint32:
 
 
 @kernel
-def split_channels(image: F32, channels: I16, grey: I16, valid: U8) -> None:
-    """Convert grey levels (H, W, K), NaN = no pixel, to integer channels, their sum, and 255 if valid."""
-    height, width, n = image.shape
-    top = np.float32(255.0 * LEVELS)
-    for y in range(height):
-        for x in range(width):
-            valid[y, x] = 255
-            total = np.int16(0)
-            for k in range(n):
-                level = image[y, x, k] * np.float32(LEVELS)
-                if not np.isfinite(level):
-                    valid[y, x] = 0
-                    level = np.float32(0.0)
-                whole = np.int16(min(max(level, np.float32(0.0)), top) + np.float32(0.5))
-                channels[k, y, x] = whole
-                total = np.int16(total + whole)
-            grey[y, x] = total
-
-
-@kernel
 def _compare(centre: I16, other: I16, bits: I32) -> None:
     for x in range(len(centre)):
         bits[x] = np.int32(bits[x] << 1) | np.int32(other[x] < centre[x])
 
 
 @kernel
-def census(grey: I16, bits: I32) -> None:
-    """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
-    reach = 2  # Radius of the census window: 5 x 5 pixels, 24 comparisons
-    height, width = grey.shape
-    padded = empty((2 * reach + 1, width + 2 * reach), np.int16)
-    bits[:] = 0
+def census(padded: I16) -> I32:
+    """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre.
+
+    Of an image that is padded by two pixels: windows of 5 x 5 pixels, 24 comparisons.
+    """
+    height, width = padded.shape[0] - 4, padded.shape[1] - 4
+    bits = zeros((height, width), np.int32)
     for y in range(height):
-        for dy in range(-reach, reach + 1):
-            row = padded[dy + reach]
-            source = grey[min(max(y + dy, 0), height - 1)]
-            copy_to(row[reach : reach + width], source)
-            row[:reach] = source[0]
-            row[reach + width :] = source[width - 1]
-        for dy in range(2 * reach + 1):
-            for dx in range(2 * reach + 1):
-                if dx != reach or dy != reach:
-                    _compare(grey[y], padded[dy, dx : dx + width], bits[y])
+        for k in range(25):
+            if k != 12:
+                beside = padded[y + k // 5, k % 5 : k % 5 + width]
+                _compare(padded[y + 2, 2 : 2 + width], beside, bits[y])
+    return bits
 
 
 @kernel

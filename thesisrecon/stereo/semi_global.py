@@ -24,28 +24,18 @@ MAX_COST = int(TOP / (1.0 + P2))
 """Maximal matching cost: the largest for which cost and penalty fit one byte."""
 
 
-@kernel
-def _adapt_P2(a: I16, b: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
-    for x in range(len(out)):
-        apart = np.float32(a[x]) - np.float32(b[x])
-        apart = -apart if apart < 0 else apart
-        p2 = largest * scale / (scale + apart)
-        out[x] = np.uint8(least if p2 < least else p2)
-
-
-@kernel(error_model="numpy")
-def adaptive_P2(grey: I16, largest: np.float32, least: np.float32, scale: np.float32, out: U8) -> None:
+def adaptive_P2(grey: I16, largest: float, least: float, scale: float) -> U8:
     """Penalties P2 (2, H, W) from the left and the upper neighbour of each pixel.
 
     They decrease with the intensity step, ``largest`` / (1 + step / ``scale``), at least ``least``
     (Hirschmüller 2008, section 2.2).
     """
-    height, width = grey.shape
-    out[:] = np.uint8(largest)
-    for y in range(height):
-        _adapt_P2(grey[y, 1:], grey[y, : width - 1], largest, least, scale, out[0, y, 1:])
-        if y > 0:
-            _adapt_P2(grey[y], grey[y - 1], largest, least, scale, out[1, y])
+    penalties = np.full((2, *grey.shape), largest, np.uint8)
+    top, width = np.float32(largest) * np.float32(scale), np.float32(scale)
+    for axis, out in ((1, penalties[0, :, 1:]), (0, penalties[1, 1:])):
+        step = np.abs(np.diff(grey.astype(np.float32), axis=axis))
+        out[:] = np.maximum(top / (width + step), np.float32(least))
+    return penalties
 
 
 @kernel
@@ -182,16 +172,16 @@ class SemiGlobalMatching:
         measured = float(np.mean([_cost.estimate_noise(image) for image in images]))
         noise = float(np.hypot(min_noise, measured))
         (height, width), n = images[0].valid.shape, last - first + 1
-        bits = np.empty((2, height, width), np.int32)
-        for image, out in zip(images, bits, strict=True):
-            _cost.census(image.grey, out)
+        bits = [_cost.census(np.pad(image.grey, 2, mode="edge")) for image in images]
         arms = np.empty((4, _cost.ARM, height, width), np.uint8)
         # The colour difference at which an arm of the support ends is five standard deviations.
         tolerance = np.int16(min(round(5.0 * noise * _cost.LEVELS), 255 * _cost.LEVELS))
         _cost.support_masks(images[0].channels, images[0].valid, tolerance, arms)
         # A partner outside the image costs a share of the maximal cost.
         weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(0.4 * MAX_COST))
-        penalties, P1_cost = _adapted_P2(images[0], noise), np.uint8(round(P1 * MAX_COST))
+        edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
+        scale, P1_cost = edge * noise * _cost.LEVELS * len(images[0].channels), np.uint8(round(P1 * MAX_COST))
+        penalties = adaptive_P2(images[0].grey, P2 * MAX_COST, MIN_P2 * MAX_COST, scale)
         # Confidence 1/2 if the second best disparity costs P1 more on every path.
         half = float(4 * P1 * MAX_COST)
         found = np.empty((3, height, width), np.float32)
@@ -201,7 +191,7 @@ class SemiGlobalMatching:
         for start, stop, top, bottom in _cost.row_strips(height, 3 * width * n, room):
             rows = slice(top, bottom)
             features = [
-                (bits[side, rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows])
+                (bits[side][rows], np.ascontiguousarray(image.channels[:, rows]), image.valid[rows])
                 for side, image in enumerate(images)
             ]
             # One allocation gets large memory pages.
@@ -246,12 +236,3 @@ class SemiGlobalMatching:
         confidence = _postprocessing.final_confidence(confidence, left, smooth, texture)
         sigma_px = _postprocessing.disparity_noise(closed, smooth)
         return DisparityMap(smooth, confidence, sigma_px)
-
-
-def _adapted_P2(image: _cost.StereoImage, noise: float) -> U8:
-    """P2 / (1 + g / ``EDGE``) with the intensity step g, at least ``MIN_P2``; see :func:`adaptive_P2`."""
-    edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
-    out = np.empty((2, *image.valid.shape), np.uint8)
-    scale = np.float32(edge * noise * _cost.LEVELS * len(image.channels))
-    adaptive_P2(image.grey, np.float32(P2 * MAX_COST), np.float32(MIN_P2 * MAX_COST), scale, out)
-    return out
