@@ -268,6 +268,8 @@ def test_fundamentals_of_a_plane_keep_the_plane_and_the_two_matches():
             assert np.abs(two_view.sampson_residuals(f.reshape(3, 3), kept[:, :2], kept[:, 2:])).max() < 1e-9
     np.testing.assert_array_equal(agree.sum(axis=1), sums[:, 0])
     assert (sums[:, 0] >= 2).all()
+    # One match twice determines no epipole.
+    assert not homography.fundamentals_of_plane(H, away, np.ones((1, 6)), np.array([[3, 3]]), 0.1)[1].any()
 
 
 def test_votes_of_matches_off_the_plane():

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon._numba import kernel
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import unit_norm
@@ -116,46 +115,26 @@ def check_start(F: F64, frame: PairFrame) -> F64:
 TAIL = 4.0  # standard deviation of the noise's tail relative to the noise
 
 
-@kernel
 def _fit_mixture(residuals: F64, parameters: float, spread: float, rounds: int, mixture: F64) -> float:
     """Fit three zero-mean normals by expectation-maximisation; return the mean log-likelihood."""
     # `mixture` (5,), updated: sigma, standard deviation of wrong residuals (prior `spread`), fractions of
-    # noise, its tail and wrong residuals.
-    core_count, tail_count, wrong_count = 1.0, 0.5, 1.0
-    n, likelihood = len(residuals), 0.0
-    for last in range(rounds - 1, -1, -1):
-        sigma, wide, core, tail, wrong = mixture
-        c0, c1, c2 = core / sigma, tail / (TAIL * sigma), wrong / wide
-        i1, i2 = 0.5 / (TAIL * TAIL * sigma * sigma), 0.5 / (wide * wide)
-        n0, n1, n2, s01, s2 = 0.0, 0.0, 0.0, 0.0, 0.0
-        likelihood = 0.0
-        for k in range(n):
-            q = residuals[k] * residuals[k]
-            # The core's exponential is that of the tail to the power TAIL^2 = 16.
-            e1 = np.exp(-i1 * q)
-            e0 = e1 * e1
-            e0 *= e0
-            e0 *= e0
-            e0 *= e0
-            p0, p1, p2 = c0 * e0, c1 * e1, c2 * np.exp(-i2 * q)
-            p = p0 + p1 + p2 + 1e-300
-            if last == 0:
-                likelihood += np.log(p)
-            p = 1.0 / p
-            n0 += p0 * p
-            n1 += p1 * p
-            n2 += p2 * p
-            s01 += (p0 + p1 / (TAIL * TAIL)) * p * q
-            s2 += p2 * p * q
-        total = n + core_count + tail_count + wrong_count
-        mixture[0] = np.sqrt(s01 / max(n0 + n1 - parameters, 1.0)) + 1e-12 * spread
-        wide = np.sqrt((s2 + wrong_count * spread * spread) / (n2 + wrong_count))
+    # noise, its tail and wrong residuals. The prior counts one residual of either and half a one of the tail.
+    squares, prior, likelihood = residuals**2, np.array([1.0, 0.5, 1.0]), 0.0
+    for _ in range(rounds):
+        sigma, wide, *fractions = mixture
+        std = np.array([sigma, TAIL * sigma, wide])
+        p = (fractions / std)[:, None] * np.exp(squares * (-0.5 / std**2)[:, None])
+        total = p.sum(axis=0) + 1e-300
+        likelihood = float(np.log(total).mean())
+        p /= total
+        counts, sums = p.sum(axis=1), p @ squares
+        noise = (sums[0] + sums[1] / TAIL**2) / max(counts[0] + counts[1] - parameters, 1.0)
+        mixture[0] = np.sqrt(noise) + 1e-12 * spread
+        wide = np.sqrt((sums[2] + prior[2] * spread**2) / (counts[2] + prior[2]))
         # Wrong residuals are at least twelve times as wide as the noise.
         mixture[1] = max(wide, 12.0 * mixture[0])
-        mixture[2] = (n0 + core_count) / total
-        mixture[3] = (n1 + tail_count) / total
-        mixture[4] = (n2 + wrong_count) / total
-    return likelihood / n
+        mixture[2:] = (counts + prior) / (len(residuals) + prior.sum())
+    return likelihood
 
 
 def _middle(ordered: F64) -> float:

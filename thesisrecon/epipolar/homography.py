@@ -12,6 +12,7 @@ from numpy.random import Generator
 from thesisrecon._numba import empty, kernel, zeros
 from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.epipolar._matches import PairFrame, noise_width
+from thesisrecon.epipolar._sampling import squared_distances
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import cross_matrix, directions_across, homogenize, unit_norm
 from thesisrecon.geometry.two_view import homography_linear, homography_sampson_residuals
@@ -180,25 +181,11 @@ def fundamentals_of_plane(H: F64, points: F64, weights: F64, pairs: I64, gate: f
     """
     x1, x2 = homogenize(points[:, :2]), homogenize(points[:, 2:])
     parallax = np.cross(x2, x1 @ H.T)
-    F = unit_norm(cross_matrix(np.cross(parallax[pairs[:, 0]], parallax[pairs[:, 1]])) @ H)
-    agree = np.asarray(_plane_inliers(F, np.ascontiguousarray(points.T), gate))
-    return F.reshape(-1, 9), agree, agree @ weights.T
-
-
-@kernel(fastmath={"reassoc", "contract"})
-def _plane_inliers(F: F64, columns: F64, gate: float) -> F64:
-    """1 where a Sampson distance of the matches (4, N) from F (S, 3, 3) is below the gate, else 0: (S, N)."""
-    agree, wide = empty((len(F), columns.shape[1])), gate * gate
-    for s in range(len(F)):
-        f00, f01, f02, f10, f11, f12 = F[s, 0, 0], F[s, 0, 1], F[s, 0, 2], F[s, 1, 0], F[s, 1, 1], F[s, 1, 2]
-        f20, f21, f22 = F[s, 2, 0], F[s, 2, 1], F[s, 2, 2]
-        for k in range(columns.shape[1]):
-            x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
-            a0, a1 = f00 * x1 + f01 * y1 + f02, f10 * x1 + f11 * y1 + f12
-            b0, b1 = f00 * x2 + f10 * y2 + f20, f01 * x2 + f11 * y2 + f21
-            e = a0 * x2 + a1 * y2 + f20 * x1 + f21 * y1 + f22
-            agree[s, k] = 1.0 if e * e < wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) else 0.0
-    return agree
+    F = unit_norm(cross_matrix(np.cross(parallax[pairs[:, 0]], parallax[pairs[:, 1]])) @ H).reshape(-1, 9)
+    # No match agrees with F = 0, of one match twice.
+    near = np.asarray(squared_distances(F, np.ascontiguousarray(points.T)) < gate * gate)
+    agree = np.where(F.any(axis=1, keepdims=True), near, False).astype(np.float64)
+    return F, agree, agree @ weights.T
 
 
 _SAMPLE, _PARAMETERS = 4, 8
