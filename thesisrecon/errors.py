@@ -25,12 +25,17 @@ def counted(number: int, noun: str, shown: str = "") -> str:
     return f"{shown or number} {noun}{ending}"
 
 
-def require_at_least(method: object, **least: float) -> None:
-    """Raise ``ValueError`` if one of these settings of a method is below its least value."""
-    for name, bound in least.items():
-        # NaN is below every bound.
-        if not getattr(method, name) >= bound:
-            raise ValueError(f"{name} must be at least {bound}; got {getattr(method, name)}")
+def require_range(method: object, **intervals: str) -> None:
+    """Raise ``ValueError`` if a setting of a method is outside its interval, as "[1, inf)" or "(0, 1)"."""
+    for name, interval in intervals.items():
+        value, (low, high) = getattr(method, name), map(float, interval[1:-1].split(","))
+        # Comparisons with NaN are false.
+        if low < value < high or (value == low and "[" in interval) or (value == high and "]" in interval):
+            continue
+        rule = f"lie between {low:g} and {high:g}"
+        if high == float("inf"):
+            rule = f"be at least {low:g}" if "[" in interval else "be positive"
+        raise ValueError(f"{name} must {rule}; got {value}")
 
 
 def in_words(value: Any) -> str:

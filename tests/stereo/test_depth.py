@@ -164,8 +164,8 @@ def test_one_baseline_gives_depth_and_settings_without_any_are_refused():
     scene = STEREO.prepare(walled.images, walled.reconstruction)
     require_accurate(walled, confirmed_depth_maps(STEREO, scene), median=0.003, known=0.5)
     for rule, wrong in (
-        ("not be negative", {"sequence_links": -1}), ("at least 1; got 0", {"max_neighbours": 0}),
-        ("at least 64 px; got 0 and 640", {"max_side": 0}), ("at least 64 px; got 1024", {"match_side": 1}),
+        ("at least 0; got -1", {"sequence_links": -1}), ("at least 1; got 0", {"max_neighbours": 0}),
+        ("max_side .* at least 64; got 0", {"max_side": 0}), ("match_side .* at least 64", {"match_side": 1}),
     ):  # fmt: skip
         refuses(ValueError, rule, MultiViewStereo, **wrong)
 

@@ -20,7 +20,7 @@ from thesisrecon.config.plug_ins import FunctionMatcher, as_method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.ransac import ThesisRansac
 from thesisrecon.epipolar.verification import PairVerification
-from thesisrecon.errors import UsageError, in_words, require_at_least, unknown_word
+from thesisrecon.errors import UsageError, in_words, require_range, unknown_word
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._prepared import EstimateFundamental, MapAll
@@ -283,7 +283,7 @@ class ImageOptions:
     part_views: int = 400
 
     def __post_init__(self) -> None:
-        require_at_least(self, max_size_px=64, part_views=0)
+        require_range(self, max_size_px="[64, inf)", part_views="[0, inf)")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import NoiseMixture, PairFrame, check_matches, noise_scale, noise_width
 from thesisrecon.epipolar._sampling import sampson_distances, search_fundamental, truncated_score
 from thesisrecon.epipolar.refinement import SAMPSON, fundamental_covariance, refine
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.optimize.least_squares import best_huber_width, effective_noise
 from thesisrecon.optimize.ransac import watched
 from thesisrecon.records import FundamentalFit
@@ -68,16 +68,8 @@ class LocallyOptimisedRansac:
     inlier_floor = 0.3  # residual up to which a match is always an inlier, in units of ``threshold_px``
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
-            raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if not 0.0 < self.confidence < 1.0:
-            raise ValueError(f"confidence must lie between 0 and 1; got {self.confidence}")
-        if not self.max_samples >= self.max_starts:
-            raise ValueError(f"max_samples must be at least {self.max_starts}; got {self.max_samples}")
-        if not 1 <= self.starts <= self.max_starts:
-            raise ValueError(f"starts must lie between 1 and {self.max_starts}; got {self.starts}")
-        if not self.inlier_sigmas > 0.0:
-            raise ValueError(f"inlier_sigmas must be positive; got {self.inlier_sigmas}")
+        require_range(self, threshold_px="(0, inf)", confidence="(0, 1)", inlier_sigmas="(0, inf]")
+        require_range(self, starts=f"[1, {self.max_starts}]", max_samples=f"[{self.max_starts}, inf)")
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""

@@ -12,7 +12,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import MIN_PX, PairFrame, as_matches, check_matches, noise_scale
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
 from thesisrecon.optimize.ransac import draw_samples, watched
@@ -184,10 +184,7 @@ class ThesisRansac:
     stop_inlier_ratio = 0.95  # inlier ratio at which sampling stops
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.threshold_px) and self.threshold_px > 0.0):
-            raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
-        if self.samples < 1 or self.rounds < 0:
-            raise ValueError(f"a search needs samples >= 1, rounds >= 0; got {self.samples}, {self.rounds}")
+        require_range(self, threshold_px="(0, inf)", samples="[1, inf)", rounds="[0, inf)")
         if self.inlier_test not in INLIER_TESTS:
             raise ValueError(
                 f"inlier_test must be one of {', '.join(INLIER_TESTS)}; got {self.inlier_test!r}"

@@ -17,7 +17,7 @@ from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.degeneracy import assess_degeneracy
 from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine
-from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, counted, require_range
 from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.small_matrices import solve_positive
 from thesisrecon.geometry.strata import nearest_rotation
@@ -288,8 +288,7 @@ class PairVerification:
     homography_px = 2.0  # distance within which a homography explains a match, or 4.3 sigma if that is more
 
     def __post_init__(self) -> None:
-        if self.min_inliers < 8:
-            raise ValueError(f"min_inliers must be at least 8; got {self.min_inliers}")
+        require_range(self, min_inliers="[8, inf)")
 
     def verify(self, matches: Matches, fit: FundamentalFit, rng: np.random.Generator) -> TwoView:
         """See `thesisrecon.config.Verifier.verify`."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from thesisrecon._numba import FAST, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.errors import require_range
 from thesisrecon.imaging.resampling import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
@@ -164,8 +165,7 @@ class CornerMeasure:
     derivative_sigma_px = 1.0
 
     def __post_init__(self) -> None:
-        if not self.integration_sigma_px > 0.0:
-            raise ValueError(f"integration_sigma_px must be above 0; got {self.integration_sigma_px}")
+        require_range(self, integration_sigma_px="(0, inf)")
 
     def _channels(self, image: Image) -> F32:
         """(C, H, W) grey values or three colours."""
@@ -207,10 +207,7 @@ class HarrisCorners:
     spacing_rel = 0.004
 
     def __post_init__(self) -> None:
-        if self.max_corners < 1:
-            raise ValueError(f"max_corners must be at least 1; got {self.max_corners}")
-        if not 0.0 <= self.threshold_rel <= 1.0:
-            raise ValueError(f"threshold_rel must lie between 0 and 1; got {self.threshold_rel}")
+        require_range(self, max_corners="[1, inf)", threshold_rel="[0, 1]")
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""

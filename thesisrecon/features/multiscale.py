@@ -14,6 +14,7 @@ import scipy
 
 from thesisrecon._numba import FAST, empty, kernel
 from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.errors import require_range
 from thesisrecon.features.harris import CornerMeasure, select_spread
 from thesisrecon.imaging.resampling import halve, resample, smooth
 from thesisrecon.records import Features, Image, Seeds
@@ -121,13 +122,9 @@ class MultiScaleCorners:
     oblique_tilts: ClassVar[tuple[float, ...]] = (1.414, 2.828)
 
     def __post_init__(self) -> None:
-        if self.levels < 1:
-            raise ValueError(f"levels must be at least 1; got {self.levels}")
-        if self.full_corners < 0 or self.half_corners < 0 or self.full_corners + self.half_corners == 0:
-            raise ValueError(
-                "full_corners and half_corners must be at least 0, and one of them above; "
-                f"got {self.full_corners} and {self.half_corners}"
-            )
+        require_range(self, levels="[1, inf)", full_corners="[0, inf)", half_corners="[0, inf)")
+        if self.full_corners + self.half_corners == 0:
+            raise ValueError("one of full_corners and half_corners must be above 0; got 0 and 0")
         if self.half_corners and self.levels < 3:
             raise ValueError(
                 "half_corners must be 0 with fewer than 3 levels, because the third level has half the size; "

@@ -7,7 +7,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import B8, F32, F64, I64
-from thesisrecon.errors import StageFailure, UsageError, require_at_least
+from thesisrecon.errors import StageFailure, UsageError, require_range
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.matching import _seeds
 from thesisrecon.matching._prepared import (
@@ -289,9 +289,7 @@ class SeedsAndGrowth:
     many_share = 0.5  # share of the corners and seeds that are matched first
 
     def __post_init__(self) -> None:
-        require_at_least(self, neighbours=1, oblique_pairs=0)
-        if not self.ratio > 0.0:
-            raise ValueError(f"ratio must be above 0; got {self.ratio}")
+        require_range(self, neighbours="[1, inf)", oblique_pairs="[0, inf)", ratio="(0, inf)")
 
     def prepare(self, image: Image, features: Features) -> PreparedImage:
         """See `thesisrecon.config.Matcher.prepare`."""

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F32, F64, I64, rows_of_views
-from thesisrecon.errors import UsageError, require_at_least
+from thesisrecon.errors import UsageError, require_range
 from thesisrecon.matching._prepared import MapAll, select_found
 from thesisrecon.matching._seeds import nearest_seeds
 from thesisrecon.records import Features, PairChoice, Seeds, TwoView
@@ -152,7 +152,7 @@ class OverlapEstimate:
     words = 65536  # largest size of the vocabulary; an eighth of the patches of the images if that is less
 
     def __post_init__(self) -> None:
-        require_at_least(self, nearest=1, most=1, spread=0)
+        require_range(self, nearest="[1, inf)", most="[1, inf)", spread="[0, inf)")
 
     def select(
         self, names: Sequence[str], features: Sequence[Features], *, map_all: MapAll, rng: np.random.Generator

@@ -8,6 +8,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
+from thesisrecon.errors import require_range
 from thesisrecon.matching import _prepared
 from thesisrecon.matching.track_alignment import align_matches
 from thesisrecon.records import Features, Image, Matches
@@ -154,15 +155,10 @@ class StrengthOfMatch:
     align: bool = False
 
     def __post_init__(self) -> None:
-        if self.candidates < 1 or self.neighbours < 1:
-            got = f"{self.candidates} and {self.neighbours}"
-            raise ValueError(f"candidates and neighbours must be at least 1; got {got}")
+        require_range(self, candidates="[1, inf)", neighbours="[1, inf)")
+        require_range(self, radius_rel="(0, inf)", min_strength="[0, 1)")
         if self.window < 3 or self.window % 2 == 0:
             raise ValueError(f"window must be odd and at least 3; got {self.window}")
-        if not self.radius_rel > 0.0:
-            raise ValueError(f"radius_rel must be above 0; got {self.radius_rel}")
-        if not 0.0 <= self.min_strength < 1.0:
-            raise ValueError(f"min_strength must lie in [0, 1); got {self.min_strength}")
 
     def prepare(self, image: Image, features: Features) -> _prepared.PreparedImage:
         """See `thesisrecon.config.Matcher.prepare`."""

@@ -11,6 +11,7 @@ import scipy
 
 from thesisrecon._numba import empty, full, kernel
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
+from thesisrecon.errors import require_range
 from thesisrecon.matching._prepared import MapAll, PreparedImage, select_found
 from thesisrecon.matching.track_alignment import AFFINE_STD, MIN_CORRELATION, align_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
@@ -157,8 +158,7 @@ class PlainTracks:
     merge_px: float = MERGE_PX
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.merge_px) and self.merge_px >= 0.0):
-            raise ValueError(f"merge_px must be at least 0; got {self.merge_px}")
+        require_range(self, merge_px="[0, inf)")
 
     def build(
         self, prepared: Sequence[Any], pairs: Sequence[TwoView], *, map_all: MapAll, rng: np.random.Generator

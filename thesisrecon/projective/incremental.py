@@ -13,7 +13,7 @@ import numpy as np
 from numpy.random import Generator
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.errors import Notice, StageFailure, counted, require_at_least
+from thesisrecon.errors import Notice, StageFailure, counted, require_range
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.optimize.bundle.partial import refine_camera
 from thesisrecon.optimize.ransac import Budget, resect_projective
@@ -92,7 +92,7 @@ class IncrementalProjective:
     max_initial_pairs = 3  # initial pairs tried in one attempt while usable views are missing
 
     def __post_init__(self) -> None:
-        require_at_least(self, core_views=0)
+        require_range(self, core_views="[0, inf)")
 
     def reconstruct(
         self, tracks: Tracks, pairs: Sequence[TwoView], sizes: I64, *, rng: Generator, attempt: int = 0

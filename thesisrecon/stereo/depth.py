@@ -9,7 +9,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.imaging.on_demand import MappingOnDemand
@@ -273,14 +273,8 @@ class MultiViewStereo:
     min_comparison_views = 12
 
     def __post_init__(self) -> None:
-        min_side = 64
-        if self.sequence_links < 0:
-            raise ValueError(f"sequence_links must not be negative; got {self.sequence_links}")
-        if self.max_neighbours < 1:
-            raise ValueError(f"max_neighbours must be at least 1; got {self.max_neighbours}")
-        if min(self.max_side, self.match_side) < min_side:
-            sides = f"{self.max_side} and {self.match_side}"
-            raise ValueError(f"max_side and match_side must be at least {min_side} px; got {sides}")
+        require_range(self, sequence_links="[0, inf)", max_neighbours="[1, inf)")
+        require_range(self, max_side="[64, inf)", match_side="[64, inf)")
 
     def match_rectified(self, left: ArrayLike, right: ArrayLike, *, max_disparity_px: float) -> DisparityMap:
         """See `thesisrecon.config.DepthEstimator.match_rectified`."""

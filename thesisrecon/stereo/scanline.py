@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
+from thesisrecon.errors import require_range
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo._cost import LEVELS, checked_range, estimate_noise, prepare_stereo_images
 from thesisrecon.stereo._postprocessing import final_confidence, texture_of
@@ -225,8 +226,7 @@ class MaximumLikelihoodScanline:
     disparities; the paper charges them as occluded, which pulls both row ends to disparity 0."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.radius <= 4:
-            raise ValueError(f"radius must be in 0 .. 4; got {self.radius}")
+        require_range(self, radius="[0, 4]")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """See `thesisrecon.stereo.semi_global.SemiGlobalMatching.match`; the disparities are whole numbers.

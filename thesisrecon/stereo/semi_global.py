@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, I16, U8
+from thesisrecon.errors import require_range
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo import _cost, _postprocessing
 
@@ -156,8 +157,7 @@ class SemiGlobalMatching:
     memory_mb = 256.0
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.census_share <= 1.0 and self.truncation > 0.0):
-            raise ValueError("census_share must be in [0, 1] and truncation positive")
+        require_range(self, census_share="[0, 1]", truncation="(0, inf]")
 
     def match(self, left: ArrayLike, right: ArrayLike, *, disparity_range: tuple[int, int]) -> DisparityMap:
         """Compute the disparities of the left image, NaN where occluded or ambiguous.

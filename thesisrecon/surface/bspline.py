@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I32, I64
+from thesisrecon.errors import require_range
 from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import DepthMap
 from thesisrecon.surface._mesh import GRAZING_DEG, components, max_depth_slope, same_surface
@@ -200,8 +201,7 @@ class BSplineSurface:
     surface they take its depth, elsewhere they become empty."""
 
     def __post_init__(self) -> None:
-        if self.knot_px < 2:
-            raise ValueError(f"knot_px must be >= 2; got {self.knot_px}")
+        require_range(self, knot_px="[2, inf)")
 
     def smooth(self, depth_map: DepthMap) -> DepthMap:
         """Return the depths of the fitted surface."""

@@ -18,7 +18,7 @@ import scipy
 from thesisrecon._numba import ThreadPool, empty, kernel
 from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
 from thesisrecon.camera import compose_camera, decompose_camera
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.imaging.resampling import bilinear_samples
@@ -320,10 +320,7 @@ class VolumetricFusion:
     max_blocks = 250_000
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.voxel_px < np.inf:
-            raise ValueError(f"voxel_px must be positive; got {self.voxel_px}")
-        if not 0.0 <= self.tolerance < np.inf:
-            raise ValueError(f"tolerance must be finite and not negative; got {self.tolerance}")
+        require_range(self, voxel_px="(0, inf)", tolerance="[0, inf)")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:
         """Fuse depth maps to one surface."""
@@ -540,8 +537,7 @@ class DepthSheets:
     step: int = 2  #: row and column step of the triangulation
 
     def __post_init__(self) -> None:
-        if self.step < 1:
-            raise ValueError(f"step must be >= 1; got {self.step}")
+        require_range(self, step="[1, inf)")
 
     def fuse(self, depth_maps: Sequence[DepthMap], *, threads: int = 1) -> TexturedMesh:  # noqa: ARG002
         """See `thesisrecon.surface.fusion.VolumetricFusion.fuse`; one thread is used."""

@@ -11,7 +11,7 @@ import numpy as np
 from thesisrecon._numba import ThreadPool, kernel
 from thesisrecon.arrays import B8, F32, F64, I64, U8, resizing_transform
 from thesisrecon.camera import Camera
-from thesisrecon.errors import Notice, StageFailure
+from thesisrecon.errors import Notice, StageFailure, require_range
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.imaging.resampling import resample, smooth
 from thesisrecon.records import DepthMap, PinholeView, TexturedMesh
@@ -324,8 +324,7 @@ class SurfaceModel:
     model-full.glb holds all of it."""
 
     def __post_init__(self) -> None:
-        if not self.max_glb_mb >= 5.0:
-            raise ValueError(f"max_glb_mb must be at least 5; got {self.max_glb_mb}")
+        require_range(self, max_glb_mb="[5, inf]")
 
     def build(
         self, depth_maps: Sequence[DepthMap], views: Sequence[PinholeView], *, threads: int = 1

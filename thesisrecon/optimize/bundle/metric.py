@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.errors import require_range
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
@@ -56,8 +57,7 @@ class BundleOptions:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        if not (self.sigma_px > 0.0 and self.loss_px > 0.0):
-            raise ValueError(f"sigma_px and loss_px must be positive; got {self.sigma_px}, {self.loss_px}")
+        require_range(self, sigma_px="(0, inf]", loss_px="(0, inf]")
 
 
 @dataclass(frozen=True)
