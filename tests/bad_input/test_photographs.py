@@ -135,14 +135,34 @@ def test_links_lead_outside_and_folders_in_a_loop_are_not_entered(tmp_path, run_
     (folder / "sub" / "a.png").write_bytes(files.encoded("PNG", picture(2)))
     (folder / "sub" / "up").symlink_to(folder)
     said = run_cli(["reconstruct", str(folder), "-o", str(tmp_path / "out"), *FEATURES], 0)
-    assert "2 images" in said
-    assert "subfolders are not searched: the images in sub are left out" in said
+    assert "3 images" in said
+    assert "images of several folders are used: . (2), sub (1)" in said
     only = tmp_path / "folders only"
-    only.mkdir()
-    (only / "sub").symlink_to(folder)
+    (only / "empty" / ".hidden").mkdir(parents=True)
+    (only / "empty" / ".hidden" / "a.png").write_bytes(files.encoded("PNG", picture(2)))
     said = run_cli(["reconstruct", str(only), "-o", str(tmp_path / "other"), *FEATURES], 2)
     assert "no images in" in said
-    assert "subfolders are not searched" in said
+    assert "and its subfolders" in said
+
+
+def test_images_of_subfolders_have_relative_names_and_a_camera_for_each_folder(tmp_path, run_cli):
+    home, out = tmp_path / "in", tmp_path / "in" / "out"
+    for n, name in enumerate(("left/2.png", "left/10.png", "right/2.png", "masks/left/2.png")):
+        (home / name).parent.mkdir(parents=True, exist_ok=True)
+        pixels = picture(n).copy()
+        pixels[:20] = 0
+        (home / name).write_bytes(files.encoded("PNG", pixels))
+    given = ["reconstruct", str(home), "-o", str(out), "--masks", str(home / "masks"), *FEATURES]
+    assert "left (2), right (1)" in run_cli(given, 0)
+    summary = json.loads((out / "summary.json").read_text())
+    assert [view["name"] for view in summary["cameras"]] == ["left/2.png", "left/10.png", "right/2.png"]
+    assert [view["camera"] for view in summary["cameras"]] == [0, 0, 1]
+    assert "masked_fraction" in summary["cameras"][0]
+    # The output folder is no folder of images, also when the run is repeated.
+    run_cli(given, 0)
+    run_cli([*given, "--cameras", "per-size", "--overwrite"], 0)
+    summary = json.loads((out / "summary.json").read_text())
+    assert [view["camera"] for view in summary["cameras"]] == [0, 0, 0]
 
 
 def test_a_file_that_vanishes_while_others_are_read(tmp_path, run_cli, monkeypatch):

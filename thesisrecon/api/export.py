@@ -166,12 +166,12 @@ def export(
     undistorted, pinholes = _undistorted(model)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     notes += [_divided_note(model, len(undistorted.views))] if divided else []
-    paths = _image_paths(images, model)
-    may_mask = masks is not None or any(map(_images.may_be_transparent, paths))
+    may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
     may_mask = may_mask or divided
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
     _require_distinct(names, "have the mask")
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
+    paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
         mask_name = partial(formats.mask_name, to) if may_mask else None

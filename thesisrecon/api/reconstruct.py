@@ -1,8 +1,9 @@
 """Algorithm 1 of the thesis: from images to cameras, points and a textured model."""
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -32,7 +33,8 @@ def reconstruct(
     Parameters
     ----------
     images : path, or sequence of path, ndarray (H, W), (H, W, 3) or (H, W, 4) uint8, or Image
-        A folder, or the images; with ``every`` a video (extra ``video``) or a folder of frames.
+        A folder with its subfolders, or the images; with ``every`` a video (extra ``video``) or a folder of
+        frames.
     out : path
         Output folder: created if missing, resumed if it holds the same run.
     config : PipelineConfig, str or path, optional
@@ -41,8 +43,9 @@ def reconstruct(
         Pipeline to start from.
     max_size : int, optional
         Long side (px) to which larger images are reduced (1600).
-    cameras : {"shared", "per-image"}, optional
-        One camera per image size (default), or one per image.
+    cameras : {"shared", "per-size", "per-image"}, optional
+        One camera for the images of one size in one folder (default), of one size in all folders, or one per
+        image.
     pairs : str, path or list of (str, str), optional
         "all", "overlap", "window:N", a file of pairs, or pairs of file names.
     set : mapping or list of str
@@ -109,31 +112,34 @@ def reconstruct(
         if Path(images).is_file() and frames is None:
             message = f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
             raise UsageError(message)
-        if frames is None and not _images.list_images(Path(images)):
-            raise UsageError(f"there are no images in {images} (subfolders are not searched)")
-        if frames is None and (left := _images.image_subfolders(Path(images), run.directory.path, masks)):
-            run.warnings.append(Notice("subfolders", left))
         run.title = _images.scene_name(Path(images)) or run.title
     else:
         images = _images.list_of_images("reconstruct", images)
     run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
+    source: Any = frames or images
+    if source is not frames and isinstance(images, str | Path):
+        source = _images.files_by_name(images, run.directory.path, masks)
+        if not source:
+            raise UsageError(f"there are no images in {images} and its subfolders")
+        if len(folders := Counter(Path(name).parent.as_posix() for name in source)) > 1:
+            run.warnings.append(Notice("subfolders", ", ".join(f"{n} ({k})" for n, k in folders.items())))
     if masks is not None:
         run.masks_folder = _images.check_masks_folder(masks, run.images_folder)
     cameras_known = None if known is None else known_by_name("reconstruct", known, until)
     run.as_stored = cameras_known is not None and any(c.as_stored for c in cameras_known.values())
     # Claim the folder first: reading images takes long.
     surface_required = options.get("until") is not None
-    source = None if frames is None else frames.identity
-    source = source if cameras_known is None else source_of_known(cameras_known, refine)
-    with claimed(run, overwrite=overwrite, source=source):
-        inputs = _read_inputs(run, frames or images, None if masks is None else Path(masks))
+    identity = None if frames is None else frames.identity
+    identity = identity if cameras_known is None else source_of_known(cameras_known, refine)
+    with claimed(run, overwrite=overwrite, source=identity):
+        inputs = _read_inputs(run, source, None if masks is None else Path(masks))
         listed = run.config.pairs
         if isinstance(listed, ListedPairs) and until != "features" and len(inputs.images) >= 2:
             # Checked before the folder is adopted: the same run can then be resumed with a corrected list.
             listed.check([image.name for image in inputs.images], inputs.refused)
         given = None if cameras_known is None else given_cameras(cameras_known, inputs, refine=refine)
         job = Job(run, inputs, FromImages(), until, surface_required, given=given)
-        return run_adopted(job, overwrite=overwrite, source=source)
+        return run_adopted(job, overwrite=overwrite, source=identity)
 
 
 def _frame_source(images: _images.ImageSource, every: int, run: Run) -> FrameSource:
@@ -145,7 +151,8 @@ def _frame_source(images: _images.ImageSource, every: int, run: Run) -> FrameSou
     return FrameSource(Path(images), every)
 
 
-def _read_inputs(run: Run, images: _images.ImageSource | FrameSource, masks: Path | None) -> _images.ImageSet:
+def _read_inputs(run: Run, images: Any, masks: Path | None) -> _images.ImageSet:
+    """Read images: a :class:`FrameSource`, a list, or files by name."""
     warnings: list[str] = []
     counts: dict[str, int] = {}
     with run.clock("images"):

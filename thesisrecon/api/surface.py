@@ -325,11 +325,13 @@ def _scene(
     """Images at working size, and their cameras for it, with the points of a reconstruction."""
     cameras = named_cameras(caller, cameras)
     if isinstance(images, str | Path):
-        files = _images.list_images(Path(images))
+        files = _images.files_by_name(images)
         # Images that were not registered have no camera.
-        images = [path for path in files if isinstance(cameras, Mapping) and path.name in cameras] or files
-    listed = _images.eight_bit_images(*_images.list_of_images(caller, images))
-    names = [_name_of(n, image) for n, image in enumerate(listed)]
+        files = {n: f for n, f in files.items() if isinstance(cameras, Mapping) and n in cameras} or files
+        names, listed = list(files), [Path(file) for file in files.values()]
+    else:
+        listed = _images.eight_bit_images(*_images.list_of_images(caller, images))
+        names = [_name_of(n, image) for n, image in enumerate(listed)]
     views = as_cameras(caller, cameras, sizes, names)
     if len(views) != len(names):
         raise ValueError(f"{caller} needs a camera per image; got {len(views)} and {len(names)}")

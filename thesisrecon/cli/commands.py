@@ -41,8 +41,10 @@ ImagesFolder = Annotated[Path | None, common.folder_option(_IMAGES_HELP, "--imag
 Masks = Annotated[Path | None, common.folder_option("Folder of masks: black pixels are left out.", "--masks")]
 _PRESET_HELP = "Pipeline to start from (default: default)."
 Preset = Annotated[Literal["default", "thesis"] | None, typer.Option("--preset", help=_PRESET_HELP)]
-_CAMERAS_HELP = "One camera per image size, or one per image."
-Cameras = Annotated[Literal["shared", "per-image"] | None, typer.Option("--cameras", help=_CAMERAS_HELP)]
+_CAMERAS_HELP = "One camera per image size and folder (shared), per size, or per image."
+Cameras = Annotated[
+    Literal["shared", "per-size", "per-image"] | None, typer.Option("--cameras", help=_CAMERAS_HELP)
+]
 _CONFIG_HELP = "TOML file of settings that override the preset."
 Config = Annotated[Path | None, typer.Option("--config", help=_CONFIG_HELP)]
 _SET_HELP = "One setting as stage.field=value; may be repeated."

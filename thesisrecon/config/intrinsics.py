@@ -6,7 +6,8 @@ Self-calibration and bundle adjustment derive their unknowns from the prior.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import PurePath
+from typing import Any, Literal
 
 import numpy as np
 
@@ -38,8 +39,9 @@ class IntrinsicsOptions:
 
     Parameters
     ----------
-    cameras : {"shared", "per-image"}
-        "shared": images of the same size come from one camera; "per-image": each image has its own camera.
+    cameras : {"shared", "per-size", "per-image"}
+        "shared": images of the same size and folder come from one camera; "per-size": images of the same size
+        do, whatever their folder; "per-image": each image has its own camera.
     common_prior : bool
         Images of the same size come from cameras of the same kind: values that are not shared scatter about a
         common mean (hierarchical prior; the scatter is estimated).
@@ -65,7 +67,7 @@ class IntrinsicsOptions:
         If a value is not finite or out of range, or two settings contradict each other.
     """
 
-    cameras: Literal["shared", "per-image"] = "shared"
+    cameras: Literal["shared", "per-size", "per-image"] = "shared"
     common_prior: bool = True
     focal: Mode = "constant"
     focal_px: float | None = None
@@ -120,7 +122,7 @@ class IntrinsicsOptions:
             raise ValueError(Notice("idle-focal-std", self.focal_std_rel))
 
 
-def _numbered(keys: Sequence[tuple[float, ...]], *, each: bool = False) -> I64:
+def _numbered(keys: Sequence[tuple[Any, ...]], *, each: bool = False) -> I64:
     """Number (V,) of each key among the distinct ones, in order of appearance; ``each``: all are distinct."""
     if each:
         return np.arange(len(keys), dtype=np.int64)
@@ -128,26 +130,39 @@ def _numbered(keys: Sequence[tuple[float, ...]], *, each: bool = False) -> I64:
     return np.array([distinct[key] for key in keys], dtype=np.int64)
 
 
+def _cameras_of(options: IntrinsicsOptions, sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> I64:
+    """Number (V,) of the camera of each image by the options; without ``names`` there are no folders."""
+    keys: list[tuple[Any, ...]] = list(sizes)
+    if options.cameras == "shared" and names:
+        keys = [(*size, PurePath(name).parent) for size, name in zip(sizes, names, strict=True)]
+    return _numbered(keys, each=options.cameras == "per-image")
+
+
 def camera_numbers(
-    original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None
-) -> I64:
+    original_sizes: Sequence[tuple[int, int]], options: IntrinsicsOptions, exif_focal_px: F64 | None = None,
+    names: Sequence[str] = (),
+) -> I64:  # fmt: skip
     """Number the cameras (V,) so that views with equal numbers agree in all intrinsics, known or shared."""
     n = len(original_sizes)
     exif = np.full(n, np.nan) if exif_focal_px is None else exif_focal_px
-    prior = prior_from_options(options, original_sizes, exif, np.ones(n))
+    prior = prior_from_options(options, original_sizes, exif, np.ones(n), names)
     known = prior.std == 0.0
     tied, values = np.where(known, -1, prior.shared), np.where(known, prior.mean, 0.0)
-    group = _numbered(original_sizes, each=options.cameras == "per-image")
+    group = _cameras_of(options, original_sizes, names)
     return _numbered(list(map(tuple, np.column_stack([group, tied, values]).tolist())))
 
 
 def prior_from_options(
-    options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64
-) -> IntrinsicsPrior:
-    """Return the prior of V views in pixels at working size; EXIF focals (V,) px or NaN, scales (V,)."""
+    options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]], exif_focal_px: F64, scales: F64,
+    names: Sequence[str] = (),
+) -> IntrinsicsPrior:  # fmt: skip
+    """Return the prior of V views in pixels at working size; EXIF focals (V,) px or NaN, scales (V,).
+
+    The ``names`` of the images tell their folders.
+    """
     n = len(original_sizes)
     _check_sizes(options, original_sizes)
-    group, own = _numbered(original_sizes, each=options.cameras == "per-image"), np.arange(n)
+    group, own = _cameras_of(options, original_sizes, names), np.arange(n)
     # A known value is known for every view: sharing it would add nothing.
     modes = [getattr(options, name) for name in _OF_COLUMN]
     shared = np.stack([group if mode == "constant" else own for mode in modes], axis=1)

@@ -34,6 +34,7 @@ from thesisrecon.io._files import (
     printable,
     require_image_name,
 )
+from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import Image
 
 T = TypeVar("T")
@@ -106,26 +107,31 @@ def image_without_pixels(name: str, size: Sequence[int], original: tuple[int, in
     return Image(name, np.broadcast_to(np.uint8(128), (size[1], size[0], 3)), original)
 
 
-def list_images(folder: Path) -> list[Path]:
-    """List the image files of a folder by suffix or content, frame9 before frame10, without hidden files."""
+def list_images(folder: Path, *others: Path | str | None, deep: bool = False) -> list[Path]:
+    """List the image files of a folder by suffix or content, frame9 before frame10, without hidden files.
+
+    ``deep``: those of its subfolders too, but for hidden ones, ``others`` and folders that thesisrecon wrote.
+    """
     if not folder.exists():
         raise UsageError(f"there is no folder {folder}")
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a folder; give the folder of the images")
-    try:
-        entries = sorted(folder.iterdir(), key=lambda path: natural_key(path.name))
-    except OSError as error:
-        raise UsageError(f"the folder {folder} cannot be read: {error.strerror}") from None
-    return [p for p in entries if not p.name.startswith(".") and not p.is_dir() and _is_listed(p)]
-
-
-def image_subfolders(folder: Path, *others: Path | str | None) -> str:
-    """Names of the subfolders with images, which are not read, but for ``others`` such as the masks."""
     # realpath, unlike resolve, has an answer for links in a circle.
     known = {os.path.realpath(other) for other in (folder, *others) if other is not None}
-    inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-    inside = (path for path in inside if os.path.realpath(path) not in known and os.access(path, os.R_OK))
-    return printable(", ".join(path.name for path in inside if list_images(path)))
+    found, pending = list[Path](), [folder]
+    while pending:
+        try:
+            entries = [path for path in pending.pop().iterdir() if path.name[0] not in ".@"]
+        except OSError as error:
+            if not found and not pending:
+                raise UsageError(f"the folder {folder} cannot be read: {error.strerror}") from None
+            continue
+        found += [path for path in entries if not path.is_dir() and _is_listed(path)]
+        for path in (path for path in entries if deep and path.is_dir()):
+            if (real := os.path.realpath(path)) not in known and not os.path.lexists(path / LOCK_FILE):
+                known.add(real)
+                pending.append(path)
+    return sorted(found, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
 def _is_listed(path: Path) -> bool:
@@ -157,9 +163,9 @@ def _common_folder(files: Sequence[Path]) -> tuple[Path, bool]:
     return Path(folder), len({file.name for file in files}) < len(files)
 
 
-def files_by_name(source: ImageSource) -> dict[str, str]:
-    """Absolute paths of the files of images by their names."""
-    found = {name: item for name, item in _named_items(source) if isinstance(item, Path)}
+def files_by_name(source: ImageSource, *others: Path | str | None) -> dict[str, str]:
+    """Absolute paths of the files of images by their names; of a folder without those in ``others``."""
+    found = {name: item for name, item in _named_items(source, *others) if isinstance(item, Path)}
     return {name: str(path.absolute()) for name, path in found.items()}
 
 
@@ -200,7 +206,7 @@ def read_images(
     ``map_all`` is an ordered map, perhaps of a thread pool. Files are rotated upright unless ``as_stored``.
     """
     if isinstance(source, Mapping):
-        items = list(source.items())
+        items = [(name, Path(item) if isinstance(item, str) else item) for name, item in source.items()]
     else:
         items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
 
@@ -223,12 +229,14 @@ def read_images(
     return ImageSet(tuple(distinct.values()), {name: refused[name] for name, _ in items if name in refused})
 
 
-def _named_items(source: ImageSource) -> list[tuple[str, Any]]:
+def _named_items(source: ImageSource, *others: Path | str | None) -> list[tuple[str, Any]]:
     """Names and files or arrays in the order of the names."""
     if isinstance(source, str | Path):
-        source = list_images(Path(source))
-    paths = [Path(item) for item in source if isinstance(item, str | Path)]
-    home, by_path = _common_folder(paths) if paths else (Path(), False)
+        home, by_path = Path(source), True
+        source = list_images(home, *others, deep=True)
+    else:
+        paths = [Path(item) for item in source if isinstance(item, str | Path)]
+        home, by_path = _common_folder(paths) if paths else (Path(), False)
     items: dict[str, Any] = {}
     for n, item in enumerate(source):
         name = f"image-{n:0{len(str(len(source)))}d}"
@@ -464,7 +472,7 @@ USELESS_MASKS = Notice("useless-masks")
 def check_masks_folder(masks: Any, images: Path | None) -> Path:
     """Absolute path; UsageError if it is none, the folder holds no masks or is the folder of the images."""
     folder: Path = as_path("a run", "masks", masks)
-    if not list_images(folder):
+    if not list_images(folder, deep=True):
         raise UsageError(f"there are no masks in {folder}; {_MASK_NAMES}")
     if images is not None and images.is_dir() and folder.samefile(images):
         raise UsageError(f"{folder} is the folder of the images; the masks need a folder of their own")
@@ -474,13 +482,15 @@ def check_masks_folder(masks: Any, images: Path | None) -> Path:
 def find_masks(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
     """The masks of images by name, and warnings of the other files."""
     files: dict[str, list[Path]] = {}
-    for path in list_images(folder):
-        files.setdefault(printable(path.stem), []).append(path)
+    for path in list_images(folder, deep=True):
+        files.setdefault(printable(path.relative_to(folder).with_suffix("").as_posix()), []).append(path)
     owner: dict[Path, str] = {}
     mask_of: dict[str, Path] = {}
     for name in names:
-        # The names of files from several folders are paths.
-        found = files.get(Path(name).name) or files.get(Path(name).stem, [])
+        # The names of files from several folders are paths; their masks may be in one folder.
+        path = Path(name)
+        places = [name, path.with_suffix("").as_posix(), path.name, path.stem]
+        found = next((files[place] for place in places if place in files), [])
         if len(found) > 1:
             raise UsageError(f"{name} has two masks, {found[0]} and {found[1].name}; keep one")
         if found:

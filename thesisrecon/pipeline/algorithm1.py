@@ -362,6 +362,7 @@ def identity_of(run: Run, inputs: ImageSet, source: Source | None = None) -> dic
 def empty_result(run: Run, inputs: ImageSet) -> RunResult:
     """The result before the first stage."""
     sizes = [image.original_size for image in inputs.images]
-    groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px)
+    names = [image.name for image in inputs.images]
+    groups = camera_numbers(sizes, run.config.intrinsics, inputs.exif_focal_px, names)
     settings = tables_from_config(run.config)
     return RunResult(run.directory.path, inputs.images, inputs.refused, (), (), groups, settings)

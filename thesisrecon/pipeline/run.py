@@ -306,7 +306,8 @@ class Job:
             return self.known
         scales = np.array([image.scale for image in self.images])
         sizes = [image.original_size for image in self.images]
-        return prior_from_options(self.config.intrinsics, sizes, self.inputs.exif_focal_px, scales)
+        exif, options = self.inputs.exif_focal_px, self.config.intrinsics
+        return prior_from_options(options, sizes, exif, scales, self.names)
 
     def require_images(self) -> None:
         """Raise ``StageFailure`` if there are fewer than two images (one, if only features are detected)."""
