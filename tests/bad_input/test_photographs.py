@@ -149,9 +149,9 @@ def test_images_of_subfolders_have_relative_names_and_a_camera_for_each_folder(t
     home, out = tmp_path / "in", tmp_path / "in" / "out"
     for n, name in enumerate(("left/2.png", "left/10.png", "right/2.png", "masks/left/2.png")):
         (home / name).parent.mkdir(parents=True, exist_ok=True)
-        pixels = picture(n).copy()
+        pixels = np.array(picture(n))
         pixels[:20] = 0
-        (home / name).write_bytes(files.encoded("PNG", pixels))
+        (home / name).write_bytes(files.encoded("PNG", PIL.Image.fromarray(pixels)))
     given = ["reconstruct", str(home), "-o", str(out), "--masks", str(home / "masks"), *FEATURES]
     assert "left (2), right (1)" in run_cli(given, 0)
     summary = json.loads((out / "summary.json").read_text())
