@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
-from tests.constants import with_constants
 from tests.selfcalibration.stratified_scenes import calibrated, with_calibrations
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.errors import StageFailure
@@ -23,10 +22,12 @@ from thesisrecon.records import IntrinsicsPrior
 from thesisrecon.selfcalibration import _refinement, _upgrade, kruppa
 from thesisrecon.selfcalibration._frame import normalized_frame, solver_unknowns
 from thesisrecon.selfcalibration._refinement import (
-    RotationCriterion,
     dual_image_residuals,
     minimize_batch,
     refine_hypotheses,
+    rotation_cost,
+    rotation_loss,
+    rotation_residuals,
 )
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric
 from thesisrecon.selfcalibration.quadric import (
@@ -38,9 +39,13 @@ from thesisrecon.selfcalibration.quadric import (
 )
 from thesisrecon.selfcalibration.stratified import Stratified
 
-FREE = RotationCriterion(focal_weight=0.0)
-EXACT = [with_constants(kind, criterion=FREE)() for kind in (NonlinearQuadric, kruppa.KruppaEquations)]
+EXACT = [NonlinearQuadric(), kruppa.KruppaEquations()]
 ALONE = [LinearQuadric(), *EXACT]
+
+
+@pytest.fixture(autouse=True)
+def without_a_weak_prior_of_the_focal(monkeypatch):
+    monkeypatch.setattr(_refinement, "FOCAL_WEIGHT", 0.0)
 
 
 def name(method):
@@ -282,7 +287,7 @@ def test_all_criteria_vanish_at_the_truth_in_every_frame(seed):
     given = projective_reconstruction(scene, seed=seed)
     frame = normalized_frame(given, prior_for(scene))
     log_f = np.log(scene.K[:1, 0, 0] / 1536.0)
-    plane, cost = kruppa._plane_for_focals(frame, FREE, log_f)
+    plane, cost = kruppa._plane_for_focals(frame, log_f)
     assert cost < 1e-20
     K = _upgrade.square_pixel_calibrations(np.full((1, 4), log_f[0]))
     residuals = dual_image_residuals(frame, K, plane[None])
@@ -299,24 +304,24 @@ def test_refinement_never_raises_the_cost(seed):
     scene = make_scene(views=5, points=40, zoom=0.2, seed=seed % 30)
     frame = normalized_frame(projective_reconstruction(scene, seed=seed), prior_for(scene, shared=False))
     theta = rng.normal(size=(6, 8))
-    before = FREE.cost(frame, theta[:, :3], theta[:, 3:])
-    refined, after = refine_hypotheses(FREE, frame, theta)
+    before = rotation_cost(frame, theta[:, :3], theta[:, 3:])
+    refined, after = refine_hypotheses(frame, theta)
     assert (after <= before).all()
-    np.testing.assert_allclose(FREE.cost(frame, refined[:, :3], refined[:, 3:]), after)
+    np.testing.assert_allclose(rotation_cost(frame, refined[:, :3], refined[:, 3:]), after)
 
 
 def test_the_std_of_the_focals_is_that_of_the_normal_equations_and_planes_alone_leave_the_focals():
     scene = make_scene(views=5, seed=1)
     frame = normalized_frame(projective_reconstruction(scene, seed=1), prior_for(scene))
     theta = np.array([0.3, -0.2, 0.1, 0.0])
-    r = FREE.residuals(frame, theta[None])
-    root = np.sqrt(FREE.loss(frame, r)[1][0])
-    J = root[:, None] * central_differences(lambda x: FREE.residuals(frame, x), theta[None])[0]
+    r = rotation_residuals(frame, theta[None])
+    root = np.sqrt(rotation_loss(frame, r)[1][0])
+    J = root[:, None] * central_differences(lambda x: rotation_residuals(frame, x), theta[None])[0]
     r = root * r[0]
     variance = r @ r / (5 * 5 - 4) * np.linalg.inv(J.T @ J)[3, 3]
-    assert _refinement.focal_std(FREE, frame, theta) == pytest.approx(np.sqrt(variance), rel=1e-6)
+    assert _refinement.focal_std(frame, theta) == pytest.approx(np.sqrt(variance), rel=1e-6)
     theta = np.random.default_rng(1).normal(size=(3, 4))
-    refined, _ = refine_hypotheses(FREE, frame, theta, planes_only=True)
+    refined, _ = refine_hypotheses(frame, theta, planes_only=True)
     np.testing.assert_array_equal(refined[:, 3:], theta[:, 3:])
 
 

@@ -6,7 +6,6 @@ scale-free form, with one log f per camera group.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,6 +13,10 @@ from thesisrecon.arrays import F64
 from thesisrecon.optimize.least_squares import central_differences, soft_l1
 from thesisrecon.selfcalibration._frame import ReferenceFrame
 
+SCALE = 0.05  #: distance from a scaled rotation beyond which the loss is linear
+FOCAL_LOG_MEAN, FOCAL_WEIGHT = 0.2, 2e-3
+"""Weak prior of an unknown focal length: mean of its logarithm, and weight."""
+GIVEN_WEIGHT = 0.01  #: weight of a given focal length in units of its standard deviation
 UPPER = np.triu_indices(3)
 ENTRY_WEIGHT = np.where(UPPER[0] == UPPER[1], 1.0, np.sqrt(2.0))
 
@@ -41,48 +44,36 @@ def _unit(conic: F64) -> F64:
     return np.asarray(conic / np.maximum(norm, 1e-300))
 
 
-@dataclass(frozen=True)
-class RotationCriterion:
-    """Robust distance of upgraded cameras from scaled rotations, linear beyond ``scale``, and priors."""
+def rotation_residuals(frame: ReferenceFrame, theta: F64) -> F64:
+    """Residuals (B, 6 R + G) of cameras and focal priors for hypotheses (p, log f) (B, 3 + G).
 
-    scale: float = 0.05  #: distance at which the loss changes from quadratic to linear
-    focal_log_mean: float = 0.2  #: weak prior of an unknown focal length: mean of its logarithm
-    focal_log_std: float = 1.0  #: standard deviation of that prior
-    focal_weight: float = 2e-3  #: weight of that prior
-    noise: float = 0.01  #: weight of a given focal length in units of its standard deviation
+    Of the cameras the weighted entries of 3 C C' / tr(C C') - I.
+    """
+    log_f = theta[:, 3:]
+    f = np.exp(log_f)[:, frame.group]
+    C = frame.homographies(theta[:, :3])
+    C[..., :2] *= f[:, frame.reference, None, None, None]
+    C[..., :2, :] /= f[..., None, None]
+    CC = C @ C.swapaxes(-1, -2)
+    trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
+    cameras = _weighted_entries(3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)).reshape(len(theta), -1)
+    known = np.isfinite(frame.focal_std)
+    given = (log_f - np.where(known, frame.focal_mean, 0.0)) / np.where(known, frame.focal_std, 1.0)
+    priors = np.where(known, GIVEN_WEIGHT * given, FOCAL_WEIGHT * (log_f - FOCAL_LOG_MEAN))
+    return np.concatenate([cameras, priors], axis=1)
 
-    def camera_residuals(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """Return the weighted entries (B, R, 6) of 3 C C' / tr(C C') - I for planes (B, 3), log_f (B, G)."""
-        f = np.exp(log_f)[:, frame.group]
-        C = frame.homographies(p)
-        C[..., :2] *= f[:, frame.reference, None, None, None]
-        C[..., :2, :] /= f[..., None, None]
-        CC = C @ C.swapaxes(-1, -2)
-        trace = np.trace(CC, axis1=-2, axis2=-1)[..., None, None]
-        E = 3.0 * CC / np.maximum(trace, 1e-300) - np.eye(3)
-        return _weighted_entries(E)
 
-    def residuals(self, frame: ReferenceFrame, theta: F64) -> F64:
-        """Residuals (B, 6 R + G) of cameras and focal priors for hypotheses (p, log f) (B, 3 + G)."""
-        cameras = self.camera_residuals(frame, theta[:, :3], theta[:, 3:]).reshape(len(theta), -1)
-        return np.concatenate([cameras, self._focal_prior_residuals(frame, theta[:, 3:])], axis=1)
+def rotation_loss(frame: ReferenceFrame, r: F64) -> tuple[F64, F64]:
+    """Costs (B,) per camera and weights (B, 6 R + G) of residuals, soft-L1 of each camera's norm."""
+    cameras, priors = np.split(r, [6 * len(frame.views)], axis=1)
+    robust, weight = soft_l1(np.sum(cameras.reshape(len(r), -1, 6) ** 2, axis=-1), SCALE)
+    cost = (robust.sum(axis=1) + np.sum(priors**2, axis=1)) / len(frame.views)
+    return cost, np.concatenate([np.repeat(weight, 6, axis=1), np.ones_like(priors)], axis=1)
 
-    def loss(self, frame: ReferenceFrame, r: F64) -> tuple[F64, F64]:
-        """Costs (B,) per camera and weights (B, 6 R + G) of residuals, soft-L1 of each camera's norm."""
-        cameras, priors = np.split(r, [6 * len(frame.views)], axis=1)
-        robust, weight = soft_l1(np.sum(cameras.reshape(len(r), -1, 6) ** 2, axis=-1), self.scale)
-        cost = (robust.sum(axis=1) + np.sum(priors**2, axis=1)) / len(frame.views)
-        return cost, np.concatenate([np.repeat(weight, 6, axis=1), np.ones_like(priors)], axis=1)
 
-    def cost(self, frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
-        """Return the robust cost (B,) per camera of planes (B, 3) with log focal lengths (B, G)."""
-        return self.loss(frame, self.residuals(frame, np.concatenate([p, log_f], axis=1)))[0]
-
-    def _focal_prior_residuals(self, frame: ReferenceFrame, log_f: F64) -> F64:
-        weak = self.focal_weight * (log_f - self.focal_log_mean) / self.focal_log_std
-        known = np.isfinite(frame.focal_std)
-        scale = np.where(known, frame.focal_std, 1.0)
-        return np.where(known, self.noise * (log_f - np.where(known, frame.focal_mean, 0.0)) / scale, weak)
+def rotation_cost(frame: ReferenceFrame, p: F64, log_f: F64) -> F64:
+    """Return the robust cost (B,) per camera of planes (B, 3) with log focal lengths (B, G)."""
+    return rotation_loss(frame, rotation_residuals(frame, np.concatenate([p, log_f], axis=1)))[0]
 
 
 def _solve_batch(N: F64, g: F64) -> F64:
@@ -132,9 +123,7 @@ def _mean_loss(r: F64, scale: float) -> tuple[F64, F64]:
     return np.nan_to_num(losses.mean(axis=1), nan=np.inf), weight
 
 
-def refine_hypotheses(
-    criterion: RotationCriterion, frame: ReferenceFrame, theta: F64, *, planes_only: bool = False
-) -> tuple[F64, F64]:
+def refine_hypotheses(frame: ReferenceFrame, theta: F64, *, planes_only: bool = False) -> tuple[F64, F64]:
     """Refine hypotheses (p, log f) (B, 3 + G) at once; return them with their costs (B,)."""
     moving = 3 if planes_only else theta.shape[1]
 
@@ -142,18 +131,18 @@ def refine_hypotheses(
         return np.concatenate([x, theta[:, moving:]], axis=1)
 
     x, cost = minimize_batch(
-        lambda x: criterion.residuals(frame, with_fixed(x)), theta[:, :moving], iterations=25,
-        loss=lambda r: criterion.loss(frame, r), damping=1e-3, decrease=5.0, max_damping=1e8, tolerance=1e-10,
+        lambda x: rotation_residuals(frame, with_fixed(x)), theta[:, :moving], iterations=25,
+        loss=lambda r: rotation_loss(frame, r), damping=1e-3, decrease=5.0, max_damping=1e8, tolerance=1e-10,
         project=lambda x: np.concatenate([x[:, :3], np.clip(x[:, 3:], -4.0, 5.4)], axis=1),
     )  # fmt: skip
     return with_fixed(x), cost
 
 
-def focal_std(criterion: RotationCriterion, frame: ReferenceFrame, theta: F64) -> F64:
+def focal_std(frame: ReferenceFrame, theta: F64) -> F64:
     """Standard deviations (G,) of the log focals at a minimum (p, log f) by (J'J)^-1; inf if singular."""
-    r = criterion.residuals(frame, theta[None])
-    J = central_differences(lambda x: criterion.residuals(frame, x), theta[None])[0]
-    root = np.sqrt(criterion.loss(frame, r)[1][0])
+    r = rotation_residuals(frame, theta[None])
+    J = central_differences(lambda x: rotation_residuals(frame, x), theta[None])[0]
+    root = np.sqrt(rotation_loss(frame, r)[1][0])
     dof = max(5 * len(frame.views) - len(theta), 1)
     noise = float(np.sqrt(np.sum((root * r[0]) ** 2) / dof))
     J = root[:, None] * J

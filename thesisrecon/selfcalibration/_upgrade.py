@@ -27,7 +27,7 @@ from thesisrecon.records import (
     Upgrade,
 )
 from thesisrecon.selfcalibration._frame import ReferenceFrame, build_frame, cannot_be_calibrated
-from thesisrecon.selfcalibration._refinement import RotationCriterion, focal_std
+from thesisrecon.selfcalibration._refinement import focal_std
 
 _MAX_OBSERVATIONS = 12000
 _VIRTUAL_POINTS = 300
@@ -290,8 +290,8 @@ def distinct_candidates(
 
 
 def select_candidate(
-    frame: ReferenceFrame, reconstruction: Reconstruction, criterion: RotationCriterion,
-    candidates: Sequence[Candidate], *, max_candidates: int = 1, min_in_front_ratio: float = 0.5,
+    frame: ReferenceFrame, reconstruction: Reconstruction, candidates: Sequence[Candidate], *,
+    max_candidates: int = 1, min_in_front_ratio: float = 0.5,
 ) -> SelfCalibration:  # fmt: skip
     """Select the best candidates of different focals with enough points in front; check them."""
     chosen: list[tuple[Candidate, Upgrade]] = []
@@ -305,7 +305,7 @@ def select_candidate(
         raise _no_candidate_failure(frame, reconstruction, len(candidates))
     candidate, best = chosen[0]
     theta = np.concatenate([candidate.plane, group_log_focals(frame, candidate.K)])
-    std_log_f = focal_std(criterion, frame, theta)
+    std_log_f = focal_std(frame, theta)
     report = check_identifiability(reconstruction, best, frame.prior)
     K_std = _calibration_std(frame, best.K, candidate, np.minimum(std_log_f[frame.group], _MAX_LOG_STD))
     reasons = _biased_focal(frame, best, report) if report.identifiable else report.sentences

@@ -23,7 +23,7 @@ from thesisrecon.optimize.least_squares import minimize_residuals, soft_l1
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration import _frame, _upgrade
 from thesisrecon.selfcalibration._frame import ReferenceFrame, SolverUnknowns
-from thesisrecon.selfcalibration._refinement import RotationCriterion, refine_hypotheses
+from thesisrecon.selfcalibration._refinement import refine_hypotheses, rotation_cost
 from thesisrecon.selfcalibration._upgrade import Candidate
 
 _ROOT2 = np.sqrt(2.0)
@@ -135,7 +135,6 @@ class KruppaEquations:
     starts = 4  # number of minima to refine
     loss_scale = 0.02  # residual of a pair beyond which it counts linearly (soft L1)
     min_common_points = 20  # minimum number of common observations of a pair
-    criterion = RotationCriterion()  # criterion that selects the candidate
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -149,9 +148,9 @@ class KruppaEquations:
         unknown = _frame.solver_unknowns(frame, prior)
         candidates = []
         for K, K_std, _ in self._solutions(pairs, unknown, len(frame.views)):
-            plane, cost = _plane_for_focals(frame, self.criterion, _upgrade.group_log_focals(frame, K))
+            plane, cost = _plane_for_focals(frame, _upgrade.group_log_focals(frame, K))
             candidates.append(Candidate(plane, K, cost, "Kruppa equations", K_std))
-        return _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
+        return _upgrade.select_candidate(frame, reconstruction, candidates)
 
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
         """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
@@ -182,7 +181,7 @@ class KruppaEquations:
         return [float(grid[k]) for k in minima[np.argsort(cost[minima], kind="stable")][: self.starts]]
 
 
-def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f: F64) -> tuple[F64, float]:
+def _plane_for_focals(frame: ReferenceFrame, log_f: F64) -> tuple[F64, float]:
     """The best plane (3,) for known log focal lengths (G,) and its cost; NaN and inf if there is none."""
     f = np.exp(log_f[frame.group])
     reference = np.array([f[frame.reference]])
@@ -194,8 +193,8 @@ def _plane_for_focals(frame: ReferenceFrame, criterion: RotationCriterion, log_f
     if not len(planes):
         return np.full(3, np.nan), np.inf
     theta = np.concatenate([planes, np.repeat(log_f[None], len(planes), axis=0)], axis=1)
-    order = np.argsort(criterion.cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:_MAX_PLANES]
-    theta, cost = refine_hypotheses(criterion, frame, theta[order], planes_only=True)
+    order = np.argsort(rotation_cost(frame, theta[:, :3], theta[:, 3:]), kind="stable")[:_MAX_PLANES]
+    theta, cost = refine_hypotheses(frame, theta[order], planes_only=True)
     best = int(np.nan_to_num(cost, nan=np.inf).argmin())
     return theta[best, :3], float(cost[best])
 

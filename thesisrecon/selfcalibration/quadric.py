@@ -143,8 +143,6 @@ class LinearQuadric:
 
     normalising_focal: float = 1.67
 
-    criterion = _refinement.RotationCriterion()  # criterion that orders the candidates
-
     @_upgrade.as_stage_failure
     def calibrate(
         self, reconstruction: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator  # noqa: ARG002
@@ -153,10 +151,10 @@ class LinearQuadric:
         frame = _frame.normalized_frame(reconstruction, prior)
         p, f = quadric_hypotheses(frame, np.array([self.normalising_focal]))
         log_f = _upgrade.group_focals_from_planes(frame, p, f)
-        cost = self.criterion.cost(frame, p, log_f)
+        cost = _refinement.rotation_cost(frame, p, log_f)
         theta = np.concatenate([p, log_f], axis=1)
         candidates = _upgrade.candidates_from_parameters(frame, theta, cost, "linear quadric")
-        found = _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
+        found = _upgrade.select_candidate(frame, reconstruction, candidates)
         # The error is a bias, not noise: it has no standard deviation.
         K_std = found.K_std.copy()
         K_std[frame.views[:, None], (0, 1), (0, 1)] = np.nan
@@ -171,7 +169,6 @@ class NonlinearQuadric:
     focal_range, focal_steps = (0.2, 40.0), 45
     starts = 5  # number of hypotheses to refine over all unknown intrinsics
     loss_scale = 0.05  # residual beyond which an entry counts linearly (Huber)
-    criterion = _refinement.RotationCriterion()  # criterion that selects the starts
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -182,7 +179,7 @@ class NonlinearQuadric:
         unknown = _frame.solver_unknowns(frame, prior)
         p, f = quadric_hypotheses(frame, np.geomspace(*self.focal_range, self.focal_steps))
         log_f = _upgrade.group_focals_from_planes(frame, p, f)
-        cost = self.criterion.cost(frame, p, log_f)
+        cost = _refinement.rotation_cost(frame, p, log_f)
         best = np.argsort(cost, kind="stable")[: self.starts]
         candidates = [
             minimize_quadric(
@@ -191,7 +188,7 @@ class NonlinearQuadric:
             )
             for b in best[np.isfinite(cost[best])]
         ]  # fmt: skip
-        return _upgrade.select_candidate(frame, reconstruction, self.criterion, candidates)
+        return _upgrade.select_candidate(frame, reconstruction, candidates)
 
 
 # Standard deviation of principal point (long sides), aspect or skew beyond which estimating focal lengths
@@ -221,7 +218,6 @@ class HypothesesAndRefinement:
     max_refined, max_full_refined = 40, 8
     max_candidates = 3  # maximum number of candidates for bundle adjustment
     min_in_front_ratio = 0.95  # required share of observations with positive depth
-    criterion = _refinement.RotationCriterion()
 
     @_upgrade.as_stage_failure
     def calibrate(
@@ -230,10 +226,10 @@ class HypothesesAndRefinement:
         """See `thesisrecon.config.SelfCalibrator.calibrate`."""
         frame = _frame.normalized_frame(reconstruction, prior)
         planes, log_f = self._propose(frame, reconstruction, rng)
-        cost = np.nan_to_num(self.criterion.cost(frame, planes, log_f), nan=np.inf)
+        cost = np.nan_to_num(_refinement.rotation_cost(frame, planes, log_f), nan=np.inf)
         best = np.argsort(cost, kind="stable")[: self.max_refined]
         theta = np.concatenate([planes[best], log_f[best]], axis=1)
-        theta, cost = _refinement.refine_hypotheses(self.criterion, frame, theta)
+        theta, cost = _refinement.refine_hypotheses(frame, theta)
         candidates = _upgrade.candidates_from_parameters(frame, theta, cost, "hypotheses and refinement")
         unknown = _frame.solver_unknowns(frame, prior)
         others = np.setdiff1d(np.arange(len(unknown.std)), unknown.focals)
@@ -241,12 +237,12 @@ class HypothesesAndRefinement:
             candidates = [
                 minimize_quadric(
                     frame, unknown, one.plane, _upgrade.group_log_focals(frame, one.K)[frame.group],
-                    method="hypotheses and nonlinear quadric", loss_scale=self.criterion.scale,
+                    method="hypotheses and nonlinear quadric", loss_scale=_refinement.SCALE,
                 )
                 for one in _upgrade.distinct_candidates(frame, candidates, self.max_full_refined)
             ]  # fmt: skip
         return _upgrade.select_candidate(
-            frame, reconstruction, self.criterion, candidates,
+            frame, reconstruction, candidates,
             max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
         )  # fmt: skip
 

@@ -10,7 +10,7 @@ from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration._frame import ProjectiveScene, projective_scene
-from thesisrecon.selfcalibration._refinement import RotationCriterion, dual_image_residuals
+from thesisrecon.selfcalibration._refinement import dual_image_residuals
 from thesisrecon.selfcalibration._upgrade import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
@@ -40,7 +40,6 @@ class Stratified:
 
     max_candidates = 1  # maximum number of candidates to return
     min_in_front_ratio = 0.5  # required share of observations with positive depth
-    criterion = RotationCriterion()  # criterion for the standard deviations of the focal lengths
 
     @as_stage_failure
     def calibrate(
@@ -50,7 +49,7 @@ class Stratified:
         scene = projective_scene(reconstruction, prior)
         candidates = self._candidates(scene, self.plane.locate(scene, rng))
         return select_candidate(
-            scene.frame, reconstruction, self.criterion, candidates,
+            scene.frame, reconstruction, candidates,
             max_candidates=self.max_candidates, min_in_front_ratio=self.min_in_front_ratio,
         )  # fmt: skip
 
