@@ -20,7 +20,7 @@ import sys
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -293,13 +293,12 @@ def _module(file: str) -> str:
 def judge_all(bench: Bench, mutants: Sequence[Mutant]) -> Iterator[Verdict]:
     """Yield the verdict of each fault in order."""
     bench.set_up()
-    judges = {m: _named_judges(m) or bench.judges(m.file) for m in mutants}
-    everything = sorted(
-        {test for lists in judges.values() for files in lists for test in files if test.endswith(".py")}
-    )
-    code, _, failed = bench.run_tests(everything, "sound", limit_s=COLD_S)
-    if code:
-        raise ValueError(f"{failed or 'a test'} fails or takes too long without any fault")
+    judges = {m: _kinds(m.judges) or bench.judges(m.file) for m in mutants}
+    everything = sorted({judge for lists in judges.values() for files in lists for judge in files})
+    for files in _kinds(everything):
+        code, _, failed = bench.run_tests(files, "sound", limit_s=COLD_S)
+        if code:
+            raise ValueError(f"{failed or files[0]} fails or takes too long without any fault")
     for number, mutant in enumerate(mutants):
         text = mutant.apply((bench.tree / mutant.file).read_text(encoding="utf-8"))
         by, seconds = "", 0.0
@@ -313,9 +312,10 @@ def judge_all(bench: Bench, mutants: Sequence[Mutant]) -> Iterator[Verdict]:
         yield Verdict(mutant, by, seconds)
 
 
-def _named_judges(mutant: Mutant) -> list[list[str]]:
-    tests = [judge for judge in mutant.judges if judge.endswith(".py")]
-    gates = [judge for judge in mutant.judges if judge not in tests]
+def _kinds(judges: Sequence[str]) -> list[list[str]]:
+    """Return test files and gates, without an empty list."""
+    tests = [judge for judge in judges if judge.endswith(".py")]
+    gates = [judge for judge in judges if judge not in tests]
     return [files for files in (tests, gates) if files]
 
 
@@ -351,6 +351,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--list", type=Path, metavar="FILE", help="own faults, as validation/faults.toml")
     parser.add_argument("--names", nargs="+", default=(), help="some faults of the list (default: all)")
+    parser.add_argument("--gates", action="store_true", help="judge faults of the list by gates alone")
     parser.add_argument("--again", action="store_true", help="repeat the uncaught faults of OUT")
     parsed = parser.parse_args(arguments)
     results: dict[Mutant, Verdict] = {}
@@ -361,6 +362,9 @@ def main(arguments: list[str] | None = None) -> int:
         mutants = [m for m, verdict in results.items() if not verdict.by and m in everything]
     elif parsed.list:
         mutants = read_faults(parsed.list, parsed.names)
+        if parsed.gates:
+            gates = [tuple(judge for judge in m.judges if not judge.endswith(".py")) for m in mutants]
+            mutants = [replace(m, judges=g) for m, g in zip(mutants, gates, strict=True) if g]
     else:
         mutants = [m for package in parsed.packages for m in draw(ROOT, package, parsed.sample, parsed.seed)]
     try:

@@ -110,7 +110,11 @@ def test_tests_judge_a_listed_fault_before_gates(monkeypatch, tmp_path, capsys):
     options = ["-o", str(tmp_path), "--list", str(LIST), "--names", "depth-maps-too-deep"]
     assert mutants.main(options) == 0
     tests, gates = ["tests/stereo/test_depth.py"], ["depth/courtyard"]
-    assert judged == [("sound", tests), ("depth-maps-too-deep", tests), ("depth-maps-too-deep", gates)]
+    sound = [("sound", tests), ("sound", gates)]
+    assert judged == [*sound, ("depth-maps-too-deep", tests), ("depth-maps-too-deep", gates)]
     assert "depth/courtyard/x" in capsys.readouterr().out
     (verdict,) = mutants.read_verdicts(tmp_path / "mutants.json")
     assert verdict.mutant == read_faults(LIST, ["depth-maps-too-deep"])[0]
+    judged.clear()
+    assert mutants.main([*options, "--gates"]) == 0
+    assert judged == [("sound", gates), ("depth-maps-too-deep", gates)]

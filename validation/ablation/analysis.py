@@ -336,28 +336,13 @@ def _cells(table: _Table, measure: Measure, condition: str) -> list[Cell]:
     scale = np.exp if table.by_quotients(measure) else np.asarray
     found = []
     for k, name in enumerate(names):
-        own, interval = table.values(measure, name, condition), intervals[k]
-        own = own[np.isfinite(own)]
+        values, interval = table.values(measure, name, condition), intervals[k]
+        own, failed = values[np.isfinite(values)], int(np.isinf(values).sum())
         low, high = (np.nan, np.nan) if interval is None else (interval.low, interval.high)
         mean, low, high = (float(scale(v)) for v in (means[k], low, high))
         middle = float(np.median(own)) if len(own) else float("nan")
-        failed = len(rows[k]) - len(own)
-        found.append(
-            Cell(
-                measure,
-                name,
-                condition,
-                mean,
-                low,
-                high,
-                middle,
-                ranks[k],
-                len(own),
-                failed,
-                float(cost[k]),
-                bool(front[k]),
-            )
-        )
+        counted, at_cost = (len(own), failed), (float(cost[k]), bool(front[k]))
+        found.append(Cell(measure, name, condition, mean, low, high, middle, ranks[k], *counted, *at_cost))
     return found
 
 

@@ -39,7 +39,8 @@ SUFFIXES = {".jpg", ".jpeg", ".png"}
 @dataclass(frozen=True)
 class Scene:
     """A set of images, sorted by name, and its truth where there is one: ``K``, ``R`` (world-to-camera)
-    (V, 3, 3) and ``C`` (V, 3) camera centres in metres. Rows of images whose camera is not known are NaN.
+    (V, 3, 3) and ``C`` (V, 3) camera centres in metres; poses without K are a truth, too. Rows of images
+    whose camera is not known are NaN.
     """
 
     name: str
@@ -50,8 +51,8 @@ class Scene:
 
     @property
     def has_truth(self) -> bool:
-        """Return whether all cameras are known."""
-        return self.truth is not None and bool(self.known.all())
+        """Return whether all cameras are known, with K."""
+        return self.K is not None and bool(self.known.all() and np.isfinite(self.K).all())
 
     @property
     def known(self) -> B8:
@@ -62,16 +63,14 @@ class Scene:
 
     @property
     def truth(self) -> tuple[F64, F64, F64] | None:
-        """Return K, R and C, None if they are not known."""
-        known = self.K is not None and self.R is not None and self.C is not None
-        return (self.K, self.R, self.C) if known else None  # type: ignore[return-value]
+        """Return K, R and C, None without poses; K is NaN if it is not known."""
+        return None if self.R is None else self.cameras_of(range(len(self.image_paths)))
 
     def cameras_of(self, views: Sequence[int]) -> tuple[F64, F64, F64]:
-        """K, R and C of some images of a scene with K, NaN where one is not known."""
-        assert self.K is not None
-        K, chosen = self.K, list(views)
-        R = np.full_like(K, np.nan) if self.R is None else self.R
-        C = np.full_like(K[..., 0], np.nan) if self.C is None else self.C
+        """K, R and C of some images, NaN where one is not known."""
+        unknown, chosen = np.full((len(self.image_paths), 3, 3), np.nan), list(views)
+        K, R = (unknown if part is None else part for part in (self.K, self.R))
+        C = unknown[..., 0] if self.C is None else self.C
         return K[chosen], R[chosen], C[chosen]
 
     @property
@@ -133,7 +132,7 @@ def with_truth(scene: Scene, model: Path) -> Scene:
     """The scene with the cameras of a model as its truth, paired as :func:`thesisrecon.compare_models` does.
 
     A file K.txt (3 x 3) beside it gives K to poses. Raises ``ValueError`` if the model has no image of the
-    scene, or no K.
+    scene.
     """
     found, paths = read_model(model), scene.image_paths
     # Images have K, so that only trajectories are paired by time or order.
@@ -151,9 +150,7 @@ def with_truth(scene: Scene, model: Path) -> Scene:
         R[n], C[n] = view.R, view.centre
         if (own := view.K if view.K is not None else common) is not None:
             K[n] = own
-    if not np.isfinite(K).any():
-        raise ValueError(f"{model} gives no image a K; put one into K.txt (3 x 3) beside it")
-    return replace(scene, K=K, R=R, C=C)
+    return replace(scene, K=K if np.isfinite(K).any() else None, R=R, C=C)
 
 
 def _calibration_beside(model: Path) -> F64 | None:

@@ -148,6 +148,8 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
         ("centre error", "mm", "centre_error_mm", CENTRE),
         ("rotation error", "deg", "rotation_error_deg", ROTATION),
     ):
+        if scene.K is None and field in ("focal_error_pct", "principal_point_error_px"):
+            continue
         values: Values = {n: None if e is None else getattr(e, field) for n, e in errors.items()}
         rows.append(row(scene.name, name, unit, values, text))
         if THESIS in values:

@@ -112,7 +112,7 @@ def common_frame(scene: Scene, ours: Reconstruction, theirs: Reconstruction) -> 
     if both.sum() < 3:
         return None
     centres = [dehomogenize(camera_centre(model.P[both])) for model in (ours, theirs)]
-    target = scene.C[both] if scene.C is not None and scene.has_truth else centres[1]
+    target = scene.C[both] if scene.C is not None and scene.known.all() else centres[1]
     try:
         moves = [estimate_similarity(C, target) for C in centres]
     except ValueError:

@@ -175,6 +175,17 @@ def test_only_pairs_count_and_failures_are_reported():
     assert "| aim = 1 | a (15 seeds) | no luck |" in str(analysis)
 
 
+def test_a_scene_without_truth_has_not_failed():
+    class WithoutTruth(Darts):
+        def unavailable(self, scene):
+            return ("miss",) if scene == "b" else ()
+
+    rows = rows_of(darts(scenes=["a", "b"], task=WithoutTruth()), lambda p: float(p.seed))
+    cells = {(c.variant, c.measure.name): (c.rows, c.failed) for c in analyse(rows).cells}
+    assert cells["aim = 1", "miss"] == (20, 0)
+    assert cells["aim = 1", "score"] == (40, 0)
+
+
 def test_each_step_of_a_ladder_is_also_compared_with_the_one_before():
     ladder = darts(mode="ladder", start="bottom")
     height = {"bottom": 5.0, "aim = 1": 3.0, "aim = 2": 2.5}

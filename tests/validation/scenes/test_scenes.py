@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import thesisrecon
+from validation.ablation.tasks.reconstruction import Reconstruction
 from validation.command import main
 from validation.runs.models import report_models
 from validation.runs.records import ReportOptions, load_images
@@ -277,13 +278,29 @@ def test_a_download_is_laid_out_by_one_command(kind, scene, tmp_path, capsys):
     assert " has no " in capsys.readouterr().err
 
 
-def test_k_alone_is_a_truth_of_intrinsics(scene, tmp_path):
-    (tmp_path / "0004.jpg").symlink_to(FOLDER / "images" / "0004.jpg")
-    np.savetxt(tmp_path / "K.txt", scene.K[0])
+def test_poses_alone_and_k_alone_are_truths_without_the_other(scene, tmp_path):
     options = ReportOptions(tmp_path / "out", ("own",), (), folders={"own": str(tmp_path)})
+    chosen = [4, 7, 10]
+    for number, k in enumerate(chosen):
+        (tmp_path / f"{number:06d}.jpg").symlink_to(scene.image_paths[k])
+    K, R, C = (part[chosen] for part in scene.cameras)
+    write_truth("KITTI", tmp_path, ["0", "1", "2"], K, R, C)
+    (tmp_path / "K.txt").unlink()
+    task, poses = Reconstruction(), load_images("own", options)
+    assert poses.K is None
+    assert not poses.has_truth
+    assert poses.known.all()
+    np.testing.assert_allclose(poses.truth[1], R, atol=1e-12)
+    np.testing.assert_allclose(poses.truth[2], C, atol=1e-12)
+    assert task.unavailable(str(tmp_path)) == {"focal_error_pct"}
+    key = task.scene_key(str(tmp_path))
+    (tmp_path / "poses.txt").unlink()
+    np.savetxt(tmp_path / "K.txt", K[0])
     found = load_images("own", options)
     assert found.truth is None
-    np.testing.assert_allclose(found.K[0], scene.K[0])
+    assert {"centre_error_mm", "auc1_pct"} <= task.unavailable(str(tmp_path))
+    assert task.scene_key(str(tmp_path)) != key
+    np.testing.assert_allclose(found.K, K)
     (tmp_path / "K.txt").write_text("1 2 3")
     with pytest.raises(ValueError, match=r"K.txt must hold the 3 x 3 numbers of K"):
         load_images("own", options)

@@ -107,7 +107,7 @@ class Reconstruction(Task):
         }
         whole = scene_or_folder(scene)
         unknown = {"focal_error_pct"} if whole.K is None else set()
-        return found | (unknown if whole.truth is not None else {*unknown, *NEED_POSES})
+        return found | unknown | (set() if whole.truth is not None else {*NEED_POSES})
 
     def steps(self, config: PipelineConfig, scene: str, seed: int) -> list[tuple[str, str]]:
         """A step is named by all settings up to it; corners alone do not depend on the seed."""
@@ -141,7 +141,7 @@ def content_key(scene: Scene, views: Sequence[int]) -> str:
     content = hashlib.sha256()
     for path in (scene.image_paths[k] for k in views):
         content.update(path.name.encode() + path.read_bytes())
-    for part in () if scene.K is None else scene.cameras_of(views):
+    for part in scene.cameras_of(views):
         content.update(np.ascontiguousarray(part).tobytes())
     return content.hexdigest()[:32]
 
@@ -177,14 +177,14 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
             found["registered_pct"] = 100.0 * float(result.projective.registered.mean())
             found["points"] = float(result.projective.valid.sum())
         return found
-    model, truth = result.metric.reconstruction, _truth_at_working_size(result, scene)
+    model = result.metric.reconstruction
     found["registered_pct"] = 100.0 * float(model.registered.sum()) / images
     found["points"] = float(model.valid.sum())
     found["trusted"] = float(result.metric.trusted)
     found["reprojection_px"] = measure_reprojection(model).median_px
-    if truth is None:
-        return found
-    found["focal_error_pct"] = measure_intrinsics(model, truth[0])[0]
+    truth = _truth_at_working_size(result, scene)
+    if scene.K is not None:
+        found["focal_error_pct"] = measure_intrinsics(model, truth[0])[0]
     if scene.truth is None:
         return found
     found |= pose_scores_pct(pose_pair_errors(model, truth))
@@ -194,9 +194,7 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
     return found
 
 
-def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras | None:
-    if scene.K is None:
-        return None
+def _truth_at_working_size(result: RunResult, scene: Scene) -> TrueCameras:
     number = {path.name: n for n, path in enumerate(scene.image_paths)}
     chosen = [number[image.name] for image in result.images]
     K, R, C = scene.cameras_of(chosen)
