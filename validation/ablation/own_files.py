@@ -2,7 +2,8 @@
 
 The text of a file and of all that it imports from outside installed packages is part of its name, so that
 rows of an edited file, or of an edited helper, are computed again. Workers get the texts, not the paths: a
-file that is edited while a study runs changes nothing.
+file that is edited while a study runs changes nothing. Data files that own code reads are watched: a row is
+found again only if all of them are as they were.
 """
 
 from __future__ import annotations
@@ -13,14 +14,19 @@ import importlib
 import importlib.abc
 import importlib.machinery
 import importlib.util
+import os
 import sys
 import sysconfig
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from thesisrecon import _numba
 from thesisrecon.errors import UsageError, unknown_word
+from validation.scenes.real import cache_folder
 
 PREFIX = "ablation_own_"
 OURS = ("thesisrecon", "validation")
@@ -111,7 +117,8 @@ def load_own(word: str, where: str, folder: Path = Path()) -> Any:
     digest = hashlib.sha256(content.encode()).hexdigest()[:16]
     source = Source(f"{PREFIX}{path.stem}_{digest}", str(path), text, helpers)
     try:
-        module = source.install()
+        with watched():
+            module = source.install()
     except Exception as error:
         raise UsageError(f"{where}: {path} does not run: {type(error).__name__}: {error}") from None
     _SOURCES[source.module] = source
@@ -181,3 +188,61 @@ def _file_of(module: str, folder: Path) -> Path | None:
 def _is_installed(file: str | Path | None) -> bool:
     """Whether a file belongs to Python or to an installed package."""
     return file is not None and any(Path(file).resolve().is_relative_to(folder) for folder in INSTALLED)
+
+
+# ---------------------------------------------------------------- data files
+
+
+class _Watch:
+    """Files that this process opens while own code runs; also in earlier rows, whose data code may keep."""
+
+    def __init__(self) -> None:
+        self.running, self.installed = False, False
+        self.read, self.written = set[str](), set[str]()
+
+    def __call__(self, event: str, details: tuple[Any, ...]) -> None:
+        if self.running and event == "open" and isinstance(details[0], str | os.PathLike):
+            writes = details[2] & (os.O_WRONLY | os.O_RDWR)
+            (self.written if writes else self.read).add(str(Path(details[0]).absolute()))
+
+
+_WATCH = _Watch()
+
+
+@contextmanager
+def watched() -> Iterator[None]:
+    """Note the files that are opened in the block."""
+    if not _WATCH.installed:
+        sys.addaudithook(_WATCH)
+    _WATCH.installed, before, _WATCH.running = True, _WATCH.running, True
+    try:
+        yield
+    finally:
+        _WATCH.running = before
+
+
+def read_files(out: Path) -> dict[str, str]:
+    """Data files that own code has read in this process, with digests; without those of ``out``, of caches,
+    of the system and of installed packages, and those that it writes.
+    """
+    aside = (out, cache_folder(""), *map(Path, map(os.path.expanduser, SYSTEM)), _numba.cache_folder())
+    paths = [Path(name) for name in sorted(_WATCH.read - _WATCH.written)]
+    kept = [p for p in paths if not _is_installed(p) and not any(p.is_relative_to(f) for f in aside)]
+    return {str(p): digest_of(str(p)) for p in kept if p.is_file() and p.suffix not in (".py", ".pyc")}
+
+
+SYSTEM = ("/proc", "/sys", "/dev", "/etc", "/usr", "~/.cache", "~/.config")
+
+
+def digest_of(path: str) -> str:
+    """Digest of the content of a file, empty if it cannot be read."""
+    try:
+        state = Path(path).stat()
+        return _digest(path, state.st_mtime_ns, state.st_size)
+    except OSError:
+        return ""
+
+
+@cache
+def _digest(path: str, *_: int) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from thesisrecon.runtime._executors import (
     is_dask_address,
 )
 from validation.ablation.changes import Setting
-from validation.ablation.own_files import Source, loaded_sources
+from validation.ablation.own_files import Source, digest_of, loaded_sources, read_files, watched
 from validation.ablation.plan import Plan, PlannedRow, plan_study
 from validation.ablation.study import FunctionTask, Place, Study
 from validation.runs.processes import run_jobs
@@ -110,7 +110,7 @@ def read_earlier_rows(study: Study, out: str | Path) -> Rows:
     """Return the rows of a study in ``out`` by variant, condition, scene and seed, whatever the code and the
     settings that they were computed with; the newest of several.
     """
-    plan, store, keys = plan_study(study), Store(Path(out)), dict[tuple[Any, ...], str]()
+    plan, store, keys = plan_study(study), Store(Path(out), earlier=True), dict[tuple[Any, ...], str]()
     for path in sorted((store.path / ROWS).glob("*.json"), key=lambda p: (p.stat().st_mtime_ns, p.name)):
         record = read_json(path)
         if isinstance(record, dict):
@@ -152,7 +152,8 @@ def _finite(metrics: Mapping[str, float], wanted: Collection[str]) -> tuple[dict
 @dataclass(frozen=True)
 class Outcome:
     """Result of a row: its numbers, or the error message ``failure``; wall and processor seconds; the keys of
-    the shared ``steps`` it reused. ``lost``: the process ended before the row.
+    the shared ``steps`` it reused; the data ``files`` that own code read, with digests. ``lost``: the process
+    ended before the row.
     """
 
     metrics: Mapping[str, float] = field(default_factory=dict)
@@ -161,13 +162,15 @@ class Outcome:
     cpu_s: float = 0.0
     steps: tuple[str, ...] = ()
     lost: bool = False
+    files: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Store:
-    """The folder of a study."""
+    """The folder of a study; rows of edited data files are not found again, unless they are ``earlier``."""
 
     path: Path
+    earlier: bool = False
 
     def prepare(self) -> None:
         """Create the folder; :class:`OutputError` if it cannot be written."""
@@ -181,6 +184,9 @@ class Store:
         """Return the outcome of this key, or None if absent or damaged."""
         record = read_json(self.path / kind / f"{key}.json")
         try:
+            files = {} if self.earlier else dict(record["files"])
+            if any(digest_of(path) != digest for path, digest in files.items()):
+                return None
             metrics = {str(name): float(value) for name, value in record["metrics"].items()}
             seconds, cpu_s = float(record["seconds"]), float(record["cpu_s"])
             return Outcome(metrics, str(record["failure"]), seconds, cpu_s, tuple(record["steps"]))
@@ -315,9 +321,10 @@ def _pack(setting: Setting) -> tuple[bytes, tuple[Source, ...]]:
 
 def carry_out(job: Job) -> Outcome:
     """Compute the row or the step. Errors are recorded; a full disk raises :class:`OutputError`."""
-    for source in job.sources:
-        source.install()
-    setting: Setting = pickle.loads(job.setting)
+    with watched():
+        for source in job.sources:
+            source.install()
+        setting: Setting = pickle.loads(job.setting)
     own = job.out / WORK / job.key
     shutil.rmtree(own, ignore_errors=True)
     place, given = Place(own, job.out / SHARED), (setting.config, job.scene, job.seed)
@@ -325,7 +332,7 @@ def carry_out(job: Job) -> Outcome:
     metrics, failure = dict[str, float](), ""
     try:
         own.mkdir(parents=True, exist_ok=True)
-        with _time_limit(job.limit_s):
+        with _time_limit(job.limit_s), watched() if _is_foreign(job, setting) else nullcontext():
             if job.step:
                 setting.task.prepare(*given, place, step=job.step)
             else:
@@ -343,7 +350,13 @@ def carry_out(job: Job) -> Outcome:
         failure = f"{type(error).__name__}: {error} ({where})"
     seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
     shutil.rmtree(own, ignore_errors=True)
-    return Outcome(metrics, failure, seconds, cpu_s)
+    return Outcome(metrics, failure, seconds, cpu_s, files=read_files(job.out))
+
+
+def _is_foreign(job: Job, setting: Setting) -> bool:
+    """Whether code of the user runs; that of the project has the content of its scenes in its keys."""
+    task = setting.task.function if isinstance(setting.task, FunctionTask) else type(setting.task)
+    return bool(job.sources) or not task.__module__.startswith("validation.")
 
 
 class _TooLongError(BaseException):

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 from dataclasses import dataclass
 
 import pytest
@@ -10,8 +11,9 @@ import pytest
 from tests.validation.ablation.toy import Darts, Steps, marks
 from thesisrecon.errors import OutputError, UsageError
 from validation.ablation import Study, ablate, analyse, read_rows
-from validation.ablation.own_files import helpers_of
+from validation.ablation.own_files import PREFIX, helpers_of
 from validation.ablation.plan import study_from_table
+from validation.ablation.run import read_earlier_rows
 
 
 def study(log, **more):
@@ -159,6 +161,46 @@ def test_an_edited_helper_is_computed_again(tmp_path, executor):
         (tmp_path / name).write_text(text, encoding="utf-8")
         assert misses() == {miss}
     assert len(list((tmp_path / "out" / "rows").iterdir())) == 2 * 4
+
+
+OWN_READER = """
+from pathlib import Path
+import numpy as np
+SCALE = float(Path(__file__).with_name("scale.txt").read_text())
+def read(config, scene, seed):
+    Path(__file__).with_name("seen.txt").write_text(scene)
+    assert Path(__file__).with_name("seen.txt").read_text() == scene
+    return {"miss": SCALE * float(np.loadtxt(scene).mean())}
+"""
+
+
+@pytest.mark.parametrize("executor", ["local", "processes"])
+def test_edited_data_that_a_task_reads_is_computed_again(tmp_path, executor):
+    scene, scale, out = tmp_path / "scene.txt", tmp_path / "scale.txt", tmp_path / "out"
+    (tmp_path / "mine.py").write_text(OWN_READER, encoding="utf-8")
+    table = {"task": "mine.py:read", "scenes": [str(scene)], "seeds": 1, "metrics": ["miss"]}
+    table["axes"] = {"dense.max_side": [512]}
+
+    def misses():
+        study = study_from_table(table, tmp_path)
+        rows = ablate(study, out, executor=executor, threads=1)
+        assert len(rows) == 2
+        for name in [name for name in sys.modules if name.startswith(PREFIX)]:
+            del sys.modules[name]  # As in a new process, which reads the scale again
+        return {r.metrics["miss"] for r in rows}
+
+    scale.write_text("2")
+    scene.write_text("1 2 3")
+    assert misses() == {4.0}
+    before = sorted(p.stat().st_mtime_ns for p in (out / "rows").iterdir())
+    assert misses() == {4.0}
+    assert sorted(p.stat().st_mtime_ns for p in (out / "rows").iterdir()) == before
+    scene.write_text("4 5 6")
+    assert len(read_rows(study_from_table(table, tmp_path), out)) == 0
+    assert len(read_earlier_rows(study_from_table(table, tmp_path), out)) == 2
+    assert misses() == {10.0}
+    scale.write_text("3")
+    assert misses() == {15.0}
 
 
 def test_helpers_are_those_outside_installed_packages(tmp_path):
