@@ -1,12 +1,15 @@
 """Stated intervals hold the truth as often as they say; how cameras of one kind scatter, and who borrows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.metric.metric_stage import refine, scatter, with_few_points, with_xy
 from tests.synthetic import make_scene
-from thesisrecon.metric import _uncertainty, refinement
+from thesisrecon.metric import _adjustment, _uncertainty, refinement
 from thesisrecon.metric._adjustment import tail_width
+from thesisrecon.metric._model import FOCAL
 from validation.metrics.cameras import pose_scores
 
 
@@ -54,6 +57,28 @@ def test_the_last_model_is_at_the_minimum_of_its_inliers_which_have_no_wrong_pix
     # Adjustments between which inliers are chosen again end at a tenth of a standard deviation.
     assert max(heavy) < 0.006
     assert np.mean(accepted) < 0.15
+
+
+@pytest.mark.parametrize("views", [3, 6])
+def test_one_adjustment_ends_where_its_predicted_gain_says(monkeypatch, views):
+    """With heavy tails it converges linearly: the gain left is that at which it ends, and not a step less."""
+    ends, finish, rng = [], refinement.finish_metric, np.random.default_rng(0)
+    monkeypatch.setattr(refinement, "finish_metric", lambda *given: ends.append(finish(*given)) or ends[-1])
+    scene = make_scene(sigma_px=0.5, points=150, views=views, seed=0)
+    refine(with_xy(scene, scene.tracks.xy + 0.5 * rng.standard_t(2.0, size=scene.tracks.xy.shape)))
+    model, adjustment = ends[-1][:2]
+
+    def off(start):
+        return adjustment.run(start, iterations=0, keep_noise=True)[1].sigmas_to_minimum
+
+    for longer in (1.01, 1.1, 1.3):
+        rows = model.cameras.intrinsics.copy()
+        rows[:, FOCAL] *= longer
+        start = replace(model, cameras=replace(model.cameras, intrinsics=rows))
+        assert off(start) > 4.0
+        # Half the square of the distance in standard deviations is 1e-4, between choices of inliers 5e-3.
+        assert off(adjustment.run(start, settled=_adjustment.SETTLED, keep_noise=True)[0]) < 0.02
+        assert off(adjustment.run(start, keep_noise=True)[0]) < 0.08
 
 
 def test_less_noise_is_a_narrower_interval_and_heavy_tails_bring_the_floor():
