@@ -211,7 +211,8 @@ def _print_gates(results: Results, gates: Mapping[str, Gate]) -> None:
         if row.limit is not None:
             sign = "<=" if row.direction == "at most" else ">="
             value = "none" if row.value is None else f"{row.value:.4g}"
-            print(f"{row.verdict:8} {row.key}: {value} {sign} {row.limit:g} {row.unit}")
+            more = " (better than measured: show the change with --update)" * (row.verdict == "moved")
+            print(f"{row.verdict:8} {row.key}: {value} {sign} {row.limit:g} {row.unit}{more}")
     for key in results.missing:
         why = [words for task, words in results.failures.items() if task.split("/")[:2] == key.split("/")[:2]]
         print(f"missed   {key}: no method reported this number{''.join(f' ({words})' for words in why[:1])}")

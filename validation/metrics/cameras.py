@@ -58,8 +58,9 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
         raise ValueError(f"measure_cameras needs one truth per view; got {counts}")
     known = np.isfinite(truth[2][registered]).all(axis=1)
     views = registered[known]
+    intrinsics = measure_intrinsics(reconstruction, truth[0])
     if not len(views):
-        return CameraErrors(np.nan, np.nan, None, np.nan)
+        return CameraErrors(*intrinsics, None, np.nan)
     R_true, C_true = truth[1][views], truth[2][views]
     R = _rotations_translations(reconstruction)[0][known]
     try:
@@ -69,7 +70,7 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     except ValueError:
         centre_error = None
     turn = float(np.median(rotation_errors_deg(R, R_true)))
-    return CameraErrors(*measure_intrinsics(reconstruction, truth[0]), centre_error, turn)
+    return CameraErrors(*intrinsics, centre_error, turn)
 
 
 def measure_intrinsics(reconstruction: Reconstruction, K_true: F64) -> tuple[float, float]:

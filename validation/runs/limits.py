@@ -16,15 +16,12 @@ from typing import Any
 import numpy as np
 
 from thesisrecon.io._files import write_text
-from validation.runs.results import GATES_FILE, Gate, read_gates
+from validation.runs.results import GATES_FILE, MARGIN, Gate, read_gates
 from validation.runs.tables import text_table
 
-MARGIN = 5.0
-"""Distance of a limit from the measured value in units of noise: one false alarm in three million runs of
-normal noise, and less than one in a thousand where the noise is known from five runs only."""
-LEAST_NOISE = (
-    5e-3  # Relative: other processors and versions of libraries, where seeds agree to the last digit
-)
+LEAST_NOISE = 1e-3
+"""Relative, where seeds and processors agree to the last digit."""
+STEADY = 5  # Runs that show that the noise is smaller than the entry says
 HEAD = """\
 # Limits of the gates: "stage/scene/number". Written by `python -m validation check --update` and
 # `python -m validation limits OUT ... --write`; {measured}, {noise} and {REFERENCE} in a reason become the
@@ -88,7 +85,9 @@ def moved_gate(
     noise = _rounded(noise if gate.fixed else max(noise, least), up=True, digits=2)
     if gate.measured is not None and gate.noise is not None:
         moved = abs(measured - gate.measured) > max(gate.noise, least)
-        if not moved and (len(values) == 1 or noise <= 1.5 * gate.noise):
+        # Fewer runs may agree by chance.
+        steadier = len(values) >= STEADY and noise < gate.noise / 1.5
+        if not (moved or steadier) and (len(values) == 1 or noise <= 1.5 * gate.noise):
             measured, noise = gate.measured, gate.noise
     named = {name: _shown(references.get(name, old)) for name, old in gate.references.items()}
     after = replace(gate, measured=_shown(measured), noise=noise, references=named)

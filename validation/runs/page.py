@@ -82,7 +82,11 @@ def _verdict(rows: Iterable[Row], missing: Sequence[str]) -> dict[str, Any]:
         sentence = f"{numbers} reported, none with a limit."
         return {"level": "open", "word": "Nothing promised here", "sentence": sentence, "reasons": ()}
     summary = f"{len(judged) - len(broken)} of {len(judged) + len(missing)} limits are reached"
-    reasons = [f"{r.key}: {number(r.value)} {r.unit}, {r.direction} {number(r.limit)}" for r in broken]
+    reasons = [
+        f"{r.key}: {'no value' if r.value is None else f'{number(r.value)} {r.unit}'.rstrip()}, "
+        f"{r.direction} {number(r.limit)}{', much better than measured' * (r.verdict == 'moved')}"
+        for r in broken
+    ]
     reasons += [f"{key}: no method reported this number" for key in missing]
     if reasons:
         return {"level": "bad", "word": "Broken", "sentence": f"{summary}.", "reasons": reasons}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,6 @@ from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from validation.metrics.cameras import (
     focal_errors_pct,
     measure_cameras,
-    measure_intrinsics,
     measure_reprojection,
     pose_pair_errors,
 )
@@ -138,9 +138,7 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, folder: Path) 
 def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
     rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
-    truth = scene.truth
-    if truth is None:
-        return rows if scene.K is None else [*rows, *_intrinsic_errors(scene, models)]
+    truth = scene.cameras_of(range(len(scene.image_paths)))
     errors = {n: None if m is None else measure_cameras(m, truth) for n, m in models.items()}
     for name, unit, field, text in (
         ("focal error", "%", "focal_error_pct", FOCAL),
@@ -148,31 +146,19 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
         ("centre error", "mm", "centre_error_mm", CENTRE),
         ("rotation error", "deg", "rotation_error_deg", ROTATION),
     ):
-        if scene.K is None and field in ("focal_error_pct", "principal_point_error_px"):
+        if (scene.R if unit in ("mm", "deg") else scene.K) is None:
             continue
         values: Values = {n: None if e is None else getattr(e, field) for n, e in errors.items()}
         rows.append(row(scene.name, name, unit, values, text))
         if THESIS in values:
             rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], text))
+    if scene.R is None:
+        return rows
     pairs = {n: pose_pair_errors(m, truth) for n, m in models.items()}
     for threshold in (1.0, 5.0):
         areas: Values = {n: 100.0 * area_under_recall(e, threshold) for n, e in pairs.items()}
         rows.append(row(scene.name, f"AUC@{threshold:g}°", "%", areas, AUC, more=True))
     return rows
-
-
-def _intrinsic_errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
-    """Errors of images of which K alone is known."""
-    assert scene.K is not None
-    K = scene.K
-    errors = (
-        each(models, lambda m: measure_intrinsics(m, K)[0]),
-        each(models, lambda m: measure_intrinsics(m, K)[1]),
-    )
-    return [
-        row(scene.name, "focal error", "%", errors[0], FOCAL),
-        row(scene.name, "principal point error", "px", errors[1], PRINCIPAL_POINT),
-    ]
 
 
 def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
@@ -262,6 +248,12 @@ def _stated(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
     rows = [
         row(scene.name, "trusted", "", trusted, "1: passed its self-check", more=True),
         row(scene.name, "refused without a reason", "", silent, "images"),
+    ]
+    checks = {n: r["self_check"] for n, r in records.items() if r.get("self_check")}
+    noise, off = (each(checks, itemgetter(name)) for name in ("sigma_rel", "sigmas_to_minimum"))
+    rows += [
+        row(scene.name, "noise", "", noise, "noise of the observations over the longer side of the image"),
+        row(scene.name, "distance to the minimum", "", off, "of the adjusted cameras, standard deviations"),
     ]
     if scene.K is None or not records:
         return rows

@@ -15,6 +15,7 @@ from thesisrecon.camera import compose_camera
 from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
 from thesisrecon.io._images import read_images
 from thesisrecon.pipeline.matching import match_views
 from thesisrecon.records import Image, TwoView
@@ -42,6 +43,7 @@ FRONT_ENDS = (OURS, THESIS, SIFT)
 CORNERS = 1000
 VERIFIED = "mean over the pairs; none if F is wrong"
 NOISE = "median over the pairs of the noise of the verified matches"
+FROM_TRUTH = "mean over the pairs of the RMS distance of verified matches, at most 1 px each"
 MAX_SIZE_PX = 1600
 WITH_DEPTH = ("courtyard",)  # Scenes with true depth, which gives the position of a corner in the next image
 
@@ -71,7 +73,7 @@ class FeaturesStage(Stage):
             corners: dict[str, Any] = {f"{i}": _corners(task.method, m) for i, m in enumerate(images)}
             np.savez(folder / "corners.npz", **corners)
         if task.method != HARRIS:
-            np.savez(folder / "matches.npz", **_matches(task.method, images, options))
+            np.savez(folder / "matches.npz", **_matches(task.method, images, scene, options))
 
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
@@ -103,7 +105,7 @@ def _corners(method: str, image: Image) -> F64:
     return sift_corners(image, CORNERS) if method == SIFT else harris_corners(image, CORNERS)
 
 
-def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> dict[str, Any]:
+def _matches(method: str, images: tuple[Image, ...], scene: Scene, options: ReportOptions) -> dict[str, Any]:
     # All with the estimator of F and the verification of the default.
     config, thesis = preset("default"), preset("thesis")
     if method == SIFT:
@@ -120,7 +122,17 @@ def _matches(method: str, images: tuple[Image, ...], options: ReportOptions) -> 
         arrays[f"F{gap}"] = np.array([in_original_pixels(v.F, images[v.i], images[v.j]) for v in views])
         arrays[f"inliers{gap}"] = np.array([view.inliers for view in views])
         arrays[f"sigma{gap}"] = np.array([view.sigma_px for view in views])
+        arrays[f"off{gap}"] = np.array([_distance_from_truth(v, images, scene) for v in views])
     return arrays
+
+
+def _distance_from_truth(view: TwoView, images: tuple[Image, ...], scene: Scene) -> float:
+    """RMS distance (working px) of the matches from their true epipolar lines, at most ``RIGHT_PX`` each."""
+    K, R, C = scene.cameras_of((view.i, view.j))
+    F = fundamental_from_cameras(*compose_camera(K, R, -np.einsum("vab,vb->va", R, C)))
+    first, second = (images[k].original_from_working for k in (view.i, view.j))
+    d = symmetric_residuals(second.T @ F @ first, view.xy1, view.xy2) / np.sqrt(2.0)
+    return float(np.sqrt(np.mean(np.minimum(d, RIGHT_PX) ** 2)))
 
 
 def in_original_pixels(F: F64, first: Image, second: Image) -> F64:
@@ -132,15 +144,16 @@ def in_original_pixels(F: F64, first: Image, second: Image) -> F64:
 def _match_metrics(
     scene: str, gap: int, pairs: list[RealPair], found: Mapping[str, dict[str, Any] | None]
 ) -> list[Metric]:
-    verified, right, sigma = (Values(dict.fromkeys(found)) for _ in range(3))
+    verified, right, sigma, off = (Values(dict.fromkeys(found)) for _ in range(4))
     for name, arrays in found.items():
         if arrays is not None:
-            F, inliers, noise = (arrays[f"{what}{gap}"] for what in ("F", "inliers", "sigma"))
+            F, inliers, noise, distance = (arrays[f"{n}{gap}"] for n in ("F", "inliers", "sigma", "off"))
             truths = [pair.truth for pair in pairs if pair.truth is not None]
             good = np.array([rms_epipolar_distance(*both) < RIGHT_PX for both in zip(F, truths, strict=True)])
             verified[name] = float(inliers[good].sum() / len(pairs))
             right[name] = float(100.0 * good.mean())
             sigma[name] = float(np.median(noise[good])) if good.any() else None
+            off[name] = float(np.mean(distance[good])) if good.any() else None
     where = f"(i, i+{gap})"
     return [
         row(scene, f"{THESIS}: verified matches {where}", "", verified[THESIS], VERIFIED, more=True),
@@ -148,6 +161,8 @@ def _match_metrics(
         row(scene, f"verified matches {where}", "", verified, VERIFIED, more=True),
         row(scene, f"right F {where}", "%", right, "share of the pairs whose F is right", more=True),
         row(scene, f"noise {where}", "px", sigma, NOISE),
+        row(scene, f"{THESIS}: distance from true lines {where}", "px", off[THESIS], FROM_TRUTH),
+        row(scene, f"distance from true lines {where}", "px", off, FROM_TRUTH),
     ]
 
 

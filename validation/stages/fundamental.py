@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.arrays import B8, F64
+from thesisrecon.epipolar.refinement import refine_fundamental
 from thesisrecon.geometry.two_view import epipoles
+from thesisrecon.testing import assert_fundamental
 from validation.metrics.fundamental_precision import NONE_PX, rms_epipolar_distance
 from validation.references.fundamental import estimate_with
 from validation.references.libraries import NoReference
@@ -69,8 +72,10 @@ class FundamentalStage(Stage):
         answer(pairs[0], 0)  # compiles
         answers = [[answer(pair, options.seed + seed) for seed in range(_seeds(options))] for pair in pairs]
         none = np.full((3, 3), np.nan)
+        own = [_deviations(pair) for pair in pairs] if (task.method, task.scene) == (OURS, GATED) else []
         np.savez(
             folder / "answers.npz",
+            deviations=np.reshape(own, (-1, 2)),
             F=[[none if F is None else F for F, _, _ in found] for found in answers],
             inliers=[[float(inliers.sum()) for _, inliers, _ in found] for found in answers],
             seconds=[[seconds for _, _, seconds in found] for found in answers],
@@ -85,6 +90,17 @@ class FundamentalStage(Stage):
         if scene == GATED:
             metrics += _gated(scene, pairs[: len(load_images(scene, options).image_paths) - 1], answers)
         return Judgement(metrics, notes, [_plot(errors)])
+
+
+def _deviations(pair: RealPair) -> tuple[float, float]:
+    """Error of F, and the distance of its refinement from the minimum, in stated standard deviations."""
+    fit = estimate_fundamental(pair.xy1, pair.xy2, threshold_px=THRESHOLD_PX, seed=0)
+    right = pair.xy1[fit.inliers], pair.xy2[fit.inliers]
+    refined = refine_fundamental(fit.F, *right)
+    minimum = refine_fundamental(refined, *right)
+    pairs = (fit, pair.F), (replace(fit, F=refined), minimum)
+    error, off = (assert_fundamental(found, F, false_alarm=1e-300) for found, F in pairs)
+    return error, off
 
 
 def _seeds(options: ReportOptions) -> int:
@@ -139,14 +155,22 @@ def _metrics(
 
 def _gated(scene: str, pairs: list[RealPair], answers: Mapping[str, Answers | None]) -> list[Metric]:
     """Return the rows that have gates: the same pairs and seeds in a quick and a full report."""
+    kinds = ("F", "inliers", "seconds")
     some = {
-        name: None if a is None else {key: found[: len(pairs), :_QUICK_SEEDS] for key, found in a.items()}
+        name: None if a is None else {kind: a[kind][: len(pairs), :_QUICK_SEEDS] for kind in kinds}
         for name, a in answers.items()
     }
     rows = _metrics(
         scene, pairs, some, {n: None if a is None else _errors(a, pairs) for n, a in some.items()}
     )
     rows = [one for one in rows if "error" in one.name or "angle" in one.name]
+    if (own := answers.get(OURS)) is not None:
+        error, off = np.sqrt(np.mean(own["deviations"][: len(pairs)] ** 2, axis=0))
+        text = "RMS of the pairs, in stated standard deviations"
+        rows += [
+            row(scene, "error in deviations", "", float(error), f"error of F: {text}"),
+            row(scene, "distance of the refinement", "", float(off), f"from the minimum: {text}"),
+        ]
     return [replace(one, name=f"neighbours: {one.name}") for one in rows]
 
 

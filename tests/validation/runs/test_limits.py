@@ -35,6 +35,19 @@ def test_limits_stand_five_noise_units_from_the_mean_and_fixed_ones_stay():
     assert (sharp.measured, sharp.limit) == (2e-12, 1e-6)
 
 
+def test_five_runs_show_less_noise_and_fewer_do_not():
+    steady = [1.0, 1.001, 0.999, 1.0005, 1.0002]
+    assert moved_gate(ERROR, steady[:4], {}) == ERROR
+    assert moved_gate(ERROR, steady, {}).limit == pytest.approx(1.0 + MARGIN * 0.001, abs=2e-3)
+
+
+def test_a_number_much_better_than_measured_has_moved():
+    verdicts = {value: ERROR.verdict(value) for value in (1.06, 1.04, 0.96, 0.94, None, float("nan"))}
+    assert list(verdicts.values()) == ["missed", "reached", "reached", "moved", "missed", "missed"]
+    assert [SHARE.verdict(value) for value in (87.0, 92.0, 93.0)] == ["missed", "reached", "moved"]
+    assert RANK.verdict(0.0) == "reached"
+
+
 def test_only_moved_gates_are_written_in_the_same_order(tmp_path, capsys):
     path, runs = tmp_path / "gates.toml", [a_run(error=2.0, colmap=4.0)]
     write_gates(GATES, path)

@@ -21,6 +21,7 @@ from validation.runs.page import write_pages
 from validation.runs.records import Judgement, ReportOptions
 from validation.runs.report import run_tasks
 from validation.runs.results import Gate, Results, Row, collect, read_gates, write_results
+from validation.runs.tables import plot
 from validation.scenes.real import ROOT
 from validation.studies.robustness import stopped
 
@@ -153,6 +154,7 @@ def test_a_run_starts_from_no_unlike_one(change, tmp_path):
         (2.0, {"COLMAP": None, "ours, fast": 1.0}, "at most", None),
         (None, {"COLMAP": 1.0}, "at most", None),
         (0.0, {"COLMAP": 1.0}, "at most", None),
+        (3e-14, {"COLMAP": 0.04}, "at most", None),
     ],
 )
 def test_a_ratio_above_one_is_always_worse(value, reference, direction, expected):
@@ -172,6 +174,24 @@ def test_pages_without_limits_and_with_all_reached_are_written(limit, tmp_path):
     word = "Nothing promised here" if limit is None else "Reached"
     for path in (page, tmp_path / "scene-yard.html"):
         assert f'<p class="word">{word}</p>' in path.read_text(encoding="utf-8")
+
+
+def test_the_page_names_gates_that_moved_or_have_no_value_and_reserves_room_for_plots(tmp_path):
+    rows = [
+        Row(f"toy/yard/{name}", "yard", name, value, unit, "at most", 3.0, {}, "", verdict)
+        for name, value, unit, verdict in (("c", 1.0, "px", "moved"), ("d", None, "", "missed"))
+    ]
+    plots = [plot("high", [], "x", "y", height=777), plot("any", [], "x", "y")]
+    options = toy_options(tmp_path, quick=True)
+    results = Results(rows, [], {}, {"commit": "none"}, options.to_json())
+    assert results.broken == rows
+    judged = {("toy", "yard"): (Judgement([], plots=plots), {})}
+    page = write_pages(options, STAGES, judged, results).read_text(encoding="utf-8")
+    assert "toy/yard/c: 1 px, at most 3, much better than measured" in page
+    assert "toy/yard/d: no value, at most 3" in page
+    scene = (tmp_path / "scene-yard.html").read_text(encoding="utf-8")
+    assert scene.count("min-height: 777px") == 1
+    assert scene.count('class="plot"') == 2
 
 
 MISSING = "raise ModuleNotFoundError(\"No module named '{0}'\", name='{0}')"

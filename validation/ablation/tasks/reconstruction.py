@@ -23,7 +23,6 @@ from validation.ablation.study import Measure, Place, Task, window_names, window
 from validation.metrics.cameras import (
     TrueCameras,
     measure_cameras,
-    measure_intrinsics,
     measure_reprojection,
     pose_pair_errors,
 )
@@ -183,14 +182,13 @@ def _measured(result: RunResult, scene: Scene, images: int) -> dict[str, float]:
     found["trusted"] = float(result.metric.trusted)
     found["reprojection_px"] = measure_reprojection(model).median_px
     truth = _truth_at_working_size(result, scene)
-    if scene.K is not None:
-        found["focal_error_pct"] = measure_intrinsics(model, truth[0])[0]
-    if scene.truth is None:
-        return found
-    found |= pose_scores_pct(pose_pair_errors(model, truth))
     errors = measure_cameras(model, truth)
-    found["rotation_error_deg"] = errors.rotation_error_deg
-    found["centre_error_mm"] = np.nan if errors.centre_error_mm is None else errors.centre_error_mm
+    if scene.K is not None:
+        found["focal_error_pct"] = errors.focal_error_pct
+    if scene.truth is not None:
+        found |= pose_scores_pct(pose_pair_errors(model, truth))
+        found["rotation_error_deg"] = errors.rotation_error_deg
+        found["centre_error_mm"] = np.nan if errors.centre_error_mm is None else errors.centre_error_mm
     return found
 
 
