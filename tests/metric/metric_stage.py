@@ -64,5 +64,5 @@ def scatter(contradiction, blocks=32):
     """Variances and ratios of one, with so much contradiction between the blocks."""
     one = np.ones((1, 8))
     return BlockScatter(
-        one, np.ones(8), one, one, np.full((2, 1, 2), np.nan), np.zeros((1, 8)), contradiction, blocks
+        one, np.ones(8), one, one, np.full((2, 1, 2), np.nan), 0.0 * one, 0.0 * one, contradiction, blocks
     )

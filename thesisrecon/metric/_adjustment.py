@@ -46,6 +46,7 @@ SETTLED, ROUND_SETTLED = 1e-4, 5e-3
 larger if the observations are chosen again after it."""
 MAX_CHANGE = 0.05
 """Relative change of centres and focal lengths up to which the simpler camera model is accurate enough."""
+CENTRE_DOF = 3  # degrees of freedom of the prior of the principal point: the fewest with a finite variance
 FOCAL_AND_CENTRE = np.isin(np.arange(LENS_WIDTH), (FOCAL, *CENTRE))
 
 
@@ -99,15 +100,19 @@ class MetricAdjustment:
             std[row, K1 : K1 + len(coefficients)] = coefficients
             std[row, DECENTRING] = DECENTRING_STD if self.decentred else 0.0
         # Images may be crops: the principal point has a bivariate t distribution, whose weight over that of
-        # the normal one falls with the distance from the mean; 3 degrees of freedom: a finite variance.
-        dof = 3.0
+        # the normal one falls with the distance from the mean.
         off, known = model.cameras.intrinsics[:, CENTRE] - mean[:, CENTRE], std[:, CENTRE] > 0.0
         squared = np.sum(np.where(known, off, 0.0) ** 2, axis=1, keepdims=True)
-        std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (dof + 2.0)), 0.0))
+        std[:, CENTRE] = np.hypot(std[:, CENTRE], np.where(known, np.sqrt(squared / (CENTRE_DOF + 2.0)), 0.0))
         unknown = ~np.isfinite(mean)
         mean[unknown] = model.cameras.intrinsics[unknown]
         kinds = {} if self.hierarchical is None else vars(self.hierarchical)
         return IntrinsicsPrior.unshared(mean, std, **kinds)
+
+    def shares_a_lens(self, model: MetricEstimate) -> bool:
+        """Whether some views share a lens whose coefficients are estimated."""
+        first = np.unique(model.cameras.group, return_index=True)[1]
+        return bool((_shares_a_lens(model) & (self.prior.std[first, K1] > 0.0)).any())
 
     def free(self, model: MetricEstimate) -> B8:
         """Which of the intrinsics are estimated in some camera."""

@@ -48,6 +48,18 @@ def with_best_lens(
     return best, adjustment
 
 
+def with_decentring(
+    model: MetricEstimate, adjustment: MetricAdjustment
+) -> tuple[MetricEstimate, MetricAdjustment]:
+    """The model of a nearly straight lens with the lens model "brown", which is decentred."""
+    prior = replace(adjustment.prior, lens_model="brown")
+    group, shared = _model.camera_rows(prior)
+    rows = model.cameras.intrinsics[model.cameras.group[np.unique(group, return_index=True)[1]]]
+    rows = np.pad(rows, ((0, 0), (0, _model.LENS_WIDTH - _model.WIDTH)))
+    cameras = replace(model.cameras, intrinsics=rows, group=group, shared=shared)
+    return replace(model, cameras=cameras), replace(adjustment, prior=prior, decentred=True)
+
+
 def _settled(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
     """Adjust all and triangulate again, until the points beyond the first view angles have joined."""
     for _ in range(3):
@@ -82,13 +94,18 @@ def undetermined_lens(
     return (Notice("lens-undetermined", where, _reason(model, motion)),)
 
 
-def _reason(model: MetricEstimate, motion: Mapping[str, float]) -> str:
-    """Why the lens is not determined: points in the middle, parallel views of a plane, or forward motion."""
-    t, views = model.tracks, np.flatnonzero(model.registered)
+def reach_of_points(model: MetricEstimate) -> float:
+    """Distance from the image centre, over the half diagonal, within which 99 % of the points lie."""
+    t = model.tracks
     sizes = model.sizes[t.view_index[model.inlier]]
     off = 2.0 * t.xy[model.inlier] - (sizes - 1.0)
-    reach = float(np.quantile(np.linalg.norm(off, axis=1) / np.linalg.norm(sizes, axis=1), 0.99))
-    if reach < MIN_REACH:
+    return float(np.quantile(np.linalg.norm(off, axis=1) / np.linalg.norm(sizes, axis=1), 0.99))
+
+
+def _reason(model: MetricEstimate, motion: Mapping[str, float]) -> str:
+    """Why the lens is not determined: points in the middle, parallel views of a plane, or forward motion."""
+    views = np.flatnonzero(model.registered)
+    if (reach := reach_of_points(model)) < MIN_REACH:
         return (
             f"99 % of the points lie within {reach:.0%} of the half diagonal. Fill the images with the scene"
         )

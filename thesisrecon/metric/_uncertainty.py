@@ -20,8 +20,8 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
-from thesisrecon.metric._adjustment import HierarchicalPrior, MetricAdjustment
-from thesisrecon.metric._model import ASPECT, CENTRE, DECENTRING, FOCAL, K1, SKEW, MetricEstimate
+from thesisrecon.metric._adjustment import CENTRE_DOF, HierarchicalPrior, MetricAdjustment
+from thesisrecon.metric._model import ASPECT, CENTRE, DECENTRING, FOCAL, K1, SKEW, WIDTH, MetricEstimate
 from thesisrecon.optimize.bundle.projection import calibrations
 from thesisrecon.optimize.bundle.scatter import BlockScatter, PoseUncertainty
 from thesisrecon.optimize.least_squares import MAD_FACTOR, student_factor
@@ -196,9 +196,13 @@ def intrinsic_intervals(
 
     They contain the errors of a fixed aspect, skew and decentring as those of the poses do.
     """
-    floors, prior = _std_floor(model, scatter), adjustment.row_prior(model)
+    floors, largest = _std_floor(model, scatter), adjustment.row_prior(model).std
+    # The prior of the principal point has longer tails than a normal one.
+    tails = np.where(np.isin(np.arange(largest.shape[1]), CENTRE), student_factor(CENTRE_DOF), 1.0)
+    largest *= tails
     share = lack_of_fit(scatter, model.tail)
     faults = MODEL_FLOOR_REL * np.sqrt(share) * np.linalg.norm(uncertainty.intrinsic_fault, axis=1)
+    faults = np.maximum(faults, np.abs(uncertainty.decentring_change))
     answer: list[dict[str, IntrinsicInterval]] = [{} for _ in model.registered]
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]
@@ -210,11 +214,12 @@ def intrinsic_intervals(
                 continue
             ratios = float(scatter.ratio[g, column]), float(scatter.large_ratio[g, column])
             inflation, floor = _inflation(scatter, *ratios, share), float(floors[g, column])
-            # A value that the images leave to its prior is as uncertain as the prior is wrong.
-            noise = float(np.hypot(inflation * np.sqrt(variance), scatter.pull[g, column]))
+            # A value that the images leave to its prior is as uncertain as the prior, however they agree.
+            part = (tails[column] ** 2 - inflation**2) * scatter.prior_variance[g, column]
+            noise = np.sqrt(inflation**2 * variance + max(part, 0.0) + scatter.pull[g, column] ** 2)
             fault = float(faults[uncertainty.number[g, column]])
             measured = float(np.hypot(noise, fault))
-            std = min(float(np.hypot(measured, floor)), float(prior.std[g, column]))
+            std = min(float(np.hypot(measured, floor)), float(largest[g, column]))
             if floor > measured:
                 how = "bundle adjustment; the interval is the camera-model error floor"
                 how += f" of {floor:.1%}" if column == FOCAL else ""
@@ -242,22 +247,42 @@ def widen_unverified_focals(intervals: Intervals, focal_std: F64) -> Intervals:
     return tuple(answer)
 
 
-def widen_by_camera_model(intervals: Intervals, difference: tuple[float, float], misfit: float) -> Intervals:
-    """Add the differences to a richer camera model to the standard deviations, or scale these by the misfit.
+def widen_by_camera_model(intervals: Intervals, difference: Sequence[float], misfit: float) -> Intervals:
+    """Add the differences to another camera model to the standard deviations, or scale these by the misfit.
 
-    Of focals, and principal points over the focal; if 0, variances times ``misfit`` (Birge ratio).
+    Of focals, principal points over the focal, and k1; if 0, variances times ``misfit`` (Birge ratio).
     """
-    moved = {"focal_px": difference[0], "principal_x_px": difference[1], "principal_y_px": difference[1]}
+    names = ("focal_px",), ("principal_x_px", "principal_y_px"), ("k1",)
+    moved = {name: rel for group, rel in zip(names, difference, strict=False) for name in group}
     factor = 1.0 if any(difference) else np.sqrt(misfit)
     answer: list[dict[str, IntrinsicInterval]] = [dict(own) for own in intervals]
     for own in filter(None, answer):
         for name, rel in moved.items():
             if name in own and own[name].std > 0.0 and (rel > 0.0 or factor > 1.0):
-                std, off = own[name].std, rel * own["focal_px"].value
+                std, off = own[name].std, rel * (1.0 if name == "k1" else own["focal_px"].value)
                 # The larger part names the interval.
                 source = CAMERA_MODEL if factor > 1.0 or off > std else own[name].source
                 own[name] = replace(own[name], std=float(np.hypot(factor * std, off)), source=source)
     return tuple(answer)
+
+
+def changes_by_expected_lens(
+    model: MetricEstimate, adjustment: MetricAdjustment, uncertainty: PoseUncertainty
+) -> tuple[float, float, float]:
+    """Largest changes of focals (relative), principal points (over the focal), k1 to the expected distortion.
+
+    Of a lens of small distortion, to first order: to the conditional mean given the means of the prior.
+    """
+    if model.cameras.intrinsics.shape[1] > WIDTH:
+        return 0.0, 0.0, 0.0
+    number, C = uncertainty.number, uncertainty.covariance
+    of_lens = np.unique(number[:, K1:][number[:, K1:] >= 0])
+    off = np.zeros(len(C))
+    off[number[number >= 0]] = (model.cameras.intrinsics - adjustment.row_prior(model).mean)[number >= 0]
+    moved = C[:, of_lens] @ np.linalg.solve(C[np.ix_(of_lens, of_lens)], off[of_lens])
+    change = np.abs(np.append(moved, 0.0)[number])
+    over_focal = change[:, CENTRE] / model.cameras.intrinsics[:, :1]
+    return float(change[:, FOCAL].max()), float(over_focal.max()), float(change[:, K1].max())
 
 
 def pose_std(

@@ -11,17 +11,30 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from thesisrecon import records
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import Join, check_returned, returned_cameras, self_check
-from thesisrecon.metric._lens import undetermined_lens, with_best_lens
+from thesisrecon.metric._lens import (
+    MIN_REACH,
+    reach_of_points,
+    undetermined_lens,
+    with_best_lens,
+    with_decentring,
+)
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
-from thesisrecon.optimize.bundle.scatter import BlockScatter, LinearisedFit, block_scatter, pose_uncertainty
+from thesisrecon.optimize.bundle.scatter import (
+    BlockScatter,
+    LinearisedFit,
+    block_scatter,
+    decentring_score,
+    pose_uncertainty,
+)
 from thesisrecon.optimize.least_squares import noise_from_distances
 
 MAX_REMAINING = 0.25
@@ -63,8 +76,8 @@ class MetricRefinement:
         model, adjustment = with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
-        settled = settle_camera_model(finish_metric(model, adjustment))
-        assessed = _assess(settled, reconstruction.tracks, calibration, reasons)
+        model, adjustment, finished = _finished_with_decentring(model, adjustment)
+        assessed = _assess(settle_camera_model(finished), reconstruction.tracks, calibration, reasons)
         if assessed[0].trusted:
             return assessed[0]
         part = _trusted_part(assessed, model, adjustment, reconstruction.tracks, calibration)
@@ -115,6 +128,11 @@ def _assess(
         model, adjustment, critical=critical, contradicted=bool(enlarged)
     )
     intervals = _uncertainty.widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
+    angles = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
+    if undetermined_lens(model, angles, motion) or (critical and reach_of_points(model) < MIN_REACH):
+        # Distortion in the middle of the images is hardly told from other errors.
+        expected = _uncertainty.changes_by_expected_lens(model, adjustment, uncertainty)
+        intervals = _uncertainty.widen_by_camera_model(intervals, expected, 1.0)
     report = check_returned(model, adjustment, motion, intervals)
     poses = _uncertainty.pose_std(model, uncertainty, scatter, intervals)
     intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
@@ -207,6 +225,21 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     scatter = block_scatter(fit)
     single = scatter if hierarchical is None else block_scatter(alone.linearised(model))
     return _Finished(model, adjustment, _uncertainty.per_camera_estimates(model, alone, single), fit, scatter)
+
+
+def _finished_with_decentring(
+    model: MetricEstimate, adjustment: MetricAdjustment
+) -> tuple[MetricEstimate, MetricAdjustment, _Finished]:
+    """Finish a model; a nearly straight lens is decentred if a score test and held-out observations agree."""
+    finished = finish_metric(model, adjustment)
+    narrow = adjustment.prior.lens_model == "auto" and model.cameras.intrinsics.shape[1] == _model.WIDTH
+    limit = scipy.special.chdtri(2, 1e-3)
+    if narrow and adjustment.shares_a_lens(model) and decentring_score(finished.fit) > limit:
+        free = with_decentring(model, adjustment)
+        decentred = finish_metric(*free)
+        if _adjustment.predicts_better(finished[:2], decentred[:2]):
+            return *free, decentred
+    return model, adjustment, finished
 
 
 def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:

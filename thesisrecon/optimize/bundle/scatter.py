@@ -23,6 +23,7 @@ from thesisrecon.optimize.bundle.covariance import (
 )
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicUnknowns, number_unknowns
 from thesisrecon.optimize.bundle.projection import (
+    LENS,
     POSE_DOF,
     Jacobians,
     MetricCameras,
@@ -52,7 +53,8 @@ class BlockScatter:
     its expectation, NaN for fixed intrinsics, ``large_ratio`` that of the ``large_blocks``; ``pose_ratios``
     (2, V, 2) are both of the rotation and the position of each observed view, NaN where not measured.
     ``overdispersion`` is the scatter between blocks over that between single points, 1 for independent noise.
-    ``pull`` (G, C) is the step by which the prior moves the values.
+    ``pull`` (G, C) is the step by which the prior moves the values, ``prior_variance`` (G, C) the part of the
+    variance that is the prior's and not the images'.
     """
 
     variance: F64
@@ -61,6 +63,7 @@ class BlockScatter:
     large_ratio: F64
     pose_ratios: F64
     pull: F64
+    prior_variance: F64
     overdispersion: float
     blocks: int
 
@@ -119,6 +122,7 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     estimated, number = values.number >= 0, values.number
     covariance = rows[len(poses) :, first:]
     variance, pull = np.diag(covariance), covariance @ values.terms.gradient(fit.start)
+    of_prior = np.sum((covariance @ values.terms.information()) * covariance, axis=1)
     place_of = np.where(estimated, len(poses) + number, 0)
     pose_ratios = np.full((2, first), np.nan)
     pose_ratios[:, poses] = ratio[: len(poses)], large[: len(poses)]
@@ -129,6 +133,7 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
         np.where(estimated, large[place_of], np.nan),
         pose_ratios.reshape(2, -1, 2, 3).mean(axis=3),
         np.append(pull, 0.0)[np.where(estimated, number, -1)],
+        np.append(of_prior, 0.0)[np.where(estimated, number, -1)],
         float(np.mean(ratio[valid]) / np.mean(alone[valid])) if valid.any() else np.nan,
         int(block.max()) + 1,
     )
@@ -143,7 +148,8 @@ class PoseUncertainty:
     intrinsics, ``response`` (V, 6, n) the derivative by each of the n unknown intrinsics, ``covariance``
     (n, n) theirs, ``number`` (G, C) theirs in the table, -1 if fixed. ``fault`` (V, 6, 4) is the change by a
     unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966), and
-    ``intrinsic_fault`` (n, 4) that of the intrinsics.
+    ``intrinsic_fault`` (n, 4) that of the intrinsics; ``decentring_change`` (n,) is that by the decentring
+    that the images show, 0 if that may be chance.
     """
 
     views: I64
@@ -153,6 +159,7 @@ class PoseUncertainty:
     number: I64
     fault: F64
     intrinsic_fault: F64
+    decentring_change: F64
 
     def variances(self, noise: F64, std: F64, fault: float) -> F64:
         """Total variances (V, 6) for factors ``noise`` (V, 6) on standard deviations, and of other causes.
@@ -182,7 +189,10 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
         rows = np.arange(POSE_DOF * v, POSE_DOF * (v + 1))
         own = known(unit_columns(first, rows))[rows]
         variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
-    moved = fit.solve(np.asarray(fit.J.T @ _faults(fit)))
+    fields = _faults(fit)
+    moved = fit.solve(np.asarray(fit.J.T @ fields))
+    score, decentring = _decentring(fit, fields, moved)
+    beyond_chance = score > scipy.special.chdtri(2, 0.05)
     return PoseUncertainty(
         fit.views,
         np.maximum(variance, 0.0),
@@ -191,7 +201,34 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
         fit.values.number,
         turn @ moved[:first].reshape(n, POSE_DOF, -1),
         moved[first:],
+        moved[first:, 2:] @ decentring if beyond_chance else np.zeros(D - first),
     )
+
+
+def decentring_score(fit: LinearisedFit) -> float:
+    """Twice the decrease of the cost that decentring promises, from a fit without it (score test, Rao 1948).
+
+    Chi-square with two degrees of freedom if the lens is centred.
+    """
+    fields = _faults(fit)
+    return _decentring(fit, fields, fit.solve(np.asarray(fit.J.T @ fields)))[0]
+
+
+def _decentring(fit: LinearisedFit, fields: F64, moved: F64) -> tuple[float, F64]:
+    """Return the score of the last two faults, and the coefficients (2,) of one step from zero.
+
+    Zeros if the lens is decentred already, or the observations do not determine the coefficients.
+    """
+    fields, moved = fields[:, 2:], moved[:, 2:]
+    whole = fields.T @ fields
+    information = whole - (fit.J.T @ fields).T @ moved
+    known = np.linalg.eigvalsh(information)[0] > 1e-9 * np.trace(whole)
+    if not known or np.isin(fit.values.column, (LENS - 2, LENS - 1)).any():
+        return 0.0, np.zeros(2)
+    # At the minimum residuals and prior have no gradient by the unknowns.
+    gradient = fields.T @ fit.residual
+    step = np.linalg.solve(information, gradient)
+    return float(gradient @ step), step
 
 
 def _faults(fit: LinearisedFit) -> F64:
