@@ -110,7 +110,7 @@ def patched():
 
     def sequence(images, frames, **_):
         views = [np.full((8, 8, 3), 40 * k, np.uint8) for k in range(frames)]
-        return ViewSequence(lambda k: views[k], {"images": ["x"]}, [{} for _ in views], ["x"] * frames)
+        return ViewSequence(lambda k: views[k], {"images": ["x"]}, [{} for _ in views])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_frames, "_decoded", decoded)
@@ -127,7 +127,7 @@ def patched():
 KNOWN = (
     *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json",
     "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
-    "frames.json", "strip.html", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
+    "frames.json", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
     "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "scene.mvs",
 )  # fmt: skip
 """Files that --overwrite may replace; the following survive it, too."""

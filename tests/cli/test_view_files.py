@@ -83,7 +83,6 @@ def test_interpolation_begins_and_ends_as_the_photographs(run, capsys):
 
 def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run, tmp_path):
     wanted = ["render", str(run), "--path", "orbit", "--frames", "6", "--size", "120x80"]
-    wanted += ["--background", "#102030"]
     for threads in ("1", "2"):
         assert run_command([*wanted, "-o", str(tmp_path / threads), "--threads", threads]) == 0
     one, two = tmp_path / "1", tmp_path / "2"
@@ -93,8 +92,8 @@ def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run,
     frames = [pixels(one / f"frame-000{k}.png") for k in range(1, 7)]
     for frame in frames:
         assert frame.shape == (80, 120, 3)
-        assert (frame[0, 0] == [16, 32, 48]).all()
-        drawn = (frame != [16, 32, 48]).any(axis=2)
+        drawn = frame.any(axis=2)
+        assert not drawn[0, 0]
         assert 0.1 < drawn.mean() < 0.9
         y, x = np.nonzero(drawn)
         assert abs(x.mean() - 59.5) < 3
@@ -102,14 +101,7 @@ def test_an_orbit_shows_the_model_from_all_sides_and_threads_change_no_byte(run,
     assert np.abs(frames[0] - frames[3]).mean() > 4
 
 
-def test_light_changes_the_colours_and_a_bare_model_is_lit(run, tmp_path):
-    mean = {}
-    for light in ("none", "camera", "sun"):
-        folder = tmp_path / light
-        assert run_command(["render", str(run), "--frames", "1", "--light", light, "-o", str(folder)]) == 0
-        mean[light] = pixels(folder / "frame-0001.png")
-    assert np.abs(mean["none"] - mean["camera"]).mean() > 1
-    assert np.abs(mean["sun"] - mean["camera"]).mean() > 1
+def test_a_bare_model_is_lit(run, tmp_path):
     cube = TexturedMesh(
         np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) * 0.7,
         np.array([[0, 1, 2], [3, 2, 1], [4, 6, 5], [7, 5, 6], [0, 4, 1], [5, 1, 4]]),
@@ -138,8 +130,6 @@ def test_a_shorter_command_removes_the_earlier_frames(run):
         (["--size", "100x9000"], "sides of 1 to 8192 pixels"),
         (["--size", "-5x7"], "--size takes WIDTHxHEIGHT"),
         (["--path", "spiral"], "--path"),
-        (["--light", "moon"], "--light"),
-        (["--background", "mauvish"], "--background takes a colour as white or #20304f; got 'mauvish'"),
         (["-o", ""], "the folder has no name"),
     ],
 )

@@ -10,7 +10,6 @@ import pytest
 
 from tests.report.synthetic import Structure, Witness, unpacked
 from thesisrecon.cli.commands import run_command
-from thesisrecon.report._page import strip_page
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 MARK = "header-of-a-photograph"
@@ -85,16 +84,6 @@ def test_names_add_no_element_and_no_attribute_and_headers_are_nowhere(pages):
     for path in pages[1].parent.rglob("*"):
         if path.is_file():
             assert MARK.encode() not in path.read_bytes()
-
-
-def test_names_add_nothing_to_a_strip():
-    frames = [("0 %", np.zeros((60, 80, 3), np.uint8)), ("100 %", np.zeros((60, 80, 3), np.uint8))]
-    plain = strip_page("Between a and b", frames, notes=["c"])
-    for snare in (*SNARES, "</script>", "</title>", "</style>"):
-        named = [(f"{caption} {snare}", rgb) for caption, rgb in frames]
-        evil = strip_page(f"Between {snare} and b", named, notes=[snare])
-        assert Structure(evil).elements == Structure(plain).elements
-        assert scripts(evil) == scripts(plain)
 
 
 @pytest.mark.browser

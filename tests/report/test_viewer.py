@@ -18,7 +18,7 @@ from thesisrecon.io._models import read_model
 from thesisrecon.records import Similarity, TexturedMesh
 from thesisrecon.report import _figures
 from thesisrecon.report._figures import LEVELS, upright_rotation, viewer_data
-from thesisrecon.report._page import comparison_page, render_report, strip_page
+from thesisrecon.report._page import comparison_page, render_report
 
 
 def unpacked(text, kind, columns):
@@ -398,24 +398,3 @@ def test_a_browser_draws_both_models(browser, tmp_path):
     for points in ((255, 199, 138), (159, 216, 247)):
         assert (np.abs(colors - points).max(axis=1) < 30).sum() > 20
     assert seen.errors == []
-
-
-@pytest.mark.browser
-def test_one_turns_through_the_pictures_of_a_strip(browser, tmp_path):
-    levels = (20, 120, 220)
-    frames = [(f"picture <{k}>", np.full((60, 80, 3), level, np.uint8)) for k, level in enumerate(levels)]
-    page = strip_page("Between <a> and b", frames, notes=["all is well"])
-    assert "all is well." in page
-    seen = page_in(browser, tmp_path, page, drawn=())
-    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - levels[0]) < 4
-    seen.page.locator("#place").press("ArrowRight")
-    assert seen.page.inner_text("#caption") == "picture <1>"
-    assert abs(int(seen.pixels("#shown")[30, 40, 0]) - levels[1]) < 4
-    seen.page.click("#play")
-    for caption in ("picture <2>", "picture <0>"):
-        seen.page.locator("#caption", has_text=caption).wait_for()
-    seen.page.click("#play")
-    assert seen.page.inner_text("#play") == "Play"
-    assert seen.errors == []
-    assert not [url for url in seen.requests if not url.startswith(("file:", "data:"))]
-    seen.context.close()

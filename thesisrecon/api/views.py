@@ -24,7 +24,7 @@ from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views import tensor
 from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
-from thesisrecon.views.render import Shading, render_mesh
+from thesisrecon.views.render import render_mesh
 
 _COARSE = 4  # Reduction at which the largest disparity of a rectified pair is searched, up to half its width
 
@@ -317,17 +317,16 @@ def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfi
 
 
 def render(
-    mesh: TexturedMesh, camera: Camera, *, shading: Shading | None = None,
-    background: tuple[int, int, int] = (0, 0, 0), samples: int = 2, threads: int = 1,
+    mesh: TexturedMesh, camera: Camera, *, background: tuple[int, int, int] = (0, 0, 0), samples: int = 2,
+    threads: int = 1,
 ) -> RenderedView:  # fmt: skip
     """Render a mesh with a z-buffer, exact in perspective (section 2.6).
 
     Parameters
     ----------
     mesh, camera : TexturedMesh, Camera
-        Mesh with a texture, vertex colours or neither (light grey), and camera without distortion.
-    shading : Shading, optional
-        Lighting. None shows the texture as photographed.
+        Mesh with a texture or vertex colours, shown as photographed, or neither (grey, lit from the camera),
+        and camera without distortion.
     background : tuple of int, or of float
         Colour of empty pixels, 0 to 255, or 0 to 1 as floats.
     samples : int
@@ -356,13 +355,10 @@ def render(
     arrays.whole_number("render", "threads", threads, 1)
     if not isinstance(camera, Camera):
         raise ValueError(f"render needs a thesisrecon.Camera as camera; got a {type(camera).__name__}")
-    if not (shading is None or isinstance(shading, Shading)):
-        raise ValueError(f"render needs a Shading or None as shading; got a {type(shading).__name__}")
     (behind,) = arrays.numbers("render", background=background)
     if behind.shape != (3,) or not np.isfinite(behind).all():
         rule = "background, three levels from 0 to 255 (or floats from 0 to 1)"
         raise ValueError(f"render needs {rule}; got {background!r}")
     colour = tuple(arrays.eight_bit(arrays.image_levels(background)[0])[0].tolist())
-    return render_mesh(
-        as_mesh("render", mesh), camera, shading=shading, background=colour, samples=samples, threads=threads
-    )
+    mesh = as_mesh("render", mesh)
+    return render_mesh(mesh, camera, background=colour, samples=samples, threads=threads)

@@ -233,8 +233,6 @@ _SCALE = typer.Option("--scale", metavar="NAME1 NAME2 DISTANCE", help=_SCALE_HEL
 _ALIGN_HELP = "Known camera positions: a CSV of name,x,y,z or name,lat,lon,alt."
 _PATH_HELP = "Camera path: orbit the model, or interpolate between the cameras."
 _SIZE_HELP = "Frame size (px); by default that of the first image, at most 1000."
-_LIGHT_HELP = "Lighting: none, camera headlight or sun."
-_BACKGROUND_HELP = "Background colour, such as white or #20304f."
 _METHOD_HELP = "Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."
 _TWO_IMAGES = typer.Argument(parser=common.parse_folder, metavar="IMAGE IMAGE", help="Two image files.")
 Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
@@ -351,8 +349,6 @@ def render(
     path: Annotated[Literal["orbit", "interpolate"], typer.Option("--path", help=_PATH_HELP)] = "orbit",
     frames: Frames = 90,
     size: Annotated[str | None, typer.Option("--size", metavar="WxH", help=_SIZE_HELP)] = None,
-    light: Annotated[Literal["none", "camera", "sun"], typer.Option("--light", help=_LIGHT_HELP)] = "none",
-    background: Annotated[str, typer.Option("--background", help=_BACKGROUND_HELP)] = "black",
     folder: Annotated[Path | None, common.folder_option("Output folder (OUT/views/PATH).")] = None,
     threads: common.Threads = 0,
     overwrite: common.Overwrite = False,
@@ -365,9 +361,9 @@ def render(
 
     with common.interruptible("repeat the command to render all frames"), common.progress_bars() as progress:
         written = render_run(
-            run, folder or run / "views" / path, path=path, frames=frames,
-            size=None if size is None else _size(size), light=light, background=_color(background),
-            threads=threads or available_threads(), progress=progress, overwrite=overwrite,
+            run, folder or run / "views" / path, path=path, frames=frames, progress=progress,
+            size=None if size is None else _size(size), threads=threads or available_threads(),
+            overwrite=overwrite,
         )  # fmt: skip
     typer.echo(written)
 
@@ -380,16 +376,6 @@ def _size(text: str) -> tuple[int, int]:
     if not 1 <= min(width, height) <= max(width, height) <= 8192:
         raise UsageError(f"--size takes sides of 1 to 8192 pixels; got {width}x{height}")
     return width, height
-
-
-def _color(text: str) -> tuple[int, int, int]:
-    """Parse a colour name, "#rrggbb" or "rgb(...)"."""
-    import PIL.ImageColor
-
-    try:
-        return PIL.ImageColor.getrgb(text.strip())[:3]
-    except ValueError:
-        raise UsageError(f"--background takes a colour as white or #20304f; got {text!r}") from None
 
 
 def interpolate(
@@ -408,7 +394,7 @@ def interpolate(
     common.cap_threads(threads)
     if max_size is not None and max_size < 64:
         raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
-    from thesisrecon.cli.view_files import STRIP, interpolate_images
+    from thesisrecon.cli.view_files import interpolate_images
 
     folder = folder or Path("views") / method
     with common.interruptible("repeat the command to compute all frames"), common.progress_bars() as progress:
@@ -417,8 +403,6 @@ def interpolate(
             threads=threads or available_threads(), progress=progress, overwrite=overwrite,
         )  # fmt: skip
     typer.echo(written)
-    if (page := folder / STRIP).is_file():
-        typer.echo(f"page: {printable(str(page))}")
 
 
 app = typer.Typer(

@@ -23,23 +23,19 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._exports import frame_name, write_animation, write_image
-from thesisrecon.io._files import is_partial, printable, read_json, write_json, write_text
+from thesisrecon.io._files import is_partial, printable, read_json, write_json
 from thesisrecon.io._images import read_image
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder
 from thesisrecon.pipeline.run import Progress
 from thesisrecon.records import Image, TexturedMesh
-from thesisrecon.report._page import strip_page
 from thesisrecon.runtime._executors import Workers
 from thesisrecon.views.interpolation import detect_monotonicity_violations
-from thesisrecon.views.paths import estimate_up, interpolate_cameras, orbit, sample_surface
-from thesisrecon.views.render import Light, Shading
+from thesisrecon.views.paths import interpolate_cameras, orbit, sample_surface
 from thesisrecon.views.tensor import camera_at
 
-MODEL, CAMERAS, FRAMES, STRIP = "model.glb", "cameras.json", "frames.json", "strip.html"
-_OWN = re.compile(
-    r"frames\.json|frame-\d{4}\.png|strip\.html|(orbit|interpolate|interpolation|tensor)\.(webp|png)"
-)
+MODEL, CAMERAS, FRAMES = "model.glb", "cameras.json", "frames.json"
+_OWN = re.compile(r"frames\.json|frame-\d{4}\.png|(orbit|interpolate|interpolation|tensor)\.(webp|png)")
 """Names of the files of these commands."""
 _MIDWAY = 0.5
 
@@ -51,9 +47,7 @@ class ViewSequence:
     draw: Callable[[int], U8]
     facts: dict[str, Any]
     entries: Sequence[dict[str, Any]]
-    #: of the frames and of the whole on a page; without captions there is none
-    captions: Sequence[str] = ()
-    notes: Sequence[str] = ()
+    milliseconds: int = 100  #: of a frame in the animation
 
 
 def interpolated_sequence(
@@ -68,13 +62,8 @@ def interpolated_sequence(
     known = int(np.isfinite(disparity).sum())
     violations = float(detect_monotonicity_violations(disparity).sum() / max(known, 1))
     facts = {"images": names, "violating_monotonicity": violations, "known": pair.known}
-    captions = [f"{100 * (1.0 - s):.0f} % {names[0]}, {100 * s:.0f} % {names[1]}" for s in path]
-    note = (
-        f"{100.0 * pair.known:.0f} % of the pixels have a correspondence; {100.0 * violations:.1f} % of "
-        "these violate monotonicity, where near surfaces occlude far ones"
-    )
     entries = [{"weights": [1.0 - s, s]} for s in path]
-    return ViewSequence(lambda k: pair.view(path[k], threads=threads), facts, entries, captions, [note])
+    return ViewSequence(lambda k: pair.view(path[k], threads=threads), facts, entries)
 
 
 def trilinear_sequence(
@@ -95,19 +84,7 @@ def trilinear_sequence(
         {"baselines": s, "R": camera.rotation, "t": camera.translation, "K": camera.K}
         for s, camera in zip(positions, path, strict=True)
     ]
-    note = (
-        f"the focal lengths are assumed to be {pair.K1[0, 0]:.0f} and {pair.K2[0, 0]:.0f} px; lengths are in "
-        "units of the distance between the two cameras"
-    )
-    captions = []
-    for s in positions:
-        if s < 0.0:
-            captions.append(f"{-s:.2f} baselines before {first.name}")
-        elif s > 1.0:
-            captions.append(f"{s - 1.0:.2f} baselines beyond {second.name}")
-        else:
-            captions.append(f"{100.0 * s:.0f} % of the way from {first.name} to {second.name}")
-    return ViewSequence(lambda k: views.render(path[k], threads=threads), facts, entries, captions, [note])
+    return ViewSequence(lambda k: views.render(path[k], threads=threads), facts, entries)
 
 
 METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
@@ -116,8 +93,7 @@ METHODS = {"interpolation": interpolated_sequence, "tensor": trilinear_sequence}
 
 def render_run(
     out: Path, folder: Path, *, path: str = "orbit", frames: int = 90, size: tuple[int, int] | None = None,
-    light: str = "none", background: tuple[int, int, int] = (0, 0, 0), threads: int = 1,
-    progress: Progress | None = None, overwrite: bool = False,
+    threads: int = 1, progress: Progress | None = None, overwrite: bool = False,
 ) -> str:  # fmt: skip
     """Render the model of a run; write frames, an animation and ``frames.json``; return a sentence."""
     mesh, cameras = _read_run(out)
@@ -128,15 +104,11 @@ def render_run(
         else:
             points = sample_surface(mesh)
             views = orbit(cameras, points if len(points) else mesh.vertices, frames, size=size)
-        shading = _shading(mesh, cameras, light)
-
-        def draw(k: int) -> U8:
-            return render(mesh, views[k], shading=shading(views[k]), background=background).color
-
-        facts = {"path": path, "light": light, "background": background, "width": width, "height": height}
+        facts = {"path": path, "width": width, "height": height}
         # The cameras as in cameras.json.
         entries = [{key: getattr(view, key) for key in ("K", "R", "t", "centre")} for view in views]
-        return _write_views(outputs, path, ViewSequence(draw, facts, entries), Workers(threads), progress)
+        sequence = ViewSequence(lambda k: render(mesh, views[k]).color, facts, entries, milliseconds=40)
+        return _write_views(outputs, path, sequence, Workers(threads), progress)
 
 
 def interpolate_images(
@@ -144,7 +116,7 @@ def interpolate_images(
     max_size_px: int | None = None, threads: int = 1, progress: Progress | None = None,
     overwrite: bool = False,
 ) -> str:  # fmt: skip
-    """Compute views between images; write frames, an animation, ``strip.html`` and ``frames.json``."""
+    """Compute views between images; write frames, an animation and ``frames.json``."""
     if len(paths) != 2:
         raise UsageError(f"interpolate takes 2 images; got {len(paths)}")
     for path in paths:
@@ -178,26 +150,23 @@ def _claimed(
         if foreign := [name for name in strange if name != LOCK_FILE and not is_partial(name)]:
             raise UsageError(Notice("foreign-frames", folder, foreign[0]))
 
-    names = [FRAMES, *map(frame_name, range(1, frames + 1)), f"{name}.webp", *[STRIP] * (name in METHODS)]
+    names = [FRAMES, *map(frame_name, range(1, frames + 1)), f"{name}.webp"]
     return claim_folder(folder, overwrite=overwrite, names=names, check=check)
 
 
 def _write_views(
     outputs: OutputFolder, name: str, views: ViewSequence, workers: Workers, progress: Progress | None
 ) -> str:
-    """Write the frames, then animation, page and description; return a sentence."""
+    """Write the frames, then animation and description; return a sentence."""
     folder, frames = outputs.path, [frame_name(k + 1) for k in range(len(views.entries))]
     # Files of an earlier command, but for frames that this one replaces.
     outputs.remove([old for old in outputs.digests if _OWN.fullmatch(old) and old not in frames])
     sizes, warnings, report = set[Any](), list[str](), progress or (lambda *_: None)
     files, film, done = [folder / frame for frame in frames], folder / f"{name}.webp", 0
-    drawn: list[tuple[str, U8]] = []
 
     def write(k: int) -> None:
         rgb = views.draw(k)
         sizes.add(rgb.shape[1::-1])
-        if views.captions:
-            drawn.append((views.captions[k], rgb))
         write_image(files[k], rgb)
 
     def finished(*_: Any) -> None:
@@ -207,11 +176,8 @@ def _write_views(
         report("views", done, len(frames) + 1)
 
     workers.run(write, [(k,) for k in range(len(frames))], finished)
-    animate = partial(write_animation, film, files, milliseconds=100 if views.captions else 40)
+    animate = partial(write_animation, film, files, milliseconds=views.milliseconds)
     animation = made(film.name, animate, warnings, None)
-    if views.captions:
-        title = "Between " + " and ".join(views.facts["images"])
-        made(STRIP, lambda: write_text(folder / STRIP, strip_page(title, drawn, views.notes)), warnings, None)
     listed = [{"name": frame, **entry} for frame, entry in zip(frames, views.entries, strict=True)]
     content = views.facts | {"frames": listed} | ({"warnings": warnings} if warnings else {})
     write_json(folder / FRAMES, content)
@@ -235,21 +201,3 @@ def _read_run(out: Path) -> tuple[TexturedMesh, list[Camera]]:
     mesh = read_mesh(out / MODEL)
     # Views are rendered without lens distortion.
     return mesh, [replace(camera, distortion=None) for camera in read_cameras(out / CAMERAS).values()]
-
-
-def _shading(mesh: TexturedMesh, cameras: list[Camera], light: str) -> Callable[[Camera], Shading | None]:
-    """Return the shading as a function of the camera of a frame."""
-    plain = mesh.colors is None and (mesh.texture is None or mesh.uv is None)
-    if light == "none" and not plain:
-        return lambda _: None
-    if light == "sun":
-        # From above, the left and the first camera: walls and ground keep their brightness.
-        x, y, z = (estimate_up(cameras) - 0.5 * cameras[0].R[0] - cameras[0].R[2]).tolist()
-        sun = Shading(ambient=0.4, lights=(Light(direction=(x, y, z), color=(0.9,) * 3),))
-        return lambda _: sun
-
-    def lamp(eye: Camera) -> Shading:
-        x, y, z = eye.centre.tolist()
-        return Shading(ambient=0.3, lights=(Light(position=(x, y, z), color=(0.8, 0.8, 0.8)),))
-
-    return lamp

@@ -1,4 +1,4 @@
-"""``report.html`` of a run, and the pages of a view sequence and a comparison: files without network access.
+"""``report.html`` of a run, and the page of a comparison: files without network access.
 
 A page loads nothing from the network, and no file name can run as code: the template escapes all text, data
 for scripts is JSON that cannot close its element, and a content security policy lists the scripts by their
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from PIL import Image as PillowImage
 
 from thesisrecon import __version__
 from thesisrecon.arrays import F64, U8
@@ -87,18 +86,6 @@ def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]
     # page.js adds the unpacked library as a script, which the policy of the page must list too.
     allowed = [*scripts, library] if drawn else []
     return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
-
-
-def strip_page(title: str, frames: Sequence[tuple[str, U8]], notes: Sequence[str] = ()) -> str:
-    """Render the page of a view sequence."""
-    script, shown = page_resource("strip.js"), []
-    for caption, rgb in frames:
-        # The files beside the page have full size and quality.
-        picture = PillowImage.fromarray(rgb)
-        picture.thumbnail((960, 960), PillowImage.Resampling.LANCZOS)
-        shown.append({"caption": caption, "image": drawing.embed_jpeg(picture, quality=85).uri})
-    template = page_resource("strip.html.j2")
-    return render_page(template, [script], title=title, frames=shown, notes=list(notes), script=script)
 
 
 def comparison_page(comparison: ModelComparison, a: str, b: str) -> str:

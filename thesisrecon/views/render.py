@@ -4,7 +4,6 @@ PSNR and SSIM of a rendered and a real image (H, W, 3) of uint8 use the pixels `
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -27,35 +26,6 @@ PART_SAMPLES = 2**21  #: samples that are rasterised at a time in each thread: o
 
 
 @kernel
-def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
-    length = max(np.sqrt(x * x + y * y + z * z), 1e-20)
-    return x / length, y / length, z / length
-
-
-@kernel
-def _shade_points(color: F32, points: F32, normals: F32, lights: F64, ambient: float) -> None:
-    """Shade colours (P, 3) in place by Lambert's law; normals are flipped towards the eye at 0."""
-    # `lights` (L, 7): 1 and a position, or 0 and the direction towards the light; then its colour.
-    light = empty(3)
-    for p in range(color.shape[0]):
-        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-        nx, ny, nz = _unit(normals[p, 0], normals[p, 1], normals[p, 2])
-        ex, ey, ez = _unit(-px, -py, -pz)
-        if nx * ex + ny * ey + nz * ez < 0.0:
-            nx, ny, nz = -nx, -ny, -nz
-        light[:] = ambient
-        for k in range(lights.shape[0]):
-            at = lights[k, 0]
-            lx, ly, lz = _unit(lights[k, 1] - at * px, lights[k, 2] - at * py, lights[k, 3] - at * pz)
-            cosine = nx * lx + ny * ly + nz * lz
-            if cosine > 0.0:
-                for c in range(3):
-                    light[c] += cosine * lights[k, 4 + c]
-        for c in range(3):
-            color[p, c] = np.float32(color[p, c] * light[c])
-
-
-@kernel
 def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: U8) -> None:
     """Average blocks of ``samples`` x ``samples`` pixels; those with negative ``drawn`` are background."""
     total = empty(3, np.float32)
@@ -71,32 +41,9 @@ def _average_blocks(color: F32, drawn: I64, samples: int, background: F32, out: 
                 out[y, x, k] = np.uint8(min(max(np.rint(total[k] * share), 0.0), 255.0))
 
 
-@dataclass(frozen=True)
-class Light:
-    """A light source at a position or at infinity."""
-
-    direction: tuple[float, float, float] | None = None  #: towards a distant light
-    position: tuple[float, float, float] | None = None  #: of a point light; exactly one of both is given
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)  #: 1 leaves the texture as it is
-
-    def __post_init__(self) -> None:
-        if (self.direction is None) == (self.position is None):
-            raise ValueError("a Light has either a direction or a position")
-        if self.direction is not None and not np.linalg.norm(self.direction) > 0.0:
-            raise ValueError("the direction of a Light must not be zero")
-
-
-@dataclass(frozen=True)
-class Shading:
-    """Ambient light and light sources. Both sides of a surface are lit equally."""
-
-    ambient: float = 0.3
-    lights: tuple[Light, ...] = ()
-
-
 def render_mesh(
-    mesh: TexturedMesh, camera: Camera, *, shading: Shading | None = None,
-    background: tuple[int, int, int] = (0, 0, 0), samples: int = 2, threads: int = 1,
+    mesh: TexturedMesh, camera: Camera, *, background: tuple[int, int, int] = (0, 0, 0), samples: int = 2,
+    threads: int = 1,
 ) -> RenderedView:  # fmt: skip
     """Render a mesh; arguments as for :func:`thesisrecon.render`."""
     shape = camera.size[::-1]
@@ -106,9 +53,8 @@ def render_mesh(
     values = mesh.colors if mesh.texture is None or mesh.uv is None else mesh.uv
     source = None if values is None else np.ascontiguousarray(values, dtype=np.float32)
     lit: list[F32] = []
-    if shading is not None:
+    if source is None:
         # About the camera: single precision would round coordinates of a map grid.
-        lights = _light_rows(shading, camera.centre)
         lit = [a.astype(np.float32) for a in (mesh.vertices - camera.centre, vertex_normals(mesh))]
 
     def measure(start: int, stop: int, raster: Raster) -> None:
@@ -119,10 +65,10 @@ def render_mesh(
         for first in range(start, stop, STRIP):
             last = min(first + STRIP, stop)
             part = raster[samples * (first - start) : samples * (last - start)]
-            color = _colors(mesh, source, part)
-            if shading is not None:
-                points, normals = (part.interpolate(v, mesh.faces).reshape(-1, 3) for v in lit)
-                _shade_points(color.reshape(-1, 3), points, normals, lights, shading.ambient)
+            if source is None:
+                color = _lit(*(part.interpolate(v, mesh.faces) for v in lit))
+            else:
+                color = _colors(mesh, source, part)
             _average_blocks(color, part.face, samples, behind, rgb[first:last])
 
     if samples == 1:
@@ -151,27 +97,21 @@ def _in_parts(
     run_in_strips(work, height // samples, threads)
 
 
-def _colors(mesh: TexturedMesh, source: F32 | None, raster: Raster) -> F32:
-    """Unlit colours (H, W, 3), 0 to 255; ``source``: texture coordinates, colours of the vertices or None."""
-    bare = (200, 200, 200)  # Colour of a mesh without texture and vertex colours
-    if source is None:
-        return np.tile(np.asarray(bare, dtype=np.float32), (*raster.face.shape, 1))
+def _lit(points: F32, normals: F32) -> F32:
+    """Grey levels (H, W, 3) of a bare surface by Lambert's law, with a lamp at the camera, the origin."""
+    ambient, lamp = 60.0, 160.0
+    length = np.linalg.norm(points, axis=2) * np.linalg.norm(normals, axis=2)
+    cosine = np.abs(np.sum(points * normals, axis=2)) / np.maximum(length, 1e-20)
+    return np.repeat((ambient + lamp * cosine).astype(np.float32)[..., None], 3, axis=2)
+
+
+def _colors(mesh: TexturedMesh, source: F32, raster: Raster) -> F32:
+    """Colours (H, W, 3), 0 to 255; ``source``: texture coordinates, or colours of the vertices."""
     if mesh.texture is None or mesh.uv is None:
         return raster.interpolate(source, mesh.faces)
     color = np.zeros((*raster.face.shape, 3), dtype=np.float32)
     sample_texture(mesh.texture, raster.interpolate(source), raster.face, color)
     return color
-
-
-def _light_rows(shading: Shading, origin: F64) -> F64:
-    """Rows (L, 7) of the lights for :func:`_shade_points`, in coordinates about an origin."""
-    rows = [
-        (1.0, *np.subtract(light.position, origin), *light.color)
-        if light.position is not None
-        else (0.0, *(light.direction or ()), *light.color)
-        for light in shading.lights
-    ]
-    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 GREY = np.array([0.299, 0.587, 0.114])  # Luma weights of Rec. 601.
