@@ -240,6 +240,20 @@ def require_shapes(caller: str, **arrays: tuple[ArrayLike, tuple[int | str, ...]
     raise ValueError(f"{caller} needs {needed}; got {got}")
 
 
+def checked(
+    caller: str, *, missing: tuple[str, ...] = (), **arrays: tuple[Any, tuple[int | str, ...]]
+) -> list[F64]:
+    """Read arrays as :func:`numbers`, of these shapes (equal letters are equal sizes) and finite.
+
+    Those of ``missing`` may hold NaN and infinite numbers.
+    """
+    found = numbers(caller, missing=missing, **{name: value for name, (value, _) in arrays.items()})
+    named = zip(arrays.items(), found, strict=True)
+    require_shapes(caller, **{name: (array, shape) for (name, (_, shape)), array in named})
+    require_finite(caller, *(array for name, array in zip(arrays, found, strict=True) if name not in missing))
+    return found
+
+
 def require_finite(caller: str, *arrays: F64) -> None:
     """Raise ``ValueError`` if an entry is NaN or infinite."""
     if not all(np.isfinite(array).all() for array in arrays):

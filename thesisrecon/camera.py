@@ -125,8 +125,7 @@ class Camera(Record):
         Camera
             Without distortion.
         """
-        (P,) = arrays.numbers("Camera.from_matrix", P=P)
-        arrays.require_shapes("Camera.from_matrix", P=(P, (3, 4)))
+        (P,) = arrays.checked("Camera.from_matrix", P=(P, (3, 4)))
         return cls(*decompose_camera(P), size)
 
     @property
@@ -166,8 +165,7 @@ class Camera(Record):
         ndarray (N, 2)
             Pixels xy.
         """
-        (X,) = arrays.numbers("Camera.project", missing=("X",), X=X)
-        arrays.require_shapes("Camera.project", X=(X, ("N", 3)))
+        (X,) = arrays.checked("Camera.project", missing=("X",), X=(X, ("N", 3)))
         return project_camera(self.K, self.R, self.t, X, distortion=self.lens_row)
 
     def unproject(self, xy: F64, depth: F64 | None = None) -> F64:
@@ -184,14 +182,12 @@ class Camera(Record):
             Points in the world frame; without ``depth`` unit vectors of the viewing rays in the world frame.
             NaN for pixels farther out than the distortion images any point.
         """
-        (xy,) = arrays.numbers("Camera.unproject", missing=("xy",), xy=xy)
-        z = None if depth is None else arrays.numbers("Camera.unproject", missing=("depth",), depth=depth)[0]
-        given = {} if z is None else {"depth": (z, ("N",))}
-        arrays.require_shapes("Camera.unproject", xy=(xy, ("N", 2)), **given)
+        given = {"xy": (xy, ("N", 2))} | ({} if depth is None else {"depth": (depth, ("N",))})
+        xy, *z = arrays.checked("Camera.unproject", missing=("xy", "depth"), **given)
         rays = viewing_rays(self.K, xy, self.lens_row)
-        if z is None:
+        if not z:
             return np.asarray(rays @ self.R)
-        return np.asarray((rays * (z / rays[:, 2])[:, None] - self.t) @ self.R)
+        return np.asarray((rays * (z[0] / rays[:, 2])[:, None] - self.t) @ self.R)
 
     def scaled(self, factor: float) -> "Camera":
         """Return the camera of the resized image: x goes to (x + 0.5) s - 0.5 along each side.

@@ -6,7 +6,7 @@ import numpy as np
 
 from thesisrecon.api.cameras import reconstruction_from_cameras
 from thesisrecon.api.given import checked_sizes
-from thesisrecon.arrays import F64, I64, numbers, require_finite, require_shapes, sizes_of_images
+from thesisrecon.arrays import F64, I64, checked, numbers, require_shapes, sizes_of_images
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
@@ -310,9 +310,7 @@ def kruppa(F: F64, sizes: I64) -> F64:
     800.0
     """
     (F,) = numbers("kruppa", F=F)
-    F = F[None] if F.ndim == 2 else F
-    require_shapes("kruppa", F=(F, ("M", 3, 3)))
-    require_finite("kruppa", F)
+    (F,) = checked("kruppa", F=(F[None] if F.ndim == 2 else F, ("M", 3, 3)))
     given = np.atleast_2d(numbers("kruppa", sizes=sizes_of_images(sizes))[0])
     if given.ndim != 2 or given.shape[1] != 2 or len(np.unique(given, axis=0)) != 1:
         raise ValueError(f"kruppa needs images of the same size, width and height; got {given.tolist()}")

@@ -38,8 +38,7 @@ def cheirality(P: F64, X: F64) -> F64:
     >>> cheirality(np.eye(3, 4), X).round(9).tolist()
     [0.5, -0.5]
     """
-    P, X = arrays.numbers("cheirality", missing=("X",), P=P, X=X)
-    arrays.require_shapes("cheirality", P=(P, (3, 4)), X=(X, ("N", 4)))
+    P, X = arrays.checked("cheirality", missing=("P", "X"), P=(P, (3, 4)), X=(X, ("N", 4)))
     return np.asarray(np.cbrt(np.linalg.det(P[:, :3])) * X[:, 3] / (X @ P[2]))
 
 
@@ -90,12 +89,10 @@ def resect(
     >>> float(found.K[0, 0].round(6)), found.t.round(6).tolist()
     (500.0, [0.2, -0.1, 4.0])
     """
-    X, xy = arrays.numbers("resect", X=X, xy=xy)
-    arrays.require_shapes("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
+    X, xy = arrays.checked("resect", X=(X, ("N", 3)), xy=(xy, ("N", 2)))
     if K is not None:
         (K,) = arrays.numbers("resect", K=K)
         arrays.require_calibration("resect", K)
-    arrays.require_finite("resect", X, xy)
     require_threshold(threshold_px, xy)
     budget = search_budget(confidence, max_samples)
     return resect_robust(X, xy, K, threshold_px, budget, arrays.generator("resect", seed))
@@ -133,11 +130,9 @@ def triangulate(P: F64, xy: F64, *, method: TriangulationMethod | None = None) -
     """
     if method is not None:
         require_word("method", method, get_args(TriangulationMethod))
-    P, xy = arrays.numbers("triangulate", missing=("xy",), P=P, xy=xy)
-    arrays.require_shapes("triangulate", P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
+    P, xy = arrays.checked("triangulate", missing=("xy",), P=(P, ("V", 3, 4)), xy=(xy, ("V", "N", 2)))
     if len(P) < 2:
         raise ValueError(f"triangulate needs at least two cameras; got {len(P)}")
-    arrays.require_finite("triangulate, for its cameras,", P)
     if not np.abs(P).max(axis=(1, 2)).all():
         raise ValueError("triangulate needs cameras that are not all zero")
     if np.isinf(xy).any():
@@ -191,9 +186,7 @@ def _checked_cameras(cameras: Sequence[F64], sizes: I64, *, metric: bool) -> tup
     caller = "reconstruction_from_cameras"
     K: F64 | None = None
     if len(cameras) == 1:
-        (P,) = arrays.numbers(caller, P=cameras[0])
-        arrays.require_shapes(caller, P=(P, ("V", 3, 4)))
-        arrays.require_finite(caller, P)
+        (P,) = arrays.checked(caller, P=(cameras[0], ("V", 3, 4)))
         if metric:
             K, R, t = (np.stack(part) for part in zip(*map(decompose_camera, P), strict=True))
             P = compose_camera(K, R, t)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thesisrecon.api.given import CameraInput, as_cameras, checked_sizes
-from thesisrecon.arrays import B8, F32, F64, I64, U8, numbers, require_calibration, require_shapes
+from thesisrecon.arrays import B8, F32, F64, I64, U8, checked, numbers, require_calibration
 from thesisrecon.camera import Camera
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.imaging.resampling import undistort_image as resampled
@@ -59,8 +59,7 @@ def undistort_points(xy: F64, camera: Camera, K: F64 | None = None) -> F64:
     >>> undistort_points(np.array([[576.25, 240.0]]), camera).round(6).tolist()
     [[570.0, 240.0]]
     """
-    (xy,) = numbers("undistort_points", missing=("xy",), xy=xy)
-    require_shapes("undistort_points", xy=(xy, ("N", 2)))
+    (xy,) = checked("undistort_points", missing=("xy",), xy=(xy, ("N", 2)))
     K = _calibration("undistort_points", camera, K)
     given = dehomogenize(homogenize(xy) @ np.linalg.inv(camera.K).T)
     if camera.is_pinhole:

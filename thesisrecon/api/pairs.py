@@ -125,10 +125,10 @@ def draw_epipolar_lines(
     >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
     ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
     """
-    F, xy1, xy2 = arrays.numbers("draw_epipolar_lines", F=F, xy1=xy1, xy2=xy2)
+    xy1, xy2, F = arrays.checked(
+        "draw_epipolar_lines", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), F=(F, (3, 3))
+    )
     arrays.whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
-    arrays.require_shapes("draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    arrays.require_finite("draw_epipolar_lines", F, xy1, xy2)
     some = np.unique(np.linspace(0, len(xy1) - 1, min(max_lines, len(xy1))).astype(np.int64))
     xy1, xy2 = xy1[some], xy2[some]
     first, second = read_pixels(image1, image2)
@@ -179,9 +179,7 @@ def estimate_homography(
     >>> int(fit.inliers.sum()), np.abs(fit.H / fit.H[2, 2]).round(6).tolist()
     (30, [[2.0, 0.0, 30.0], [0.0, 2.0, 10.0], [0.0, 0.0, 1.0]])
     """
-    xy1, xy2 = arrays.numbers("estimate_homography", xy1=xy1, xy2=xy2)
-    arrays.require_shapes("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    arrays.require_finite("estimate_homography", xy1, xy2)
+    xy1, xy2 = arrays.checked("estimate_homography", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_threshold(threshold_px, xy1, xy2)
     budget = search_budget(confidence, max_samples)
     return fit_homography(xy1, xy2, threshold_px, budget, arrays.generator("estimate_homography", seed))
@@ -239,16 +237,12 @@ def estimate_trifocal(
     """
     if not arrays.number("estimate_trifocal", "loss_px", loss_px) > 0.0:
         raise ValueError(f"loss_px must be positive; got {loss_px}")
-    xy1, xy2, xy3, segments = arrays.numbers(
-        "estimate_trifocal", xy1=xy1, xy2=xy2, xy3=xy3, segments=segments
-    )
-    require_threshold(threshold_px, xy1, xy2, xy3)
-    arrays.require_shapes("estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)))
-    points = np.stack([xy1, xy2, xy3])
-    arrays.require_shapes(
-        "a trifocal tensor", points=(points, (3, "N", 2)), segments=(segments, (3, "M", 2, 2))
-    )
-    arrays.require_finite("a trifocal tensor", points, segments)
+    *each, segments = arrays.checked(
+        "estimate_trifocal", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), xy3=(xy3, ("N", 2)),
+        segments=(segments, (3, "M", 2, 2)),
+    )  # fmt: skip
+    require_threshold(threshold_px, *each)
+    points = np.stack(each)
     if max(np.abs(points).max(initial=0.0), np.abs(segments).max(initial=0.0)) > MAX_PX:
         raise ValueError(f"points and segments must be pixels of an image; some are beyond {MAX_PX:g}")
     if segments.size and not (np.linalg.norm(segments[:, :, 0] - segments[:, :, 1], axis=2) > 0.0).all():
@@ -363,8 +357,7 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     >>> np.abs(epipolar_lines(F, np.array([[40.0, 30.0]]))).tolist()
     [[0.0, 1.0, 30.0]]
     """
-    F, xy1 = arrays.numbers("epipolar_lines", missing=("xy1",), F=F, xy1=xy1)
-    arrays.require_shapes("epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
+    F, xy1 = arrays.checked("epipolar_lines", missing=("xy1",), F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return lines_of_points(F, xy1)
 
 

@@ -7,7 +7,7 @@ from numpy.random import Generator
 
 from thesisrecon.api.cameras import require_threshold, search_budget
 from thesisrecon.api.lenses import undistort_points
-from thesisrecon.arrays import F64, generator, numbers, require_calibration, require_finite, require_shapes
+from thesisrecon.arrays import F64, checked, generator, numbers, require_calibration
 from thesisrecon.camera import Camera
 from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
@@ -95,7 +95,7 @@ def estimate_essential(
     (40, [-0.6, 0.0, 0.8])
     """
     caller = "estimate_essential"
-    x1, x2 = _matches(caller, xy1, xy2)
+    x1, x2 = checked(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     require_threshold(threshold_px, x1, x2)
     budget = search_budget(confidence, max_samples)
     (K1, x1), (K2, x2) = _pinhole(caller, K1, x1), _pinhole(caller, K1 if K2 is None else K2, x2)
@@ -137,10 +137,8 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     (True, True, [[2.0, 2.0]])
     """
     caller = "recover_pose"
-    (E,) = numbers(caller, E=E)
-    require_shapes(caller, E=(E, (3, 3)))
-    require_finite(caller, E)
-    x1, x2 = _matches(caller, xy1, xy2)
+    (E,) = checked(caller, E=(E, (3, 3)))
+    x1, x2 = checked(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     if not len(x1):
         raise ValueError("recover_pose needs at least one match, which decides between four poses; got none")
     rays1, rays2 = _rays(caller, K1, x1), _rays(caller, K1 if K2 is None else K2, x2)
@@ -192,9 +190,7 @@ def decompose_homography(
     (2, True, True)
     """
     caller = "decompose_homography"
-    (H,) = numbers(caller, H=H)
-    require_shapes(caller, H=(H, (3, 3)))
-    require_finite(caller, H)
+    (H,) = checked(caller, H=(H, (3, 3)))
     (A, _), (B, _) = (_pinhole(caller, K, np.zeros((0, 2))) for K in (K1, K1 if K2 is None else K2))
     G = np.linalg.inv(B) @ H @ A
     if not np.linalg.svd(G, compute_uv=False)[2] > 1e-12 * np.linalg.norm(G):
@@ -202,9 +198,7 @@ def decompose_homography(
     R, t, normal = poses_from_homography(G)
     if xy1 is None:
         return PlanePoses(R, t, normal, np.ones(len(R)))
-    (xy1,) = numbers(caller, xy1=xy1)
-    require_shapes(caller, xy1=(xy1, ("N", 2)))
-    x1 = _rays(caller, K1, xy1)
+    x1 = _rays(caller, K1, *checked(caller, xy1=(xy1, ("N", 2))))
     toward = normal @ x1.T
     # X = x1 d / (n' x1), of which the depth in the second camera is that of R X + t.
     after = x1 @ np.swapaxes(R, 1, 2) + t[:, None] * toward[:, :, None]
@@ -214,13 +208,6 @@ def decompose_homography(
     order = np.argsort(-share, kind="stable")
     order = order[share[order] > 0.5 * share.max(initial=0.0)]
     return PlanePoses(R[order], t[order], normal[order], share[order])
-
-
-def _matches(caller: str, xy1: F64, xy2: F64) -> tuple[F64, F64]:
-    xy1, xy2 = numbers(caller, xy1=xy1, xy2=xy2)
-    require_shapes(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite(caller, xy1, xy2)
-    return xy1, xy2
 
 
 def _pinhole(caller: str, calibration: Calibration, xy: F64) -> tuple[F64, F64]:

@@ -4,10 +4,9 @@
 functions and checks objects. ``path/to/file.py:name`` is the text form of a function or class in a file.
 """
 
-import importlib.util
+import importlib
 import inspect
 import sys
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, U8
+from thesisrecon.arrays import B8, F32, F64, U8, checked
 from thesisrecon.epipolar._matches import PairFrame, check_matches, noise_scale
 from thesisrecon.epipolar.refinement import fundamental_covariance
 from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
@@ -28,6 +27,7 @@ from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairCh
 MIN_INLIERS = 8
 NOT_IN_A_FILE = " (defined in a running program, not in a file)"
 """Added to the name of a function in text; no such function can be loaded again."""
+Shape = tuple[int | str, ...]
 
 
 def name_of(value: Any) -> str:
@@ -37,79 +37,60 @@ def name_of(value: Any) -> str:
     return str(getattr(value, "__name__", None) or type(value).__name__)
 
 
-@dataclass(frozen=True)
-class _Check:
-    """Checks of the values that a function ``who`` returned; ``returns`` describes the required values."""
+def _wrong(stage: str, who: str, what: str) -> UsageError:
+    return UsageError(f"{who} returned {what}; it must return {FUNCTIONS[stage][2]}")
 
-    who: str
-    returns: str
 
-    def wrong(self, what: str) -> UsageError:
-        return UsageError(f"{self.who} returned {what}; it must return {self.returns}")
+def _arrays(who: str, **returned: tuple[Any, Shape]) -> list[F64]:
+    """The arrays that ``who`` returned, finite and of these shapes; empty lists are arrays without rows."""
+    for name, (value, shape) in returned.items():
+        if isinstance(value, list | tuple | np.ndarray) and not np.size(value):
+            returned[name] = np.zeros((0, *map(int, shape[1:]))), shape
+    try:
+        return checked(f"a run, of what {who} returned,", missing=(), **returned)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
 
-    def array(self, value: Any, columns: int, what: str, kind: type = np.float64) -> Any:
-        """The value as an array (N,), or (N, columns), of finite numbers."""
-        try:
-            array: np.ndarray[Any, Any] = np.asarray(value, dtype=kind)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise self.wrong(f"{what} that is no array of numbers ({error})") from None
-        if columns and array.size == 0:
-            array = array.reshape(0, columns)
-        if array.ndim != (2 if columns else 1) or (columns and array.shape[1] != columns):
-            wanted = f"(N, {columns})" if columns else "(N,)"
-            raise self.wrong(f"{what} of shape {array.shape} instead of {wanted}")
-        if not np.isfinite(array).all():
-            raise self.wrong(f"{what} that is not finite (NaN or infinite)")
-        return np.ascontiguousarray(array)
 
-    def positions(self, value: Any, size: tuple[int, int] | None, what: str) -> F64:
-        """Positions (N, 2), px, inside an image of ``size`` (width, height) if that is known."""
-        xy: F64 = self.array(value, 2, what)
-        if size is not None:
-            outside = ((xy < -0.5) | (xy > np.array(size) - 0.5)).any(axis=1)
-            if outside.any():
-                x, y = xy[int(outside.argmax())]
-                where = f"outside the image of {size[0]} x {size[1]} px (its first pixel centre is (0, 0))"
-                raise self.wrong(f"{what} with ({x:g}, {y:g}) {where}")
-        return xy
+def _require_inside(who: str, xy: F64, size: tuple[int, int] | None, name: str) -> None:
+    """Raise ``UsageError`` for positions (N, 2) outside an image of a known size."""
+    outside = ((xy < -0.5) | (xy > np.subtract(size or (np.inf, np.inf), 0.5))).any(axis=1)
+    if size is not None and outside.any():
+        x, y = xy[outside][0]
+        where = f"outside the image of {size[0]} x {size[1]} px (its first pixel centre is (0, 0))"
+        raise UsageError(f"{who} returned {name} with ({x:g}, {y:g}) {where}")
 
-    def same_length(self, **arrays: Any) -> None:
-        if len({len(array) for array in arrays.values()}) > 1:
-            raise self.wrong(" and ".join(f"{len(array)} {name}" for name, array in arrays.items()))
 
-    def matches(
-        self, found: Any, pair: tuple[int, int], sizes: Sequence[tuple[int, int] | None] = (None, None)
-    ) -> Matches:
-        """Matches without corners from ``xy1, xy2[, score]``."""
-        if not isinstance(found, tuple | list) or len(found) not in (2, 3):
-            raise self.wrong(f"a {type(found).__name__}")
-        xy1, xy2 = (self.positions(found[n], sizes[n], f"xy{n + 1}") for n in (0, 1))
-        score: F32 = np.ones(len(xy1), np.float32)
-        if len(found) == 3:
-            score = self.array(found[2], 0, "score", np.float32)
-        self.same_length(xy1=xy1, xy2=xy2, score=score)
-        none, affine = np.full(len(xy1), -1, np.int64), np.tile(np.eye(2), (len(xy1), 1, 1))
-        return Matches(*pair, none, none, xy1, xy2, score, affine)
+def _matches(
+    who: str, found: Any, pair: tuple[int, int], sizes: Sequence[tuple[int, int] | None] = (None, None)
+) -> Matches:
+    """Matches without corners from ``xy1, xy2[, score]``."""
+    if not isinstance(found, tuple | list) or len(found) not in (2, 3):
+        raise _wrong("matching", who, f"a {type(found).__name__}")
+    shapes: dict[str, Shape] = {"xy1": ("N", 2), "xy2": ("N", 2), "score": ("N",)}
+    given = zip(shapes.items(), found, strict=False)
+    xy1, xy2, *score = _arrays(who, **{name: (value, shape) for (name, shape), value in given})
+    for xy, size, name in zip((xy1, xy2), sizes, shapes, strict=False):
+        _require_inside(who, xy, size, name)
+    none, affine = np.full(len(xy1), -1, np.int64), np.tile(np.eye(2), (len(xy1), 1, 1))
+    scores: F32 = (score[0] if score else np.ones(len(xy1))).astype(np.float32)
+    return Matches(*pair, none, none, xy1, xy2, scores, affine)
 
 
 def matches_of(matching: Any, found: Any, pair: tuple[int, int], views: Sequence[Any]) -> Matches:
     """Check the matches that a user-defined matcher returned: the kernels that use them check nothing."""
-    who, returns = f"the method match of {type(matching).__name__}", FUNCTIONS["matching"][2]
-    check = _Check(who, f"Matches, or {returns}")
+    who = f"the method match of {type(matching).__name__}"
     if not isinstance(found, Matches):
-        return check.matches(found, pair)
-    xy1, xy2 = check.array(found.xy1, 2, "xy1"), check.array(found.xy2, 2, "xy2")
-    n = len(xy1)
-    for name, shape in {"xy2": (n, 2), "score": (n,), "affine": (n, 2, 2)}.items():
-        if np.shape(getattr(found, name)) != shape:
-            raise check.wrong(f"{name} of shape {np.shape(getattr(found, name))} for {n} matches")
+        return _matches(who, found, pair)
+    shapes: dict[str, Shape] = {"xy1": ("N", 2), "xy2": ("N", 2), "score": ("N",), "affine": ("N", 2, 2)}
+    xy1, xy2, _, _ = _arrays(who, **{name: (getattr(found, name), shape) for name, shape in shapes.items()})
     index = [np.asarray(found.index1), np.asarray(found.index2)]
     for number, view in zip(index, views, strict=True):
         features = getattr(view, "features", None)
         most = np.inf if features is None else len(features.xy)
-        shaped = number.shape == (n,) and number.dtype.kind == "i"
-        if not shaped or (n and not -1 <= number.min() <= number.max() < most):
-            raise check.wrong("indices that are not corners of the view (-1: none)")
+        shaped = number.shape == (len(xy1),) and number.dtype.kind == "i"
+        if not shaped or ((number < -1) | (number >= most)).any():
+            raise _wrong("matching", who, "indices that are not corners of the view (-1: none)")
     index1, index2 = (number.astype(np.int64) for number in index)
     return replace(found, xy1=xy1, xy2=xy2, index1=index1, index2=index2)
 
@@ -122,9 +103,9 @@ class FunctionAdapter:
     function: Callable[..., Any] = field(metadata={"given": True})
 
     @property
-    def _check(self) -> _Check:
-        returns = next(words for kind, _, words in FUNCTIONS.values() if kind is type(self))
-        return _Check(f"the function {name_of(self)}", returns)
+    def who(self) -> str:
+        """The function in a message."""
+        return f"the function {name_of(self)}"
 
 
 @dataclass(frozen=True)
@@ -136,16 +117,16 @@ class FunctionDetector(FunctionAdapter):
         found = self.function(image.rgb)
         parts = found if isinstance(found, tuple) else (found,)
         if not 1 <= len(parts) <= 3:
-            raise self._check.wrong(f"{len(parts)} values")
-        xy = self._check.positions(parts[0], image.size, "xy")
-        others: list[F32] = [np.ones(len(xy), np.float32)] * 2
-        for n, (part, what) in enumerate(zip(parts[1:], ("scale", "response"), strict=False)):
-            others[n] = self._check.array(part, 0, what, np.float32)
-            self._check.same_length(**{"positions": xy, f"values of {what}": others[n]})
-        if (others[0] <= 0.0).any():
-            raise self._check.wrong("a scale that is not positive")
-        order = np.argsort(-others[1], kind="stable")
-        return Features(xy[order], others[0][order], others[1][order])
+            raise _wrong("features", self.who, f"{len(parts)} values")
+        shapes: dict[str, Shape] = {"xy": ("N", 2), "scale": ("N",), "response": ("N",)}
+        given = zip(shapes.items(), parts, strict=False)
+        xy, *others = _arrays(self.who, **{name: (value, shape) for (name, shape), value in given})
+        _require_inside(self.who, xy, image.size, "xy")
+        scale, response = (one.astype(np.float32) for one in [*others, *[np.ones(len(xy))] * 2][:2])
+        if (scale <= 0.0).any():
+            raise _wrong("features", self.who, "a scale that is not positive")
+        order = np.argsort(-response, kind="stable")
+        return Features(xy[order], scale[order], response[order])
 
 
 @dataclass(frozen=True)
@@ -160,15 +141,15 @@ class FunctionPairs(FunctionAdapter):
         chosen = set()
         for pair in self.function(list(names)):
             try:
-                i, j = (number[end.item() if isinstance(end, np.generic) else end] for end in pair)
+                i, j = sorted(number[end.item() if isinstance(end, np.generic) else end] for end in pair)
             except (KeyError, TypeError, ValueError):
                 what = f"{in_words(pair)}, which is no pair of the {len(names)} images"
-                raise self._check.wrong(what) from None
+                raise _wrong("pairs", self.who, what) from None
             if i == j:
-                raise self._check.wrong(f"{in_words(pair)}, a pair of an image with itself")
-            chosen.add((min(i, j), max(i, j)))
+                raise _wrong("pairs", self.who, f"{in_words(pair)}, a pair of an image with itself")
+            chosen.add((i, j))
         if not chosen:
-            raise self._check.wrong("no pairs")
+            raise _wrong("pairs", self.who, "no pairs")
         return PairChoice(np.array(sorted(chosen), dtype=np.int64), f"pairs by {name_of(self)}")
 
 
@@ -198,7 +179,7 @@ class FunctionMatcher(FunctionAdapter):
     ) -> Matches:  # fmt: skip
         """See `thesisrecon.config.Matcher.match`."""
         sizes = [(view.rgb.shape[1], view.rgb.shape[0]) for view in (view1, view2)]
-        return self._check.matches(self.function(view1.rgb, view2.rgb), pair, sizes)
+        return _matches(self.who, self.function(view1.rgb, view2.rgb), pair, sizes)
 
 
 @dataclass(frozen=True)
@@ -210,24 +191,22 @@ class FunctionFundamental(FunctionAdapter):
         xy1, xy2 = check_matches(xy1, xy2, needed=MIN_INLIERS)
         found = self.function(xy1, xy2)
         if not isinstance(found, tuple | list) or len(found) != 2:
-            raise self._check.wrong(in_words(type(found).__name__))
+            raise _wrong("epipolar", self.who, f"a {type(found).__name__}")
         if found[0] is None:
             raise self._failure("it returned no F", len(xy1))
         inliers: B8 = np.asarray(found[1])
         inliers = inliers[:, 0] if inliers.shape == (len(xy1), 1) else inliers
         if inliers.shape != (len(xy1),) or not np.isin(inliers, (0, 1)).all():
-            raise self._check.wrong(f"inliers of shape {inliers.shape} for {len(xy1)} matches")
+            raise _wrong("epipolar", self.who, f"inliers of shape {inliers.shape} for {len(xy1)} matches")
         inliers = inliers.astype(np.bool_)
-        F = self._check.array(found[0], 3, "F")
-        if F.shape != (3, 3):
-            raise self._check.wrong(f"F of shape {F.shape} instead of (3, 3)")
+        (F,) = _arrays(self.who, F=(found[0], (3, 3)))
         if inliers.sum() < MIN_INLIERS:
             raise self._failure(f"it found {inliers.sum()} inliers", len(xy1))
         frame = PairFrame.of(xy1, xy2)
         F = frame.matrix_in_frame(F).reshape(3, 3)
         s = np.linalg.svd(F, compute_uv=False)
         if not s[1] > 1e-12 * s[0]:
-            raise self._check.wrong("an F of rank below 2")
+            raise _wrong("epipolar", self.who, "an F of rank below 2")
         f = enforce_rank_two(F).ravel()
         F = frame.matrix_in_pixels(f)
         sigma = noise_scale(sampson_residuals(F, xy1[inliers], xy2[inliers]))
@@ -250,31 +229,30 @@ FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {
 
 def as_method(stage: str, value: Any, protocol: type[Any]) -> Any:
     """Return the method of a stage: a function in its adapter, or an object whose methods were checked."""
-    needed = {name: member for name, member in vars(protocol).items() if isinstance(member, FunctionType)}
-    needed = {name: member for name, member in needed.items() if not name.startswith("_")}
-    takes = f"{stage} takes an object with the method{'s' * (len(needed) > 1)} {' and '.join(needed)}"
-    if stage in FUNCTIONS:
-        takes += f", or a function of {', '.join(FUNCTIONS[stage][1])}"
-    if isinstance(value, type):
-        raise UsageError(f"{takes}; got the class {value.__name__}: write {value.__name__}()")
+    members = {name: member for name, member in vars(protocol).items() if not name.startswith("_")}
+    needed = {name: member for name, member in members.items() if isinstance(member, FunctionType)}
     missing = [name for name in needed if not callable(getattr(value, name, None))]
-    if not missing:
-        for name, member in needed.items():
-            parameters = list(inspect.signature(member).parameters.values())[1:]
-            # The pipeline always passes the arguments without a default.
-            fixed = [p for p in parameters if p.default is p.empty]
-            what = f"the method {name} of {stage}={type(value).__name__}"
-            _check_arguments(getattr(value, name), fixed, what)
-        return value
-    if stage in FUNCTIONS and callable(value):
+    if isinstance(value, type) or (missing and not (stage in FUNCTIONS and callable(value))):
+        takes = f"{stage} takes an object with the method{'s' * (len(needed) > 1)} {' and '.join(needed)}"
+        if stage in FUNCTIONS:
+            takes += f", or a function of {', '.join(FUNCTIONS[stage][1])}"
+        got = in_words(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+        got += f", which has no {' and no '.join(missing)}"
+        if isinstance(value, type):
+            got = f"the class {value.__name__}: write {value.__name__}()"
+        raise UsageError(f"{takes}; got {got}")
+    if missing:
         kind, names, _ = FUNCTIONS[stage]
         fixed = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in names]
         _check_arguments(value, fixed, f"the function {stage}={name_of(value)}")
         return kind(value)
-    if isinstance(value, FunctionType):
-        raise UsageError(f"{takes}; only {', '.join(FUNCTIONS)} take a plain function, got {value.__name__}")
-    got = in_words(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
-    raise UsageError(f"{takes}; got {got}, which has no {' and no '.join(missing)}")
+    for name, member in needed.items():
+        parameters = list(inspect.signature(member).parameters.values())[1:]
+        # The pipeline always passes the arguments without a default.
+        fixed = [p for p in parameters if p.default is p.empty]
+        what = f"the method {name} of {stage}={type(value).__name__}"
+        _check_arguments(getattr(value, name), fixed, what)
+    return value
 
 
 def _check_arguments(function: Callable[..., Any], fixed: Sequence[inspect.Parameter], what: str) -> None:
@@ -331,26 +309,19 @@ def load_reference(reference: str, where: str) -> Any:
 
 
 def _module_of(path: Path, where: str) -> ModuleType:
-    """The module of a file, imported once; modules beside it can be imported, also by worker processes."""
+    """The module of a file, imported once, by its name as worker processes import it, and those beside it."""
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
         if file and Path(file).name == path.name and Path(file).resolve() == path:
             return module
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
-    name = path.stem
-    found = None if "." in name or name in sys.modules else importlib.util.find_spec(name)
-    if found is None or not found.origin or Path(found.origin).resolve() != path:
-        name = f"{path.stem.replace('.', '_')}_{zlib.crc32(str(path).encode()):x}"
-        found = importlib.util.spec_from_file_location(name, path)
-    assert found is not None
-    assert found.loader is not None
-    module = importlib.util.module_from_spec(found)
-    sys.modules[name] = module
+    importlib.invalidate_caches()
     try:
-        found.loader.exec_module(module)
+        found = importlib.import_module(path.stem)
     except Exception as error:
         # A user's file may raise anything.
-        del sys.modules[name]
         raise UsageError(f"{where}: {path} cannot be imported: {type(error).__name__}: {error}") from None
-    return module
+    if Path(getattr(found, "__file__", None) or "").resolve() != path:
+        raise UsageError(f"{where}: another module is called {path.stem}; rename {path.name}")
+    return found

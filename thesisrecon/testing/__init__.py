@@ -382,10 +382,9 @@ def assert_cloud(
     import numpy as np
     from scipy.spatial import KDTree
 
-    from thesisrecon.arrays import numbers, require_shapes
+    from thesisrecon.arrays import checked
 
-    X, Y = numbers("assert_cloud", points=points, truth=truth)
-    require_shapes("assert_cloud", points=(X, ("N", 3)), truth=(Y, ("M", 3)))
+    X, Y = checked("assert_cloud", points=(points, ("N", 3)), truth=(truth, ("M", 3)))
     there, back = (
         float(np.quantile(KDTree(b).query(a)[0], quantile)) if len(a) and len(b) else float("inf")
         for a, b in ((X, Y), (Y, X))
