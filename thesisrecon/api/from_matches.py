@@ -17,17 +17,8 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import read_database
 from thesisrecon.io._images import USELESS_MASKS, add_masks, check_masks_folder, images_folder
 from thesisrecon.matching.tracks import AlignedTracks, PlainTracks
+from thesisrecon.pipeline import inputs
 from thesisrecon.pipeline.algorithm1 import claimed, run_adopted
-from thesisrecon.pipeline.inputs import (
-    Given,
-    PairMatches,
-    Views,
-    at_working_size,
-    given_matches,
-    given_tracks,
-    outside_masks,
-    views_of,
-)
 from thesisrecon.pipeline.run import Job, Progress, RunOptions, start_run
 from thesisrecon.records import Tracks
 from thesisrecon.results import RunResult
@@ -48,7 +39,7 @@ class GivenOptions(RunOptions, total=False):
 
 
 def reconstruct_from_matches(
-    keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], PairMatches],
+    keypoints: Sequence[F64] | None, matches: Mapping[tuple[int, int], inputs.PairMatches],
     sizes: Sequence[tuple[int, int]] | I64, out: str | Path | None = None, *,
     names: Sequence[str] | None = None, images: str | Path | Sequence[Any] | None = None,
     **options: Unpack[GivenOptions],
@@ -107,8 +98,8 @@ def reconstruct_from_matches(
     >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
     """
-    views = views_of(sizes, names, images)
-    given = given_matches(keypoints, matches, views)
+    views = inputs.views_of(sizes, names, images)
+    given = inputs.given_matches(keypoints, matches, views)
     return _reconstruct("the given matches", given, views, out, options)
 
 
@@ -147,8 +138,8 @@ def reconstruct_from_tracks(
     >>> bool(abs(result.cameras[0].K[0, 0] - 900) < 5 * result.cameras[0].std["focal_px"])
     True
     """
-    views = views_of(sizes, names, images)
-    given = given_tracks(tracks, views)
+    views = inputs.views_of(sizes, names, images)
+    given = inputs.given_tracks(tracks, views)
     return _reconstruct("the given tracks", given, views, out, options)
 
 
@@ -197,8 +188,8 @@ def reconstruct_from_colmap(
     name = str(path) if isinstance(path, str | PathLike) else f"the given {type(path).__name__}"
     if isinstance(path, str | PathLike) and not Path(path).is_dir():
         database = read_database(Path(path))
-        views = views_of(database.sizes, database.names, images, as_stored=True)
-        given = given_matches(database.keypoints, database.matches, views)
+        views = inputs.views_of(database.sizes, database.names, images, as_stored=True)
+        given = inputs.given_matches(database.keypoints, database.matches, views)
     else:
         model = as_sparse_model(path, "the model of reconstruct_from_colmap")
         if any(view.size is None for view in model.views) or not len(model.xy):
@@ -207,13 +198,13 @@ def reconstruct_from_colmap(
         view, point = model.view_index[order], model.point_index[order]
         tracks = Tracks(view, point, model.xy[order], len(model.views), len(model.X))
         sizes = [view.size for view in model.views if view.size is not None]
-        views = views_of(sizes, model.names, images, as_stored=model.as_stored)
-        given = given_tracks(tracks, views)
+        views = inputs.views_of(sizes, model.names, images, as_stored=model.as_stored)
+        given = inputs.given_tracks(tracks, views)
     return _reconstruct(name, given, views, out, options)
 
 
 def _reconstruct(
-    name: str, given: Given, views: Views, out: str | Path | None, options: Mapping[str, Any],
+    name: str, given: inputs.Given, views: inputs.Views, out: str | Path | None, options: Mapping[str, Any],
 ) -> RunResult:  # fmt: skip
     options = dict(options)
     chosen = {name: options.pop(name, None) for name in ("preset", "max_size", "cameras")}
@@ -241,16 +232,16 @@ def _reconstruct(
         with claimed(run, overwrite=overwrite, source=source):
             with run.clock("images"):
                 digests = [key_of(views.names[i], views.sizes[i], xy) for i, xy in enumerate(given.corners)]
-                inputs, warnings = views.read(run, digests), list[str]()
+                read, warnings = views.read(run, digests), list[str]()
                 if masks is not None:
-                    inputs, warnings = add_masks(
-                        inputs, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
+                    read, warnings = add_masks(
+                        read, Path(masks), as_stored=views.as_stored, map_all=run.workers.map_all
                     )
-                    if all(image.mask is None for image in inputs.images):
+                    if all(image.mask is None for image in read.images):
                         warnings.append(USELESS_MASKS)
-                given = outside_masks(at_working_size(given, inputs.images), inputs.images)
+                given = inputs.outside_masks(inputs.at_working_size(given, read.images), read.images)
             run.finish("images", counts={"read": len(digests), "refused": 0}, warnings=warnings)
-            job = Job(run, inputs, given, until, requested)
+            job = Job(run, read, given, until, requested)
             found = run_adopted(job, overwrite=overwrite, source=source)
         return found if out is not None else _without_folder(found)
 

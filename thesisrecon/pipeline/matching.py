@@ -32,16 +32,8 @@ from thesisrecon.matching.pair_selection import (
 )
 from thesisrecon.matching.tracks import tracks_of_corners
 from thesisrecon.optimize.bundle.projection import cached_pair_order
+from thesisrecon.pipeline import lens
 from thesisrecon.pipeline.large_sets import has_narrow_cut, tracks_of_part
-from thesisrecon.pipeline.lens import (
-    Straightened,
-    StraightFrame,
-    bends_little,
-    frames_of,
-    lens_of_matches,
-    pair_from_frames,
-    pair_in_frames,
-)
 from thesisrecon.pipeline.run import Batch, Job, Run, stream
 from thesisrecon.records import Features, Image, Matches, PairChoice, Seeds, Tracks, TwoView
 
@@ -172,7 +164,7 @@ class FromImages:
         digests = enumerate(image.digest for image in job.inputs.decoded)
         keys = {f"{i:05d}": run.key("features", variant, digest) for i, digest in digests}
 
-        frames = [None] * len(images) if job.prior.lens is None else list(frames_of(job).values())
+        frames = [None] * len(images) if job.prior.lens is None else list(lens.frames_of(job).values())
         if job.prior.lens is not None:
             keys = {item: run.key("features", key, job.prior.lens[int(item)]) for item, key in keys.items()}
 
@@ -185,7 +177,7 @@ class FromImages:
         """The views prepared by the matching method, which tracks are aligned with too."""
         views = dict(enumerate(zip(job.images, features, strict=True)))
         return PreparedViews(
-            job.config.matching.prepare, views, None if job.prior.lens is None else frames_of(job)
+            job.config.matching.prepare, views, None if job.prior.lens is None else lens.frames_of(job)
         )
 
     def select(self, job: Job, features: Sequence[Features]) -> PairChoice:
@@ -237,10 +229,10 @@ class FromImages:
         # Half of the pairs are neighbours by name, which overlap in a sequence; few of them show most lenses.
         near = np.column_stack([first, first + 1])[: LENS_PAIRS // 2]
         # The first set of seeds is upright.
-        if bends_little(job, seeds(near[:FEW_LENS_PAIRS], 1)):
+        if lens.bends_little(job, seeds(near[:FEW_LENS_PAIRS], 1)):
             return None
         some = np.unique(np.concatenate([near, others[others[:, 0] < others[:, 1]]]), axis=0)
-        return lens_of_matches(job, seeds(some, None))
+        return lens.lens_of_matches(job, seeds(some, None))
 
     def match(self, job: Job, views: Sequence[Any], choice: PairChoice | None) -> Sequence[TwoView]:
         """Match the pairs and estimate their epipolar geometry; weak ones again with oblique views."""
@@ -277,7 +269,7 @@ def build_tracks(job: Job, views: Any, pairs: Sequence[TwoView], rng: np.random.
     """Tracks of the accepted pairs, in pixels of the images."""
     frames = views.frames if isinstance(views, PreparedViews) else None
     if frames is not None:
-        pairs = [pair_in_frames(pair, frames[pair.i], frames[pair.j]) for pair in pairs]
+        pairs = [lens.pair_in_frames(pair, frames[pair.i], frames[pair.j]) for pair in pairs]
     found: Tracks = job.config.tracks.build(views, pairs, map_all=job.run.workers.map_all, rng=rng)
     if frames is None:
         return found
@@ -348,7 +340,7 @@ class PreparedViews(Sequence[Any]):
 
     def __init__(
         self, prepare: Prepare, given: Mapping[int, tuple[Image, Features]],
-        frames: Mapping[str, StraightFrame] | None = None,
+        frames: Mapping[str, lens.StraightFrame] | None = None,
     ) -> None:  # fmt: skip
         self._prepare, self._given, self._frames = prepare, dict(given), frames
         # The cache may hold the same views of several methods.
@@ -364,7 +356,7 @@ class PreparedViews(Sequence[Any]):
     def __getitem__(self, view: int) -> Any:  # type: ignore[override]
         if view not in self._given:
             raise IndexError(f"view {view} is not among those given")
-        prepare = self._prepare if self._frames is None else Straightened(self._prepare, self._frames)
+        prepare = self._prepare if self._frames is None else lens.Straightened(self._prepare, self._frames)
         return self._made.get((self._method, view), lambda: prepare(*self._given[view]))
 
     def prepared_by(self, prepare: Prepare) -> PreparedViews:
@@ -383,7 +375,7 @@ class PreparedViews(Sequence[Any]):
         return (None, None) if self._frames else (self._given[i][0].mask, self._given[j][0].mask)
 
     @property
-    def frames(self) -> Mapping[int, StraightFrame] | None:
+    def frames(self) -> Mapping[int, lens.StraightFrame] | None:
         """The straight frames of all views by number, if their images are straightened."""
         if self._frames is None:
             return None
@@ -444,7 +436,7 @@ def _pairs_of_few_views(
             ties.update(near[view])
 
 
-def _detect(config: PipelineConfig, image: Image, frame: StraightFrame | None) -> list[Features]:
+def _detect(config: PipelineConfig, image: Image, frame: lens.StraightFrame | None) -> list[Features]:
     if frame is None:
         return [detect_features(config, image)]
     return [frame.features(detect_features(config, frame.image(image)), straight=False)]
@@ -505,7 +497,7 @@ def _match_all(
 ) -> list[TwoView]:
     frames = views.frames
     found = [match_views(config, views[i], views[j], (i, j), seed, views.masks(i, j)) for i, j in pairs]
-    return found if frames is None else [pair_from_frames(p, frames[p.i], frames[p.j]) for p in found]
+    return found if frames is None else [lens.pair_from_frames(p, frames[p.i], frames[p.j]) for p in found]
 
 
 def _item(i: int, j: int, kind: str) -> str:
