@@ -49,10 +49,7 @@ _LENSES: dict[str, Lens] = {
     "THIN_PRISM_FISHEYE": "thin-prism-fisheye", "SIMPLE_DIVISION": "division", "DIVISION": "division",
 }  # fmt: skip
 """Lens of each kind; its coefficients, after focal lengths and principal point, have the same order."""
-_KIND_OF = {lens: kind for kind, lens in _LENSES.items()} | {
-    "division": "DIVISION",
-    "fisheye": "OPENCV_FISHEYE",
-}
+_KIND_OF = {lens: kind for kind, lens in _LENSES.items()} | {"fisheye": "OPENCV_FISHEYE"}
 _Row = TypeVar("_Row")
 _Point = tuple[int, tuple[float, float, float], bytes]  # number, position and colour
 
@@ -458,13 +455,7 @@ def _camera_params(K: F64, distortion: F64, *, pinhole: bool) -> tuple[str, tupl
         k = known.tolist()
         if lens == "brown":
             lens, k = ("rational", [*k, 0.0, 0.0, 0.0]) if k[4] else (lens, k[:4])
-        kind = {
-            "brown": "OPENCV",
-            "rational": "FULL_OPENCV",
-            "fisheye": "OPENCV_FISHEYE",
-            "division": "DIVISION",
-        }
-        return kind.get(lens, "THIN_PRISM_FISHEYE"), (fx, fy, cx, cy, *k)
+        return _KIND_OF[lens], (fx, fy, cx, cy, *k)
     k1, k2, k3 = known.tolist()
     if k2 or k3:
         return "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, 0.0, 0.0, k3, 0.0, 0.0, 0.0)
