@@ -15,26 +15,11 @@ from thesisrecon.config.text import tables_from_config
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
-from thesisrecon.pipeline import outputs
+from thesisrecon.pipeline import outputs, stages
 from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
 from thesisrecon.pipeline.lens import as_imaged
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
 from thesisrecon.pipeline.run import Job, Run, name_images, stream
-from thesisrecon.pipeline.stages import (
-    better_model,
-    build_model,
-    estimate_depth_maps,
-    known_cameras,
-    metric_of_given,
-    model_among,
-    reconstruct_projective,
-    refine_metric,
-    register_more,
-    report_depth_maps,
-    report_metric,
-    report_projective,
-    self_calibrate,
-)
 from thesisrecon.records import MetricResult, Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._precompilation import precompile
@@ -78,14 +63,14 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
 
     # Cameras that are given leave nothing to chapters 6 and 7 but the points, and the other images.
     if job.given is not None:
-        yield (result := replace(result, metric=metric_of_given(job, tracks, pairs)))
+        yield (result := replace(result, metric=stages.metric_of_given(job, tracks, pairs)))
         assert result.metric is not None
-        report_metric(job, result.metric)
+        stages.report_metric(job, result.metric)
 
     # Chapter 6: projective cameras and points.
     elif until == "projective":
-        yield (result := replace(result, projective=reconstruct_projective(job, tracks, pairs)))
-        report_projective(job, result)
+        yield (result := replace(result, projective=stages.reconstruct_projective(job, tracks, pairs)))
+        stages.report_projective(job, result)
         return
 
     # Chapter 7: self-calibration and metric refinement.
@@ -98,11 +83,11 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
     # Sections 2.5 and 2.6: depth maps, surface and texture.
     assert result.metric is not None
     try:
-        maps, undistorted = estimate_depth_maps(job, result.metric.reconstruction)
+        maps, undistorted = stages.estimate_depth_maps(job, result.metric.reconstruction)
         yield (result := replace(result, depth_maps=maps, views=undistorted))
-        report_depth_maps(job, maps)
+        stages.report_depth_maps(job, maps)
         if until == "model":
-            mesh, held_out = build_model(job, maps, undistorted)
+            mesh, held_out = stages.build_model(job, maps, undistorted)
             yield replace(result, mesh=mesh, held_out=held_out)
     except StageFailure as failure:
         if job.surface_required:
@@ -127,14 +112,14 @@ def metric_cameras(
             break
     best = outputs.best_result(tried)
     yield best
-    report_projective(job, best)
+    stages.report_projective(job, best)
     if best.metric is None or best.calibration is None:
         raise failures[0]
     chosen = next(k for k, other in enumerate(tried) if other is best)
-    metric = register_more(job, views, pairs, best.calibration, best.metric, chosen)
-    job.run.cameras = job.known or known_cameras(job.prior, metric)
+    metric = stages.register_more(job, views, pairs, best.calibration, best.metric, chosen)
+    job.run.cameras = job.known or stages.known_cameras(job.prior, metric)
     metric = join_left_over(job, replace(best, metric=metric), chosen)
-    report_metric(job, metric)
+    stages.report_metric(job, metric)
     if len(tried) > 1:
         job.run.warnings.append(Notice("several-starts", len(tried)))
     yield replace(best, metric=metric)
@@ -158,10 +143,10 @@ def join_left_over(job: Job, result: RunResult, attempt: int) -> MetricResult:
             found, _ = _last_named(part)
             pending += [[views[k] for k in rest] for rest in _unregistered_groups(part, found)]
             if found.metric is not None and found.metric.trusted:
-                others.append(model_among(model, views, found.metric.reconstruction))
+                others.append(stages.model_among(model, views, found.metric.reconstruction))
         rng = stream(run.seed, "metric", attempt, 2)
         joined = join_all(model, others, rng)
-        return metric if joined is model else better_model(job, metric, joined, calibration, rng)
+        return metric if joined is model else stages.better_model(job, metric, joined, calibration, rng)
 
     keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(item)]
     variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
@@ -176,9 +161,9 @@ def attempt_cameras(
     """Chapters 6 and 7 from one initial pair; ``in_parts``: large sets are divided if they can be."""
     tracks = result.tracks
     assert tracks is not None
-    projective = reconstruct_projective(job, tracks, pairs, attempt)
+    projective = stages.reconstruct_projective(job, tracks, pairs, attempt)
     yield (result := replace(result, projective=projective))
-    calibration = self_calibrate(job, projective, attempt)
+    calibration = stages.self_calibrate(job, projective, attempt)
     yield (result := replace(result, calibration=calibration))
     aligned, keys = None, list[str]()
     if in_parts:
@@ -188,7 +173,7 @@ def attempt_cameras(
         start, known = as_imaged(part, tracks, job.prior), calibration
     else:
         start, known = aligned, from_metric(aligned, calibration)
-    yield replace(result, metric=refine_metric(job, start, known, attempt, keys))
+    yield replace(result, metric=stages.refine_metric(job, start, known, attempt, keys))
 
 
 def last_result(stages: Iterator[RunResult], result: RunResult) -> tuple[RunResult, StageFailure | None]:
