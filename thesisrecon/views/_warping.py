@@ -1,10 +1,12 @@
 """Forward warping of an image, nearer pixels in front in any order (thesis, sections 1.2 and 1.3)."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import F32, F64, I16, I32
+from thesisrecon.arrays import F32, F64, I16, I32, I64
 from thesisrecon.imaging.raster import run_in_strips
 from thesisrecon.imaging.resampling import cubic_weights
 
@@ -222,41 +224,6 @@ def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
                     distance[k, y, x] = -1
 
 
-@kernel
-def _fill_from_behind(rgb: F32, inverse_depth: F32, steps: I32, distance: I16, step: float, out: F32) -> None:
-    """Fill holes with the background around, see :func:`fill_holes`."""
-    # Pixels in this farther part of the range of inverse depth count as background; a single far pixel may be
-    # an outlier.
-    background_fraction = 0.4
-    colors = empty(rgb.shape[2])
-    for y in range(rgb.shape[0]):
-        for x in range(rgb.shape[1]):
-            if not np.isnan(inverse_depth[y, x]):
-                continue
-            least, most, total = np.inf, -np.inf, 0.0
-            colors[:] = 0.0
-            for k in range(steps.shape[0]):
-                n = distance[k, y, x]
-                if n > 0:
-                    least = min(least, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
-                    most = max(most, inverse_depth[y + n * steps[k, 0], x + n * steps[k, 1]])
-            behind = least + max(step, background_fraction * (most - least))
-            for k in range(steps.shape[0]):
-                n = distance[k, y, x]
-                if n <= 0:
-                    continue
-                v, u = y + n * steps[k, 0], x + n * steps[k, 1]
-                if inverse_depth[v, u] > behind:
-                    continue
-                reach = n * np.hypot(steps[k, 0], steps[k, 1])
-                weight = 1.0 / (reach * reach)
-                total += weight
-                for c in range(colors.size):
-                    colors[c] += weight * rgb[v, u, c]
-            for c in range(colors.size):
-                out[y, x, c] = np.float32(colors[c] / total) if total > 0.0 else np.float32(np.nan)
-
-
 DIRECTIONS = np.array(
     [(a, b) for a in range(-2, 3) for b in range(-2, 3) if np.gcd(a, b) == 1], dtype=np.int32
 )
@@ -305,11 +272,33 @@ def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
     return out
 
 
+def known_around(inverse_depth: F32, distance: I16) -> Iterator[tuple[I64, tuple[I64, I64], I64]]:
+    """By direction: the holes with a known pixel there, by number, that pixel, and its squared distance."""
+    y, x = np.nonzero(np.isnan(inverse_depth))
+    for (down, right), steps in zip(DIRECTIONS.tolist(), distance, strict=True):
+        hole = np.flatnonzero(steps[y, x] > 0)
+        n = steps[y[hole], x[hole]].astype(np.int64)
+        yield hole, (y[hole] + n * down, x[hole] + n * right), n * n * (down**2 + right**2)
+
+
 def fill_holes(rgb: F32, inverse_depth: F32, *, step: float) -> F32:
     """Fill holes (NaN inverse depth) with the background around them: occluded surfaces are background."""
     # The nearest known pixels in sixteen directions, at most `step` or 0.4 of the range above the smallest
-    # inverse depth, are averaged with weights 1 / distance^2.
-    filled = rgb.copy()
-    distance = distances_to_known(inverse_depth)
-    _fill_from_behind(rgb, inverse_depth, DIRECTIONS, distance, step, filled)
+    # inverse depth (a single far pixel may be an outlier), are averaged with weights 1 / distance^2.
+    background_fraction = 0.4
+    holes, distance = np.isnan(inverse_depth), distances_to_known(inverse_depth)
+    count = int(holes.sum())
+    least, most = np.full(count, np.inf), np.full(count, -np.inf)
+    for hole, at, _ in known_around(inverse_depth, distance):
+        least[hole] = np.minimum(least[hole], inverse_depth[at])
+        most[hole] = np.maximum(most[hole], inverse_depth[at])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        behind = least + np.maximum(step, background_fraction * (most - least))
+        colors, total = np.zeros((count, rgb.shape[2])), np.zeros(count)
+        for hole, at, squared in known_around(inverse_depth, distance):
+            weight = np.where(inverse_depth[at] > behind[hole], 0.0, 1.0 / squared)
+            total[hole] += weight
+            colors[hole] += weight[:, None] * rgb[at]
+        filled = rgb.copy()
+        filled[holes] = colors / total[:, None]
     return filled

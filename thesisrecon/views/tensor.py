@@ -15,8 +15,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon import arrays
-from thesisrecon._numba import kernel
-from thesisrecon.arrays import B8, F32, F64, I16, I32, U8, Record
+from thesisrecon.arrays import B8, F32, F64, I64, U8, Record
 from thesisrecon.camera import rq
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_centre
@@ -24,7 +23,7 @@ from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogen
 from thesisrecon.geometry.relative_pose import depths_of_matches, poses_from_essential
 from thesisrecon.geometry.two_view import enforce_rank_two, epipoles, require_parallax_of_matches
 from thesisrecon.imaging.raster import run_in_strips
-from thesisrecon.views._warping import DIRECTIONS, distances_to_known, fill_holes, forward_map, sample
+from thesisrecon.views._warping import distances_to_known, fill_holes, forward_map, known_around, sample
 
 AGREE_PX = 1.5  #: tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise
 
@@ -177,10 +176,19 @@ class VirtualTensor:
         x''^k = x^i l_j T_i^jk with the lines l through x2 perpendicular to the epipolar lines of x1.
         """
         places, inverse_depth = np.empty(xy1.shape), np.empty(len(xy1))
+        a4 = self.P2[:, 3]
 
         def work(rows: tuple[int, int]) -> None:
             some = slice(*rows)
-            _transfer(self.T, self.P2, xy1[some], xy2[some], places[some], inverse_depth[some])
+            x, x2 = homogenize(xy1[some]), xy2[some]
+            a = x @ self.P2[:, :3].T
+            # The direction of the epipolar line a_4 x a; its length cancels.
+            l = a4[2] * a[:, :2] - a4[:2] * a[:, 2:]
+            l = np.column_stack([l, -np.sum(l * x2, axis=1)])
+            u, v, w = np.einsum("nj,njk->kn", l, np.tensordot(x, self.T, 1))
+            # With l'(a x + rho a_4) = 0, x'' is -(l'a_4) (b x + rho b_4); a comparison with NaN is false.
+            w = np.where(-w * (l @ a4) > 0.0, w, np.nan)
+            places[some], inverse_depth[some] = np.stack([u / w, v / w], axis=1), np.sum(l * a, axis=1) / w
 
         run_in_strips(work, len(xy1), threads)
         return places, inverse_depth
@@ -206,72 +214,31 @@ def seed_of_two(pair: CalibratedPair, *, first: bool = False) -> VirtualTensor:
     return VirtualTensor(np.einsum("ji,k->ijk", a, b4) - np.einsum("j,ki->ijk", a4, b), pair.P2, K)
 
 
-@kernel
-def _transfer(T: F64, P2: F64, xy1: F64, xy2: F64, xy: F64, inverse_depth: F64) -> None:
-    """Transfer matches (N, 2): with l'(a x + rho a_4) = 0, x'' is -(l'a_4) (b x + rho b_4)."""
-    for n in range(len(xy)):
-        x, y, x2, y2 = xy1[n, 0], xy1[n, 1], xy2[n, 0], xy2[n, 1]
-        xy[n, 0] = xy[n, 1] = inverse_depth[n] = np.nan
-        if not (np.isfinite(x2) and np.isfinite(y2)):
-            continue
-        a0 = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2]
-        a1 = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2]
-        a2 = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2]
-        # The direction of the epipolar line a_4 x a; its length cancels.
-        l0 = P2[2, 3] * a0 - P2[0, 3] * a2
-        l1 = P2[2, 3] * a1 - P2[1, 3] * a2
-        l2 = -(l0 * x2 + l1 * y2)
-        u = v = w = 0.0
-        for i, xi in enumerate((x, y, 1.0)):
-            for j, lj in enumerate((l0, l1, l2)):
-                weight = xi * lj
-                u += weight * T[i, j, 0]
-                v += weight * T[i, j, 1]
-                w += weight * T[i, j, 2]
-        if -w * (l0 * P2[0, 3] + l1 * P2[1, 3] + l2 * P2[2, 3]) > 0.0:
-            xy[n, 0], xy[n, 1] = u / w, v / w
-            inverse_depth[n] = (l0 * a0 + l1 * a1 + l2 * a2) / w
-
-
-@kernel
-def _extrapolate_inverse_depth(
-    inverse_depth: tuple[F32, F32], P2: F64, steps: I32, distance: I16, step: float, out: F32
-) -> None:
+def _extrapolated(inverse_depth: tuple[F32, F32], P2: F64, step: float) -> F32:
     """Complete the inverse depth of the first image of two from the surrounding pixels."""
-    # The nearest known pixel in any direction (`distance` steps) that would not occlude a surface of the
-    # other image.
+    # The nearest known pixel in any direction that would not occlude a surface of the other image.
     own, other = inverse_depth
-    for y in range(own.shape[0]):
-        for x in range(own.shape[1]):
-            out[y, x] = own[y, x]
-            if not np.isnan(own[y, x]):
-                continue
-            least, before = np.inf, True
-            for k in range(steps.shape[0]):
-                n = distance[k, y, x]
-                if n < 1:
-                    continue
-                reach = n * n * (steps[k, 0] ** 2 + steps[k, 1] ** 2)
-                rho = own[y + n * steps[k, 0], x + n * steps[k, 1]]
-                stands = _occludes(other, P2, x, y, rho, step)
-                if (before and not stands) or (before == stands and reach < least):
-                    least, before = reach, stands
-                    out[y, x] = rho
+    y, x = np.nonzero(np.isnan(own))
+    occluding, best = 2.0**40, np.full(len(y), np.inf)  # More than all squared distances
+    found = np.full(len(y), np.nan, dtype=np.float32)
+    for hole, at, squared in known_around(own, distances_to_known(own)):
+        rank = squared + occluding * _occludes(other, P2, x[hole], y[hole], own[at].astype(np.float64), step)
+        nearer = rank < best[hole]
+        best[hole[nearer]], found[hole[nearer]] = rank[nearer], own[at][nearer]
+    complete = own.copy()
+    complete[y, x] = found
+    return complete
 
 
-@kernel
-def _occludes(other: F32, P2: F64, x: int, y: int, rho: float, step: float) -> bool:
-    """Whether a pixel at inverse depth ``rho`` lies in front of the surface in the other image there."""
-    u = P2[0, 0] * x + P2[0, 1] * y + P2[0, 2] + rho * P2[0, 3]
-    v = P2[1, 0] * x + P2[1, 1] * y + P2[1, 2] + rho * P2[1, 3]
-    w = P2[2, 0] * x + P2[2, 1] * y + P2[2, 2] + rho * P2[2, 3]
-    if not w > 0.0:
-        return True
-    column, row = np.rint(u / w), np.rint(v / w)
-    if not (0 <= row < other.shape[0] and 0 <= column < other.shape[1]):
-        return False
-    # A comparison with NaN is false.
-    return bool(rho / w > other[int(row), int(column)] + step)
+def _occludes(other: F32, P2: F64, x: I64, y: I64, rho: F64, step: float) -> B8:
+    """Whether pixels at inverse depths ``rho`` lie in front of the surface in the other image there."""
+    u, v, w = (row[0] * x + row[1] * y + row[2] + rho * row[3] for row in P2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = np.rint(u / w), np.rint(v / w)
+        inside = (row >= 0) & (row < other.shape[0]) & (column >= 0) & (column < other.shape[1])
+        at = tuple(np.where(inside, place, 0).astype(np.int64) for place in (row, column))
+        # A comparison with NaN is false.
+        return np.asarray(~(w > 0.0) | (inside & (rho / w > other[at].astype(np.float64) + step)))
 
 
 def _transfer_image(virtual: VirtualTensor, places: F32, *, threads: int = 1) -> tuple[F64, F32]:
@@ -309,10 +276,8 @@ def _agreeing(places: F32, others: F32, agree_px: float) -> B8:
 
 def _completed(pair: CalibratedPair, places: F32, inverse_depth: tuple[F32, F32], step: float) -> F32:
     """``places`` (H, W, 2) with guesses for NaN, from the inverse depth of both images."""
-    own, P2 = inverse_depth[0], np.ascontiguousarray(pair.P2)
-    guessed = np.empty_like(own)
-    _extrapolate_inverse_depth(inverse_depth, P2, DIRECTIONS, distances_to_known(own), step, guessed)
-    y, x = np.nonzero(np.isnan(own))
+    guessed = _extrapolated(inverse_depth, pair.P2, step)
+    y, x = np.nonzero(np.isnan(inverse_depth[0]))
     X = np.stack([x, y, np.ones_like(x), guessed[y, x]], axis=1).astype(np.float64)
     complete = places.copy()
     complete[y, x] = dehomogenize(X @ pair.P2.T)
