@@ -135,11 +135,6 @@ def flag(caller: str, name: str, value: Any) -> bool:
     return bool(value)
 
 
-def white_level(highest: float) -> float:
-    """White of integer levels whose largest is ``highest``: 2^n - 1 of the fewest bits, at least 8."""
-    return float(2.0 ** max(8, int(highest).bit_length()) - 1)
-
-
 def image_levels(*images: Any) -> list[U8 | F32]:
     """Read arrays of images or colours as levels from 0 to 255, of one scale for all of a kind.
 
@@ -201,7 +196,8 @@ def _white_of(arrays: list[Any]) -> float:
     if real and low >= -0.5 and high <= 1.5:
         return 1.0
     if (-128.0 if real and high > 1.5 else 0.0) <= low and high <= 65535.5:
-        return 255.0 if real and high < 512.0 else white_level(high)
+        # Of whole numbers 2^n - 1 of the fewest bits, at least 8.
+        return 255.0 if real and high < 512.0 else 2.0 ** max(8, int(high).bit_length()) - 1.0
     ranges = "0 to 1 (floats), 0 to 255 or 0 to 65535"
     raise ValueError(f"the levels of an image must be {ranges}; got {low:g} to {high:g}")
 

@@ -64,20 +64,6 @@ def test_a_view_between_comes_from_arrays_and_files_with_and_without_disparities
     assert grey.shape == left.shape
 
 
-def test_wrong_calls_of_the_front_door_are_refused(wall):
-    left, right = wall
-    d, small = np.zeros(left.shape[:2], np.float32), np.zeros((3, 4), np.float32)
-    for error, words, *images, s, disparity in (
-        (ValueError, r"s must be between 0 \(left image\) and 1 .*; got 1\.5", left, right, 1.5, None),
-        (ValueError, r"same size; got \(90, 160\) and \(87, 160\)", left, right[:-3], 0.5, None),
-        (ValueError, r"shape of the images \(90, 160\); got \(3, 4\)", left, right, 0.5, small),
-        (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, [d, d]),
-        (ValueError, r"\(H, W\), or a tuple", left, right, 0.5, d[..., None]),
-        (UsageError, "no image file", Path("nowhere.png"), right, 0.5, None),
-    ):
-        refuses(error, words, thesisrecon.interpolate_view, *images, s, disparity=disparity)
-
-
 def test_photographs_without_a_view_between_them_are_refused_in_a_sentence(monkeypatch):
     a, b = photograph(0), photograph(1)
     copy, small = Image("copy.jpg", a.rgb.copy(), a.size), photograph(2, (40, 20))

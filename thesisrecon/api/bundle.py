@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -207,7 +207,10 @@ def bundle_adjust(
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
     free = tuple(free) if isinstance(free, Sequence | Set) and not isinstance(free, str) else (free,)
     chosen = _free(free)
-    loss_px, sigma_px = _noise_options(loss, loss_px, sigma_px, max_iterations)
+    require_word("loss", loss, LOSSES)
+    whole_number("bundle_adjust", "max_iterations", max_iterations, 1)
+    given = {"loss_px": loss_px, "sigma_px": sigma_px}
+    loss_px, sigma_px = (None if v is None else number("bundle_adjust", name, v) for name, v in given.items())
     start = _start(views, shared, chosen)
     chosen = chosen[: start.intrinsics.shape[1]]
     prior = {} if prior is None else prior
@@ -247,15 +250,6 @@ def bundle_adjust(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance[:, :LENS, :LENS],
         fit.point_covariance, fit.sigmas_to_minimum * scale,
     )  # fmt: skip
-
-
-def _noise_options(loss: str, loss_px: Any, sigma_px: Any, most: int) -> tuple[float | None, float | None]:
-    """Width of the loss and noise as numbers, if given; the other options are checked alone."""
-    require_word("loss", loss, LOSSES)
-    whole_number("bundle_adjust", "max_iterations", most, 1)
-    given = {"loss_px": loss_px, "sigma_px": sigma_px}
-    width, sigma = (None if v is None else number("bundle_adjust", name, v) for name, v in given.items())
-    return width, sigma
 
 
 def _adjusted(

@@ -583,17 +583,13 @@ def _similarity(centres: F64, centres_b: F64, notes: list[str]) -> Similarity | 
             "rotations and intrinsics are compared"
         )
         return None
-    if min(_extent_across(points) for points in (centres, centres_b)) < 0.01:
+    extents = (np.linalg.svd(C - C.mean(axis=0), compute_uv=False) for C in (centres, centres_b))
+    if min(across / along for along, across, _ in extents) < 0.01:
         notes.append(
             "the centres of the common cameras lie almost on one line; the rotation about it is uncertain, "
             "and with it the distances of points"
         )
     return similarity
-
-
-def _extent_across(points: F64) -> float:
-    along, across, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1]
-    return float(across / along)
 
 
 def _intrinsic_errors(a: SparseView, b: SparseView) -> tuple[float, float]:

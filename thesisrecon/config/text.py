@@ -191,7 +191,7 @@ def tables_from_settings(settings: Settings) -> Table:
     if isinstance(settings, str):
         raise UsageError(f"set takes a mapping or a list of stage.field=value; got {in_words(settings)}")
     tables: Table = {}
-    items = settings.items() if isinstance(settings, Mapping) else (_parse_setting(text) for text in settings)
+    items = settings.items() if isinstance(settings, Mapping) else map(_parse_setting, settings)
     for place, value in items:
         path = place.strip().split(".") if isinstance(place, str) else []
         if not 2 <= len(path) <= 16 or not all(path):

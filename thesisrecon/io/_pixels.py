@@ -242,17 +242,14 @@ def refuse_raw_file(stream: BinaryIO, suffix: str) -> None:
     if sensor or any(math.prod(_size(tags)) > math.prod(size) for tags in inner):
         raise UnusableImage(RAW_FILE)
     reduced = first.get(254, 0) & 1 or first.get(255, 0) == 2
-    if (reduced and others) or any(_enlarges(_size(page), size) for page in others):
+    # Larger than the first, and of the same ratio of sides within rounding.
+    larger = [(w, h) for w, h in map(_size, others) if w > size[0]]
+    if (reduced and others) or any(abs(w * size[1] - h * size[0]) <= max(w, h) for w, h in larger):
         raise UnusableImage(Notice("reduced-image", size[0], size[1]))
 
 
 def _size(tags: _Tags) -> tuple[int, int]:
     return tags.get(256, 0), tags.get(257, 0)
-
-
-def _enlarges(size: tuple[int, int], first: tuple[int, int]) -> bool:
-    """Whether an image is larger than the first, and of the same ratio of sides within rounding."""
-    return size[0] > first[0] and abs(size[0] * first[1] - size[1] * first[0]) <= max(size)
 
 
 def _directory(stream: BinaryIO, head: bytes, at: int = 0) -> ImageFileDirectory_v2:
