@@ -93,24 +93,11 @@ def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> Spars
     return SparseModel(views, as_stored=stored == {True})
 
 
-def cameras_by_name(caller: str, model: Model) -> Mapping[str, Camera]:
-    """The cameras of any model by image name, for ``caller``."""
-    if isinstance(model, RunResult):
-        if model.metric is None:
-            raise UsageError("the result has no cameras; it ended before the metric stage")
-        return model.cameras
-    if not isinstance(model, str | PathLike | SparseModel) and not _is_of_pycolmap(model):
-        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
-        raise ValueError(f"{caller} needs {kinds}; got a {type(model).__name__}")
-    source = model if isinstance(model, str | PathLike) else "the model"
-    return cameras_of_model(as_sparse_model(model), source)
-
-
 def known_by_name(caller: str, known: Model, until: str) -> Mapping[str, Camera]:
     """The cameras that a run is given; ``until`` is its last stage."""
     if until == "projective":
         raise UsageError('known cameras leave no projective stage; use until="metric"')
-    cameras = cameras_by_name(caller, as_sparse_model(known, "the known cameras"))
+    cameras: Mapping[str, Camera] = named_cameras(as_sparse_model(known, "the known cameras"))
     if not cameras:
         raise UsageError(f"{caller} got no known cameras; the model has none")
     return cameras
@@ -162,7 +149,7 @@ def as_cameras(
     """The cameras in order; the registered ones of a reconstruction; of a mapping those of ``names``."""
     if isinstance(cameras, Reconstruction):
         return _registered_cameras(caller, cameras)
-    cameras = named_cameras(caller, cameras)
+    cameras = named_cameras(cameras)
     if isinstance(cameras, Mapping):
         if not cameras:
             raise ValueError(f"{caller} needs cameras; the model has none")
@@ -187,14 +174,15 @@ def as_cameras(
     return [Camera(*one) for one in zip(K, R, t, checked_sizes(caller, sizes, len(R)), strict=True)]
 
 
-def named_cameras(caller: str, cameras: Any) -> Any:
+def named_cameras(cameras: Any) -> Any:
     """The cameras by name of a run, a folder or a model of other kinds; anything else as it is."""
-    if cameras is None or isinstance(
-        cameras, Reconstruction | Mapping | list | tuple | np.ndarray | int | float
-    ):
-        return cameras
-    if not isinstance(cameras, Sequence) or isinstance(cameras, str):
-        return cameras_by_name(caller, cameras)
+    if isinstance(cameras, RunResult):
+        if cameras.metric is None:
+            raise UsageError("the result has no cameras; it ended before the metric stage")
+        return cameras.cameras
+    if isinstance(cameras, str | PathLike | SparseModel) or _is_of_pycolmap(cameras):
+        source = cameras if isinstance(cameras, str | PathLike) else "the model"
+        return cameras_of_model(as_sparse_model(cameras), source)
     return cameras
 
 

@@ -125,8 +125,8 @@ def draw_epipolar_lines(
     >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
     ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
     """
-    xy1, xy2, F = arrays.checked(
-        "draw_epipolar_lines", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)), F=(F, (3, 3))
+    F, xy1, xy2 = arrays.checked(
+        "draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2))
     )
     arrays.whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
     some = np.unique(np.linspace(0, len(xy1) - 1, min(max_lines, len(xy1))).astype(np.int64))

@@ -323,7 +323,7 @@ def _scene(
     caller: str, images: ImagesInput, cameras: CameraInput, sizes: I64 | None, max_size: int
 ) -> tuple[list[records.Image], records.Reconstruction]:
     """Images at working size, and their cameras for it, with the points of a reconstruction."""
-    cameras = named_cameras(caller, cameras)
+    cameras = named_cameras(cameras)
     if isinstance(images, str | Path):
         files = _images.files_by_name(images)
         # Images that were not registered have no camera.
