@@ -168,12 +168,12 @@ def export(
     if divided:
         gave = f"the {len(model.views)} images gave {len(undistorted.views)} pinhole images"
         notes.append(f"{gave}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees")
-    paths = _image_paths(images, model)
-    may_mask = masks is not None or any(map(_images.may_be_transparent, paths))
+    may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
     may_mask = may_mask or divided
     names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
     _require_distinct(names, "have the mask")
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
+    paths = _image_paths(images, model)
     files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
     with claim_folder(folder, overwrite=overwrite, names=files):
         mask_name = partial(formats.mask_name, to) if may_mask else None

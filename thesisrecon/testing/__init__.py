@@ -160,15 +160,10 @@ def pose_errors(R: F64, C: F64, R_true: F64, C_true: F64, X: F64) -> F64:
 
 
 def assert_cameras(
-    model: Any,
-    truth: Any,
-    *,
-    max_sigmas: float | None = 4.0,
-    max_focal_error_pct: float | None = None,
-    max_rotation_error_deg: float | None = None,
-    max_centre_error: float | None = None,
+    model: Any, truth: Any, *, max_sigmas: float | None = 4.0, max_focal_error_pct: float | None = None,
+    max_rotation_error_deg: float | None = None, max_centre_error: float | None = None,
     sees: Mapping[str, float] | None = None,
-) -> CameraDeviations:
+) -> CameraDeviations:  # fmt: skip
     """Fail unless all cameras of the truth are there, within stated deviations and within given limits.
 
     Parameters
@@ -231,11 +226,8 @@ def assert_cameras(
         size = np.where(stated, np.abs(errors.z), -1.0)
         view, part = np.unravel_index(int(np.argmax(size)), size.shape)
         if size[view, part] > max_sigmas:
-            of, off = (
-                f"{_PARTS[part]} of {errors.names[view]}",
-                f"{size[view, part]:.2g} standard deviations off",
-            )
-            wrong.append(f"{of} is {off}, the limit is {max_sigmas:g}")
+            off = f"{size[view, part]:.2g} standard deviations off, the limit is {max_sigmas:g}"
+            wrong.append(f"{_PARTS[part]} of {errors.names[view]} is {off}")
     if not visible:
         raise AssertionError("no deviation is stated and no limit is given: this gate sees nothing")
     _judge("cameras", wrong, visible, sees)
@@ -323,12 +315,8 @@ def assert_fundamental(
     square = float(np.sum((vectors[:, 2:].T @ d) ** 2 / np.maximum(values[2:], 1e-300)))
     limit = float(stats.chi2.isf(false_alarm, 7))
     size, most = float(np.sqrt(square / 7.0)), float(np.sqrt(limit / 7.0))
-    wrong = (
-        []
-        if square <= limit
-        else [f"F is {size:.3g} stated standard deviations off, the limit is {most:.3g}"]
-    )
-    _judge("F", wrong, {"deviations": _visible_deviation(limit)})
+    wrong = [f"F is {size:.3g} stated standard deviations off, the limit is {most:.3g}"]
+    _judge("F", [] if square <= limit else wrong, {"deviations": _visible_deviation(limit)})
     return size
 
 
@@ -341,13 +329,9 @@ def _visible_deviation(limit: float) -> float:
 
 
 def assert_cloud(
-    points: Any,
-    truth: Any,
-    *,
-    max_accuracy: float,
-    max_completeness: float | None = None,
+    points: Any, truth: Any, *, max_accuracy: float, max_completeness: float | None = None,
     quantile: float = 0.5,
-) -> tuple[float, float]:
+) -> tuple[float, float]:  # fmt: skip
     """Fail unless two clouds of one frame agree, from each point to the nearest one of the other.
 
     Parameters
@@ -410,10 +394,8 @@ def _judge(
         if name not in visible:
             raise ValueError(f"this gate measures {', '.join(visible)}; it cannot see {name!r}")
         if visible[name] > wanted:
-            wrong = [
-                *wrong,
-                f"this gate sees {visible[name]:.2g} of {name} in 95 of 100 cases, and should {wanted:g}",
-            ]
+            seen = f"this gate sees {visible[name]:.2g} of {name} in 95 of 100 cases, and should {wanted:g}"
+            wrong = [*wrong, seen]
     if wrong:
         raise AssertionError("; ".join(wrong))
 
