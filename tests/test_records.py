@@ -67,15 +67,6 @@ def test_impossible_cameras_are_refused(camera, change, words):
     refuses(ValueError, words, replace, camera, **change)
 
 
-def test_wrong_arguments_are_refused(camera):
-    for factor in (0.0, -1.0, np.nan, np.inf):
-        refuses(ValueError, "factor above 0", camera.scaled, factor)
-    refuses(ValueError, r"needs P \(3, 4\); got \(3, 3\)", Camera.from_matrix, np.eye(3), (640, 480))
-    refuses(ValueError, r"needs X \(N, 3\); got \(3,\)", camera.project, np.zeros(3))
-    refuses(ValueError, r"needs xy \(N, 2\); got \(4, 3\)", camera.unproject, np.zeros((4, 3)))
-    refuses(ValueError, r"depth \(N\); got \(4, 2\), \(3,\)", camera.unproject, np.zeros((4, 2)), np.ones(3))
-
-
 def test_cameras_keep_copies_and_compare_by_value(camera):
     mine = K.copy()
     one, other = (Camera(mine, np.eye(3), np.zeros(3), (640, 480), std={"k1": np.nan}) for _ in range(2))
