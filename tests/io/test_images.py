@@ -1,5 +1,6 @@
 """Reading images: formats, orientation, bit depth, frames and resampling."""
 
+import struct
 import threading
 import time
 
@@ -12,7 +13,7 @@ from tests.conftest import refuses
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
 from thesisrecon.io._exports import frame_name, write_animation, write_image
-from thesisrecon.io._images import list_images, read_images, scene_name
+from thesisrecon.io._images import list_images, read_images, read_pixels, scene_name
 from thesisrecon.records import Image
 
 
@@ -194,6 +195,57 @@ def test_colours_are_converted_alike_in_stripes(mode):
     stored = coloured(500, 700, mode)
     found = pixels.resized_to(pixels.StoredImage(stored), 200)
     np.testing.assert_array_equal(found, at_once(stored.convert("RGB"), (142, 200), 200))
+
+
+def icc_profile(description, gamma, columns):
+    """A matrix profile (ICC.1:2001) of an RGB space: XYZ of its primaries under D50 in ``columns``."""
+
+    def tag(kind, content):
+        return kind + bytes(4) + content + bytes(-len(content) % 4)
+
+    def xyz(values):
+        return tag(b"XYZ ", struct.pack(">3i", *(round(65536 * v) for v in values)))
+
+    text = description.encode() + b"\0"
+    name = tag(b"desc", struct.pack(">I", len(text)) + text + bytes(78))
+    curve = tag(b"curv", struct.pack(">IH", 1, round(256 * gamma)))
+    tags = {b"desc": name, b"cprt": tag(b"text", b"none\0"), b"wtpt": xyz([0.9642, 1.0, 0.8249])}
+    for letter, column in zip(b"rgb", columns, strict=True):
+        tags |= {bytes([letter]) + b"XYZ": xyz(column), bytes([letter]) + b"TRC": curve}
+    table, content, start = b"", b"", 128 + 4 + 12 * len(tags)
+    for key, value in tags.items():
+        table += key + struct.pack(">2I", start + len(content), len(value))
+        content += value
+    size = struct.pack(">I", start + len(content))
+    head = size + bytes(4) + b"\x02\x40\0\0mntrRGB XYZ " + bytes(12) + b"acsp" + bytes(28)
+    head += struct.pack(">3i", 63190, 65536, 54061)
+    return head + bytes(128 - len(head)) + struct.pack(">I", len(tags)) + table + content
+
+
+DISPLAY_P3 = [[0.5151, 0.2412, -0.0011], [0.2920, 0.6922, 0.0419], [0.1571, 0.0666, 0.7841]]
+SRGB = [[0.4361, 0.2225, 0.0139], [0.3851, 0.7169, 0.0971], [0.1431, 0.0606, 0.7142]]
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_colours_of_a_wide_gamut_become_those_of_srgb(tmp_path, suffix):
+    """As a phone writes them; without the profile saturated colours would look pale."""
+    levels = np.random.default_rng(0).integers(60, 190, (64, 80, 3), dtype=np.uint8)
+    # Near grey, inside both spaces.
+    levels = (0.3 * levels + 0.7 * levels.mean(axis=2, keepdims=True)).astype(np.uint8)
+    path, profile = tmp_path / f"a.{suffix}", icc_profile("Display P3", 2.2, DISPLAY_P3)
+    PIL.Image.fromarray(levels).save(path, icc_profile=profile)
+    linear = (levels / 255.0) ** 2.2 @ (np.array(DISPLAY_P3) @ np.linalg.inv(SRGB))
+    expected = 255.0 * np.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0) ** (1 / 2.4) - 0.055
+    )
+    (found,) = read_pixels(path)
+    assert np.abs(found - expected).max() < 2.0
+    assert np.abs(levels - expected).max() > 6.0
+    upright = pixels.StoredImage(PIL.Image.open(path), PIL.Image.Transpose.ROTATE_90)
+    np.testing.assert_array_equal(np.asarray(upright.rows(0, 80)), np.rot90(found))
+    # The space of displays itself changes no byte.
+    PIL.Image.fromarray(levels).save(path, icc_profile=icc_profile("sRGB IEC61966-2.1", 2.2, SRGB))
+    np.testing.assert_array_equal(read_pixels(path)[0], levels)
 
 
 def test_every_stripe_of_a_deep_picture_has_the_range_of_all(tmp_path):

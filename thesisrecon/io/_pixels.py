@@ -4,6 +4,7 @@ The decoded image is held once, in the mode of its file. Rotation, conversion an
 at a time: on the whole image each of them would need another four bytes per pixel.
 """
 
+import io
 import math
 import re
 import threading
@@ -15,6 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import PIL.Image
+import PIL.ImageCms
 from PIL.Image import Transpose
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -90,7 +92,7 @@ class StoredImage:
             levels = self._eight_bit(part)
         else:
             # Resampling averages colours times alpha, so that those of transparent pixels have no weight.
-            levels = part.convert("RGBA").convert("RGBa") if self.layered else part.convert("RGB")
+            levels = part.convert("RGBA").convert("RGBa") if self.layered else self._in_srgb(part)
         return levels if self.transform is None else levels.transpose(self.transform)
 
     @property
@@ -118,6 +120,30 @@ class StoredImage:
             return opaque
         both = nonblack & opaque
         return both if both.any() else nonblack
+
+    def _in_srgb(self, part: PIL.Image.Image) -> PIL.Image.Image:
+        """Rows in RGB, converted from the colour space of the file to that of displays."""
+        if self._to_srgb is None:
+            return part.convert("RGB")
+        converted = PIL.ImageCms.applyTransform(part, self._to_srgb)
+        assert converted is not None
+        return converted
+
+    @cached_property
+    def _to_srgb(self) -> PIL.ImageCms.ImageCmsTransform | None:
+        """Transform by the ICC profile (Display P3, Adobe RGB); None without one that differs from sRGB."""
+        stored = self.stored.info.get("icc_profile")
+        if not stored or self.stored.mode != "RGB":
+            return None
+        try:
+            profile = PIL.ImageCms.ImageCmsProfile(io.BytesIO(stored))
+            if "sRGB" in PIL.ImageCms.getProfileDescription(profile):
+                return None
+            srgb = PIL.ImageCms.createProfile("sRGB")
+            return PIL.ImageCms.buildTransform(profile, srgb, "RGB", "RGB")
+        except Exception:
+            # Pillow may be built without colour management, and profiles may be damaged.
+            return None
 
     def _stored_part(self, start: int, stop: int) -> PIL.Image.Image:
         width, height = self.stored.size
