@@ -62,22 +62,15 @@ def test_impossible_options_are_rejected(arguments, make, words, tmp_path, run_c
 
 CONFIGS = [
     ("[[features]]\nlevels = 1", "takes a table"),
-    ("[features]\nkind = ['a']", "unknown kind of features ['a']"),
-    ("[features]\nlevels = 1979-05-27T07:32:00Z", "takes a whole number; got datetime"),
     (f"[features]\nlevels = 0x{'f' * 9000}", "takes a whole number; got int too large"),
     (f"[features]\nlevels = {'9' * 9000}", "is not TOML"),
     (f"[features]\nlevels.{'a.' * 5000}b = 1", "takes a whole number"),
-    ("[intrinsics]\nfocal_px = nan", "takes a number; got nan"),
     ("[intrinsics]\nfocal_px = 1" + "0" * 400, "takes a number; got 1000"),
-    ("[intrinsics]\nprincipal_point_px = [1, 2, 3]", "a list of 2 values; got 3"),
-    ("[intrinsics]\nprincipal_point_px = {a = 1}", "takes a list; got {'a': 1}"),
-    ("[intrinsics]\ncameras = ['shared']", "unknown value of intrinsics.cameras"),
-    ("[dense]\npairs = 3", "pairs"),
     ("[dense.pairs]\nmatcher = {kind = []}", "unknown kind of dense.pairs.matcher []"),
-    ("preset = ['default']", "unknown preset ['default']"),
     (f"a = {'[' * 50_000}", "too deep"), (b"\xff\xfe\0a", "is not a UTF-8 text"), ("\0", "is not TOML"),
     ("x" * 100_000 + " = 1", "unknown stage"),
 ]  # fmt: skip
+"""Values of other types are tried at random."""
 
 
 @pytest.mark.parametrize(("text", "words"), CONFIGS, ids=[str(k) for k in range(len(CONFIGS))])
