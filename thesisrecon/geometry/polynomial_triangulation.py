@@ -16,7 +16,7 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64, require_finite, require_shapes
-from thesisrecon.geometry._polynomials import horner, roots_in_unit_interval
+from thesisrecon.geometry._polynomials import roots_in_unit_interval
 from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix
 from thesisrecon.geometry.triangulation import sort_by_point, triangulate_linear
 from thesisrecon.geometry.two_view import fundamental_from_cameras
@@ -28,8 +28,6 @@ _PencilCost = tuple[float, float, float, float, float, float, float]
 E0, E1, E2, G, kappa."""
 
 _DEGREE = 6
-_MONOTONE = 3.0
-"""If the linear coefficient exceeds the derivative of the others by this factor, Newton's steps contract."""
 _RANK = 1e-13  # singular values below this fraction of the largest are zero
 
 
@@ -97,18 +95,7 @@ def _best_in_sector(own: _Two, B: F64, Q: float, D: float, other: _Two, E: F64, 
     G, kappa = Q * h * h, D * h * h
     cost = (n0, n1, E0, E1, E2, G, kappa)
     _stationary_polynomial(cost, c)
-    bend = 2.0 * abs(c[2]) + 3.0 * abs(c[3]) + 4.0 * abs(c[4]) + 5.0 * abs(c[5]) + 6.0 * abs(c[6])
-    if proper and c[1] > _MONOTONE * bend:
-        # A monotone derivative: the only stationary point of the sector is the global minimum.
-        x = 0.0
-        for _ in range(30):
-            value, slope = horner(c, x)
-            before = x
-            x = min(max(x - value / slope, -1.0), 1.0)
-            if abs(x - before) <= 4e-16 * abs(x):
-                break
-    else:
-        x = _least_stationary(cost, c, not proper)
+    x = _least_stationary(cost, c, not proper)
     if math.isinf(x):
         return p0, p1, -Q, n1 / h
     return q0 + h * x * p0, q1 + h * x * p1, -h * x * Q, n0 + n1 * x
