@@ -274,39 +274,18 @@ def _require_more_than_chance(H: F64, points: F64, gate: float, samples: int) ->
         raise StageFailure.of("homography-by-chance", found, len(points), samples)
 
 
-@kernel
 def _through_four(points: F64, samples: I64) -> F64:
     """Homographies (B', 3, 3) of samples (B, 4) of four matches whose triangles keep their orientation."""
     # With three points of each image as the columns of A and B, and barycentric coordinates a and b of the
     # fourth, H = B diag(b / a) A^-1; the rows of A^-1 are cross products of the columns of A.
-    models, n, s = empty((len(samples), 3, 3)), 0, empty((2, 3))
-    d, x = empty((4, 3)), empty((4, 3))
-    for sample in samples:
-        for k in range(3):
-            for c in range(4):
-                x[c, k] = points[sample[k], c]
-                d[c, k] = x[c, k] - points[sample[3], c]
-        for i in range(2):
-            u, v = d[2 * i], d[2 * i + 1]
-            s[i, 0], s[i, 1] = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2]
-            s[i, 2] = u[0] * v[1] - u[1] * v[0]
-        side = (s[0, 0] + s[0, 1] + s[0, 2]) * (s[1, 0] + s[1, 1] + s[1, 2])
-        # Points of a visible plane lie on one side of its horizon.
-        if not min(s[0, 0] * s[1, 0] * side, s[0, 1] * s[1, 1] * side, s[0, 2] * s[1, 2] * side) > 0.0:
-            continue
-        H = models[n]
-        H[:] = 0.0
-        for k in range(3):
-            i, j, ratio = (k + 1) % 3, (k + 2) % 3, s[1, k] / s[0, k]
-            across, down = ratio * (x[1, i] - x[1, j]), ratio * (x[0, j] - x[0, i])
-            last = ratio * (x[0, i] * x[1, j] - x[0, j] * x[1, i])
-            for r in range(3):
-                y = 1.0 if r == 2 else x[2 + r, k]
-                H[r, 0] += y * across
-                H[r, 1] += y * down
-                H[r, 2] += y * last
-        n += 1
-    return models[:n]
+    matches = points[samples[:, :3]]
+    d = matches - points[samples[:, 3:]]
+    a, b = np.cross(d[:, :, 0], d[:, :, 1]), np.cross(d[:, :, 2], d[:, :, 3])
+    # Points of a visible plane lie on one side of its horizon.
+    good = (a * b * (a.sum(axis=1) * b.sum(axis=1))[:, None]).min(axis=1) > 0.0
+    A, B = homogenize(matches[good, :, :2]), homogenize(matches[good, :, 2:])
+    inverse = np.cross(A[:, [1, 2, 0]], A[:, [2, 0, 1]])
+    return np.asarray((B * (b[good] / a[good])[:, :, None]).swapaxes(1, 2) @ inverse)
 
 
 def _search(points: F64, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int]:

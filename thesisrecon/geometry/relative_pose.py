@@ -1,8 +1,10 @@
 """Relative poses of calibrated cameras: five points, essential matrices and homographies taken apart."""
 
+from itertools import product
+
 import numpy as np
 
-from thesisrecon._numba import empty, kernel, zeros
+from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.geometry._polynomials import horner, roots_in_unit_interval
 from thesisrecon.geometry.homogeneous import cross_matrix
@@ -10,9 +12,9 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 # Products of the unknowns (x, y, z, 1): those of three as in Nister's table, then those without x^2, xy, y^2.
 _CUBIC = ("000", "111", "001", "011", "002", "003", "112", "113", "012", "013", "022", "023", "033", "122",
           "123", "133", "222", "223", "233", "333")  # fmt: skip
-_SQUARE = ("00", "01", "02", "03", "11", "12", "13", "22", "23", "33")
-_OF_TWO = np.array([[_SQUARE.index("".join(sorted(f"{i}{j}"))) for j in range(4)] for i in range(4)])
-_OF_THREE = np.array([[_CUBIC.index("".join(sorted(f"{two}{k}"))) for k in range(4)] for two in _SQUARE])
+_ALL_CUBIC = np.array(
+    [["".join(sorted(each)) == name for name in _CUBIC] for each in product("0123", repeat=3)], np.float64
+)
 
 
 def essential_five_points(x1: F64, x2: F64) -> F64:
@@ -23,25 +25,30 @@ def essential_five_points(x1: F64, x2: F64) -> F64:
     polynomials in z, and whose determinant has degree ten (Nister, PAMI 26(6), 2004). Up to ten of each
     sample.
     """
+    rows = np.einsum("ski,skj->sijk", x2, x1).reshape(-1, 9, 5)
+    N = np.ascontiguousarray(np.linalg.qr(rows, mode="complete")[0][:, :, 5:].swapaxes(1, 2))
     models = np.empty((10 * len(x1), 3, 3))
-    return models[: _solve_five(np.ascontiguousarray(x1), np.ascontiguousarray(x2), models.reshape(-1, 9))]
+    return models[: _solve_each(N, _essential_constraints(N.reshape(-1, 4, 3, 3)), models.reshape(-1, 9))]
+
+
+def _essential_constraints(E: F64) -> F64:
+    """2 E E' E - tr(E E') E and det E (S, 10, 20) over ``_CUBIC`` of E0 to E3 (S, 4, 3, 3)."""
+    squares = E[:, :, None] @ E[:, None].swapaxes(3, 4)
+    squares = 2.0 * squares - np.trace(squares, axis1=3, axis2=4)[..., None, None] * np.eye(3)
+    cubes = np.einsum("suvik,swkj->sijuvw", squares, E, optimize=True).reshape(-1, 9, 64)
+    minors = np.cross(E[:, :, None, 1], E[:, None, :, 2])
+    determinant = np.einsum("suvi,swi->suvw", minors, E[:, :, 0]).reshape(-1, 1, 64)
+    return np.asarray(np.concatenate([cubes, determinant], axis=1) @ _ALL_CUBIC)
 
 
 @kernel
-def _solve_five(x1: F64, x2: F64, models: F64) -> int:
-    """Fill models (M, 9) with the essential matrices of samples (B, 5, 3); their number."""
-    V, A, B, c, back = empty((9, 9)), empty((10, 20)), empty((3, 3, 5)), empty(11), empty(11)
-    roots, n = empty(11), 0
-    for s in range(len(x1)):
-        for k in range(5):
-            for i in range(3):
-                for j in range(3):
-                    V[k, 3 * i + j] = x2[s, k, i] * x1[s, k, j]
-        _complete_basis(V)
-        _essential_constraints(V[5:], A)
-        if not _reduce(A):
+def _solve_each(N: F64, A: F64, models: F64) -> int:
+    """Fill models (M, 9) from null spaces (S, 4, 9) and constraints (S, 10, 20); their number."""
+    B, c, back, roots, n = empty((3, 3, 5)), empty(11), empty(11), empty(11), 0
+    for s in range(len(N)):
+        if not _reduce(A[s]):
             continue
-        _determinant_in_z(A, B, c)
+        _determinant_in_z(A[s], B, c)
         for k in range(11):
             back[k] = c[10 - k]
         for far in range(2):
@@ -49,75 +56,8 @@ def _solve_five(x1: F64, x2: F64, models: F64) -> int:
                 z = roots[k]
                 if far and z == 0.0:
                     continue
-                n += _essential_of_root(B, 1.0 / z if far else z, V[5:], models[n])
+                n += _essential_of_root(B, 1.0 / z if far else z, N[s], models[n])
     return n
-
-
-@kernel
-def _complete_basis(V: F64) -> None:
-    """Replace five rows of V (9, 9) by an orthonormal basis of them and its complement (Gram-Schmidt)."""
-    for k in range(9):
-        if k >= 5:
-            # The unit vector farthest from the rows before.
-            far, most = 0, -1.0
-            for j in range(9):
-                left = 1.0
-                for i in range(k):
-                    left -= V[i, j] ** 2
-                if left > most:
-                    far, most = j, left
-            V[k] = 0.0
-            V[k, far] = 1.0
-        for _ in range(2):
-            for i in range(k):
-                along = 0.0
-                for j in range(9):
-                    along += V[i, j] * V[k, j]
-                for j in range(9):
-                    V[k, j] -= along * V[i, j]
-            size = 0.0
-            for j in range(9):
-                size += V[k, j] ** 2
-            size = 1.0 / np.sqrt(size + 1e-300)
-            for j in range(9):
-                V[k, j] *= size
-
-
-@kernel
-def _essential_constraints(N: F64, A: F64) -> None:
-    """Fill A (10, 20) with 2 E E' E - tr(E E') E and det E over ``_CUBIC``; N (4, 9) holds E0 to E3."""
-    G, minor = zeros((3, 3, 10)), empty(10)
-    A[:] = 0.0
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                _add_product(2.0, N, 3 * i + k, 3 * j + k, G[i, j])
-                # The trace of all squares.
-                _add_product(-1.0, N, 3 * j + k, 3 * j + k, G[i, i])
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                _add_times(G[i, k], N, 3 * k + j, A[3 * i + j])
-        minor[:] = 0.0
-        _add_product(1.0, N, 3 + (i + 1) % 3, 6 + (i + 2) % 3, minor)
-        _add_product(-1.0, N, 3 + (i + 2) % 3, 6 + (i + 1) % 3, minor)
-        _add_times(minor, N, i, A[9])
-
-
-@kernel
-def _add_product(factor: float, N: F64, a: int, b: int, q: F64) -> None:
-    """Add a multiple of the product of two linear forms, columns of N (4, 9), to q (10,) over ``_SQUARE``."""
-    for u in range(4):
-        for v in range(4):
-            q[_OF_TWO[u, v]] += factor * N[u, a] * N[v, b]
-
-
-@kernel
-def _add_times(q: F64, N: F64, a: int, out: F64) -> None:
-    """Add the product of a quadratic form q (10,) and a linear one to ``out`` (20,) over ``_CUBIC``."""
-    for two in range(10):
-        for v in range(4):
-            out[_OF_THREE[two, v]] += q[two] * N[v, a]
 
 
 @kernel

@@ -282,31 +282,18 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
 
 
 def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
-    """Positive real roots of quartics c (B, 5), highest power first, with their rows (Ferrari)."""
+    """Positive real roots of quartics c (B, 5), highest power first, with their rows (companion matrices)."""
     # Those of the reversed quartic are 1 / x: the larger of both ends leads.
     small = np.abs(c[:, 0]) < np.abs(c[:, 4])
     c = np.where(small[:, None], c[:, ::-1], c)
     good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))
-    a3, a2, a1, a0 = c[good, 1:].T / c[good, 0] + 0j
-    # y^4 + p y^2 + q y + r with x = y - a3 / 4, and the resolvent m^3 + p m^2 + (p^2 / 4 - r) m - q^2 / 8.
-    p, q = a2 - 0.375 * a3**2, a1 - 0.5 * a2 * a3 + a3**3 / 8.0
-    r = a0 - 0.25 * a1 * a3 + a2 * a3**2 / 16.0 - 3.0 * a3**4 / 256.0
-    third, half = -(p**2) / 36.0 - r / 3.0, p**3 / 216.0 - p * r / 6.0 + q**2 / 16.0
-    across = np.sqrt(half**2 + third**3)
-    u = np.where(np.abs(half + across) > np.abs(half - across), half + across, half - across) ** (1.0 / 3.0)
-    u = u * np.exp(2j * np.pi / 3.0 * np.arange(3))[:, None]
-    m = u - third / np.where(u == 0.0, 1.0, u) - p / 3.0
-    m = np.take_along_axis(m, np.abs(m).argmax(axis=0)[None], axis=0)[0]
-    s = np.sqrt(2.0 * np.where(m == 0.0, 1e-300, m)) * np.array([[1.0], [-1.0]])
-    t = np.sqrt(-2.0 * (p + m + q / s))
-    x = np.concatenate([s + t, s - t]) / 2.0 - a3 / 4.0
-    for _ in range(2):
-        slope = ((4.0 * x + 3.0 * a3) * x + 2.0 * a2) * x + a1
-        x -= ((((x + a3) * x + a2) * x + a1) * x + a0) / np.where(slope == 0.0, 1.0, slope)
-    x = np.where(small[good], 1.0 / np.where(x == 0.0, 1e-300, x), x)
+    companion = np.eye(4, k=-1) * np.ones((np.count_nonzero(good), 1, 1))
+    companion[:, 0] = -c[good, 1:] / c[good, :1]
+    x = np.linalg.eigvals(companion) + 0j
+    x = np.where(small[good, None], 1.0 / np.where(x == 0.0, 1e-300, x), x)
     real = (np.abs(x.imag) < 1e-4 * (1.0 + np.abs(x.real))) & (x.real > 0.0) & (x.real < 1e100)
-    sample, which = np.nonzero(real.T)
-    return np.asarray(x.real[which, sample], dtype=np.float64), np.flatnonzero(good)[sample]
+    sample, which = np.nonzero(real)
+    return np.asarray(x.real[sample, which], dtype=np.float64), np.flatnonzero(good)[sample]
 
 
 def _triad(X: F64) -> F64:

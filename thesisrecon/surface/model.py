@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy
 
-from thesisrecon._numba import ThreadPool, kernel
+from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import B8, F32, F64, I64, U8, resizing_transform
 from thesisrecon.camera import Camera
 from thesisrecon.errors import Notice, StageFailure, require_range
@@ -63,24 +64,6 @@ def texture_mesh(
     return replace(mesh, uv=uv, texture=texture, colors=None, untextured=label < 0)
 
 
-@kernel
-def diffuse(share: F32, neighbours: I64, keep: float, spread: F32, out: F32) -> None:
-    """Diffuse ``spread`` (M, V) over neighbouring faces by one step, among the views with a ``share``."""
-    for m in range(share.shape[0]):
-        count = 0
-        for k in range(3):
-            count += neighbours[m, k] >= 0
-        part = np.float32((1.0 - keep) / max(count, 1))
-        for v in range(share.shape[1]):
-            out[m, v] = 0.0
-            if share[m, v] > 0.0:
-                total = np.float32(0.0)
-                for k in range(3):
-                    if neighbours[m, k] >= 0:
-                        total += spread[neighbours[m, k], v]
-                out[m, v] = np.float32(keep) * share[m, v] + part * total
-
-
 def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     """Pixels (N, 2) of vertices, NaN behind the camera, and depths (N,)."""
     xyz = (vertices @ camera.R.T + camera.t) @ camera.K.T
@@ -129,7 +112,11 @@ def choose_views(
     neighbour with the longest common border: few charts. Eight views are in memory at a time.
     """
     smooth_rounds = 40  # Faces over which the choice of views is smoothed
-    own_weight = 0.1  # Weight of a face's own share relative to those of its neighbours
+    own_weight = np.float32(0.1)  # Weight of a face's own share relative to those of its neighbours
+    face, side = np.nonzero(neighbours >= 0)
+    part = (1.0 - own_weight) / np.bincount(face, minlength=len(mesh.faces))[face]
+    every = (part.astype(np.float32), (face, neighbours[face, side]))
+    across = scipy.sparse.csr_array(every, shape=(len(mesh.faces), len(mesh.faces)))
     visible = np.zeros((len(mesh.faces), -(-len(views) // 8)), dtype=np.uint8)
     label = np.full(len(mesh.faces), -1, dtype=np.int64)
     best, most = np.zeros((2, len(mesh.faces)), dtype=np.float32)
@@ -144,10 +131,9 @@ def choose_views(
 
     def smoothest_of_eight(first: int) -> tuple[F32, I64]:
         share = np.asarray(quality_of_eight(first) / np.maximum(best, 1e-20)[:, None], dtype=np.float32)
-        spread, other = share.copy(), np.empty_like(share)
+        spread = share
         for _ in range(smooth_rounds):
-            diffuse(share, neighbours, own_weight, spread, other)
-            spread, other = other, spread
+            spread = np.where(share > 0.0, own_weight * share + across @ spread, np.float32(0.0))
         return spread.max(axis=1), first + spread.argmax(axis=1)
 
     with ThreadPool(threads) as pool:
