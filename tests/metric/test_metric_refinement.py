@@ -13,9 +13,11 @@ from tests.synthetic import TrueScene, make_scene, projective_reconstruction, wi
 from thesisrecon.camera import project_camera
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric import refinement
 from thesisrecon.metric._model import normalized_observations
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.world import centres_of, constrained, placed
 from thesisrecon.optimize.bundle.projection import MetricCameras
 from thesisrecon.records import Tracks
 from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
@@ -225,6 +227,38 @@ def test_focal_length_of_strips_is_right_and_another_adjustment_keeps_it(seed):
     again = thesisrecon.bundle_adjust(result.reconstruction, free=free, prior={"k2": 0.02, "k3": 0.02})
     assert again.converged
     assert abs(again.cameras[0].K[0, 0] - focal) < 0.3 * std
+
+
+def dome(reconstruction, X, length):
+    """Height of the middle of a flat block over its ends after the best similarity, over its length."""
+    there = reconstruction.valid
+    found = reconstruction.X[there, :3] / reconstruction.X[there, 3:]
+    off = estimate_similarity(found, X[there]).apply(found)[:, 2] - X[there, 2]
+    x, y = (X[there, :2] / (0.5 * length)).T
+    basis = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    return float(np.linalg.lstsq(basis, off, rcond=None)[0][3]) / length
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_known_positions_bound_the_doming_of_a_flat_block_and_leave_out_wrong_ones(seed):
+    scene, rng = strips(seed, noise=1.0), np.random.default_rng(seed)
+    prior = prior_for(projective_reconstruction(scene))
+    prior = replace(prior, shared=np.zeros_like(prior.shared), kind=np.zeros_like(prior.kind))
+    free = thesisrecon.reconstruct_from_tracks(scene.tracks, scene.sizes).metric
+    centres = -np.einsum("vba,vb->va", scene.R, scene.t)
+    positions = centres + rng.normal(0.0, 0.02, centres.shape)
+    positions[4], positions[7] = [1e4, 0.0, 0.0], np.nan
+    alone = placed(free, positions)
+    given = {"refiner": MetricRefinement(), "prior": prior, "rng": np.random.default_rng(0)}
+    found = constrained(alone, positions, 0.02, **given)
+    assert not found.used[[4, 7]].any()
+    assert found.used.sum() == len(centres) - 2
+    X = scene.X[np.unique(scene.tracks.point_index)]
+    before, after = (dome(one.result.reconstruction, X, 120.0) for one in (alone, found))
+    assert abs(after) < 5e-4
+    assert abs(after) < 0.5 * abs(before)
+    off = (centres_of(found.result.reconstruction) - centres)[found.used]
+    assert np.sqrt(np.mean(off**2)) < 0.03
 
 
 def random_scene(seed):

@@ -179,6 +179,7 @@ def _job_with_more(
     known = known_by_name(caller, old, until)
     run.as_stored = old.summary.get("as_stored") is True
     run.images_folder, run.masks_folder = recorded(old, "images_folder"), recorded(old, "masks_folder")
+    run.world = dict(old.summary.get("world", {}))
     source = source_of_known(known, refine)
     with run.workers if trial else claimed(run, overwrite=False, source=source), run.resumable():
         inputs = _inputs(caller, run, old, images)

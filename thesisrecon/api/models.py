@@ -3,12 +3,10 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy
@@ -22,6 +20,7 @@ from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import as_path, name_without_suffix, read_json
 from thesisrecon.io._models import read_calibration, read_model, read_positions
+from thesisrecon.metric.world import require_width, robust_similarity
 from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
 from thesisrecon.results import (
@@ -34,8 +33,6 @@ from thesisrecon.results import (
     SparseView,
 )
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
-
-_INLIER_SIGMAS = 3.37  # 99 % of the lengths of three-dimensional normal residuals are shorter
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +141,9 @@ def align_to_positions(
     source = np.array([centres[name] for name in names])
     target = np.array([places[name] for name in names])
     _require_lengths(target)
-    _require_width(source, "camera centres", 0.0)
-    similarity, inlier, sigma = _robust_similarity(source, target, seed)
-    _require_width(target[inlier], "positions", sigma)
+    require_width(source, "camera centres", 0.0)
+    similarity, inlier, sigma = robust_similarity(source, target, seed)
+    require_width(target[inlier], "positions", sigma)
     residual = similarity.apply(source) - target
     report = AlignmentReport(similarity, names, residual, inlier, sigma, unknown, origin, missing)
     return model.transformed(similarity), report
@@ -177,61 +174,6 @@ def _require_lengths(positions: F64) -> None:
             "the positions look like latitude and longitude in degrees, which are no lengths; give a file "
             "whose header names the columns lat, lon and alt, or subtract an offset if they are lengths"
         )
-
-
-def _require_width(points: F64, what: str, sigma: float) -> None:
-    """Require points off a line by more than their noise: the rotation about the line is free otherwise."""
-    along, across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2] / math.sqrt(len(points))
-    if across <= max(1e-3 * along, sigma):
-        spread = f"RMS {across:.3g} across the line, {along:.3g} along it, noise {sigma:.2g}"
-        raise UsageError(
-            f"the {what} of the {len(points)} images lie on one line ({spread}), which leaves the rotation "
-            "about it undetermined; add positions off the line, or use only the scale (--scale)"
-        )
-
-
-def _robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity, B8, float]:
-    """Similarity, inliers and noise of one coordinate."""
-    n = len(source)
-    # Residuals below are rounding.
-    floor = 1e-9 * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
-
-    def distances(found: Similarity) -> F64:
-        return np.asarray(np.linalg.norm(found.apply(source) - target, axis=1))
-
-    # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.
-    rank = (n + 4) // 2
-    best, least = None, math.inf
-    # All up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong.
-    triples: Iterable[Any] = combinations(range(n), 3)
-    if math.comb(n, 3) > 1000:
-        rng = np.random.default_rng(seed)
-        triples = (rng.choice(n, 3, replace=False) for _ in range(1000))
-    for triple in map(list, triples):
-        try:
-            found = estimate_similarity(source[triple], target[triple])
-        except ValueError:
-            continue
-        quantile = float(np.partition(distances(found), rank - 1)[rank - 1])
-        if quantile < least:
-            best, least = found, quantile
-    if best is None:
-        _require_width(target, "positions", 0.0)
-        best = estimate_similarity(source, target)
-    # Rousseeuw's correction for few points, and the quantile of the lengths of normal residuals.
-    normal = math.sqrt(2.0 * scipy.special.gammaincinv(1.5, rank / (n + 1)))
-    sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / normal
-    inlier = distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
-    for _ in range(20):
-        _require_width(target[inlier], "positions", 0.0)
-        best = estimate_similarity(source[inlier], target[inlier])
-        free = 3 * int(inlier.sum()) - 7
-        sigma = math.sqrt(float(np.sum(distances(best)[inlier] ** 2)) / free)
-        before, inlier = inlier, distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
-        if inlier.sum() < 3 or (inlier == before).all():
-            inlier = before
-            break
-    return best, inlier, sigma
 
 
 def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel:

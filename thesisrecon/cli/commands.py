@@ -60,6 +60,8 @@ Until = Annotated[str | None, typer.Option("--until", help=_UNTIL_HELP)]
 _EXECUTOR_HELP = "Run workers as threads (local), as processes, or on a Dask cluster."
 _EXECUTORS = "local|processes|dask://HOST:PORT"
 Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
+_GPS_HELP = "Move the model to the GPS positions of the images: metres east, north, up."
+Gps = Annotated[bool, typer.Option("--gps", help=_GPS_HELP)]
 _KNOWN_HELP = "Cameras that are known: cameras.json, COLMAP model, run, or another file of cameras."
 Known = Annotated[Path | None, common.folder_option(_KNOWN_HELP, "--known", metavar="MODEL")]
 _REFINE_HELP = "With --known and --into: adjust these cameras, too."
@@ -74,7 +76,7 @@ OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)
 def reconstruct(
     images: Images = None, out: Out = None, into: Into = None, every: Every = None, source: Source = None,
     images_folder: ImagesFolder = None, masks: Masks = None, known: Known = None, refine: Refine = False,
-    preset: Preset = None, cameras: Cameras = None,
+    gps: Gps = False, preset: Preset = None, cameras: Cameras = None,
     config: Config = None, settings: Settings = None, seed: common.Seed = 0, threads: common.Threads = 0,
     max_size: common.MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
     overwrite: OverwriteRun = False,
@@ -82,7 +84,8 @@ def reconstruct(
     """Reconstruct cameras, points and a textured model from images."""
     common.cap_threads(threads)
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
-    chosen |= {"max_size": max_size, "set": settings or [], "masks": masks}
+    chosen |= {"max_size": max_size, "set": [*(settings or []), *(["images.gps=true"] if gps else [])]}
+    chosen |= {"masks": masks}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     if (out is None) == (into is None):
         raise UsageError(Notice("no-output-folder"))

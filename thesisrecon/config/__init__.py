@@ -276,14 +276,23 @@ class ImageOptions:
     part_views : int
         Maximum number of images (approximately) that are reconstructed together. Larger sets are divided
         into overlapping parts if a division separates few of the common points; 0: never.
+    gps : bool
+        Move the model to the GPS positions of EXIF: in metres east, north and up of their median.
+    gps_std_m : float
+        Standard deviation of a coordinate of these positions, which are then observations of the adjustment,
+        too; 0: they determine the frame alone.
     """
 
     max_size_px: int = 1600
     groups: bool = True
     part_views: int = 400
+    gps: bool = False
+    gps_std_m: float = 0.0
 
     def __post_init__(self) -> None:
-        require_range(self, max_size_px="[64, inf)", part_views="[0, inf)")
+        require_range(self, max_size_px="[64, inf)", part_views="[0, inf)", gps_std_m="[0, inf)")
+        if self.gps_std_m and not self.gps:
+            raise ValueError(f"gps_std_m = {self.gps_std_m} has no effect without gps = true")
 
 
 @dataclass(frozen=True)

@@ -66,20 +66,28 @@ _budget = _pixels.MemoryBudget(MAX_DECODED_BYTES)
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """An image at working size, a digest of its content, a warning, and the focal length from EXIF."""
+    """An image at working size, a digest of its content, a warning, and facts of EXIF.
+
+    ``place`` is the latitude, longitude (degrees) and height (m) of the camera.
+    """
 
     image: Image
     digest: str
     exif_focal_px: float = math.nan
     note: str = ""
+    place: tuple[float, float, float] = (math.nan,) * 3
 
 
 @dataclass(frozen=True)
 class ImageSet:
-    """The usable images of a run, sorted by name, and name -> reason of the other files."""
+    """The usable images of a run, sorted by name, and name -> reason of the other files.
+
+    ``whole`` is the set of which these are a part.
+    """
 
     decoded: tuple[DecodedImage, ...]
     refused: dict[str, str]
+    whole: "ImageSet | None" = None
 
     @property
     def images(self) -> tuple[Image, ...]:
@@ -90,6 +98,11 @@ class ImageSet:
     def exif_focal_px(self) -> F64:
         """Focal lengths (V,) from EXIF in original pixels, NaN = unknown."""
         return np.array([d.exif_focal_px for d in self.decoded])
+
+    @property
+    def places(self) -> F64:
+        """Latitudes, longitudes (degrees) and heights (m) of EXIF (V, 3), NaN = unknown."""
+        return np.array([d.place for d in self.decoded]).reshape(-1, 3)
 
 
 def demo_images() -> list[Path]:
@@ -338,7 +351,7 @@ def _decoded_image(name: str, max_size_px: int, as_stored: bool, file: PIL.Image
     # The film is 36 mm wide; a focal length outside of 1 to 1e5 mm is a mistake.
     focal = focal_35mm / 36.0 * max(stored.size) if 1.0 <= focal_35mm <= 1e5 else math.nan
     image = _image(name, stored, max_size_px)
-    return DecodedImage(image, "", focal, Notice("several-frames") if several else "")
+    return DecodedImage(image, "", focal, Notice("several-frames") if several else "", _gps(file))
 
 
 def may_be_transparent(path: Path) -> bool:
@@ -385,6 +398,19 @@ def _exif(file: PIL.Image.Image) -> tuple[int, float]:
         # The pixels may be good even if the header is damaged.
         return 0, 0.0
     return orientation if isinstance(orientation, int) else 0, focal
+
+
+def _gps(file: PIL.Image.Image) -> tuple[float, float, float]:
+    """Latitude, longitude (degrees) and height (m) of EXIF, NaN if they are not complete."""
+    try:
+        tags = file.getexif().get_ifd(0x8825)
+        sides = [sum(float(part) / 60.0**k for k, part in enumerate(tags[n])) for n in (2, 4)]
+        latitude, longitude = (-a if tags[n] in ("S", "W") else a for a, n in zip(sides, (1, 3), strict=True))
+        height = float(tags[6]) * (-1.0 if tags.get(5, b"\0") in (1, b"\1") else 1.0)
+    except Exception:
+        return math.nan, math.nan, math.nan
+    known = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and math.isfinite(height)
+    return (latitude, longitude, height) if known else (math.nan,) * 3
 
 
 def read_pixels(*sources: Any) -> list[U8]:

@@ -211,11 +211,9 @@ def read_positions(path: Path) -> Positions:
         found[name] = x, y, z
     if not header.degrees or not found:
         return Positions(found)
-    degrees = np.array([*found.values()])
-    # The median is one of the positions near most of them, also beside those without a fix (0, 0).
-    x, y, z = (median_low(column) for column in degrees.T.tolist())
-    metres = _east_north_up(degrees, np.array([x, y, z])).tolist()
-    return Positions({name: (e, n, u) for name, (e, n, u) in zip(found, metres, strict=True)}, (x, y, z))
+    metres, origin = east_north_up(np.array([*found.values()]))
+    placed = {name: (e, n, u) for name, (e, n, u) in zip(found, metres.tolist(), strict=True)}
+    return Positions(placed, origin)
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -263,12 +261,18 @@ def _header_of(cells: Sequence[str], path: Path) -> _Header:
     return _Header(_ORDER, 4)
 
 
-def _east_north_up(places: F64, origin: F64) -> F64:
-    """Metres (N, 3) in the tangent plane of the WGS84 ellipsoid at the origin."""
-    (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians(origin[:2])) for f in (np.sin, np.cos))
+def east_north_up(places: F64, origin: Place | None = None) -> tuple[F64, Place]:
+    """Metres (N, 3) in the tangent plane of WGS84 at the ``origin``, by default the median; and this.
+
+    ``places`` are latitudes, longitudes (degrees) and heights (m), NaN where unknown.
+    """
+    # The median is one of the positions near most of them, also beside those without a fix (0, 0).
+    known = places[np.isfinite(places).all(axis=1)].T.tolist()
+    x, y, z = origin or (median_low(column) for column in known)
+    (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians([x, y])) for f in (np.sin, np.cos))
     east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
     axes = np.array([east, north, np.cross(east, north)])
-    return np.asarray((_geocentric(places) - _geocentric(origin)) @ axes.T)
+    return np.asarray((_geocentric(places) - _geocentric(np.array([x, y, z]))) @ axes.T), (x, y, z)
 
 
 def _geocentric(place: F64) -> F64:

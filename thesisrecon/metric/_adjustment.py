@@ -29,6 +29,7 @@ from thesisrecon.metric._model import (
     reproject_observations,
     residual_norms,
 )
+from thesisrecon.optimize.bundle.knowledge import NO_PRIOR, BundleKnowledge, PositionPrior
 from thesisrecon.optimize.bundle.metric import (
     MAX_ITERATIONS,
     BundleOptions,
@@ -64,8 +65,8 @@ class MetricAdjustment:
 
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
     lower bound of the estimated noise, ``inflation`` a factor on the noise in the weights, for correlated
-    residuals. Lenses in tables of twelve columns may be ``decentred``. The result does not depend on
-    ``threads``.
+    residuals. Lenses in tables of twelve columns may be ``decentred``; ``centres`` are known positions
+    of cameras. The result does not depend on ``threads``.
     """
 
     prior: IntrinsicsPrior
@@ -75,6 +76,7 @@ class MetricAdjustment:
     inflation: float = 1.0
     threads: int = 1
     decentred: bool = False
+    centres: PositionPrior = NO_PRIOR
 
     def options(
         self, model: MetricEstimate, *, iterations: int = MAX_ITERATIONS, settled: float = SETTLED
@@ -127,7 +129,7 @@ class MetricAdjustment:
         moves = moves if free is None else moves & free[: len(moves)]
         result = refine_metric_bundle(
             model.cameras, model.X, inlier_observations(model), free=moves,
-            prior=self.row_prior(model), options=options, fixed=fixed,
+            prior=self.row_prior(model), options=options, fixed=fixed, knowledge=self._knowledge(model),
         )  # fmt: skip
         model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)
         if keep_noise:
@@ -138,6 +140,14 @@ class MetricAdjustment:
         # For a larger width it is least squares.
         loss, tail = min(width / sigma, 20.0), tail_width(norms, sigma)
         return replace(model, sigma_px=sigma, loss_sigmas=loss, tail=tail), result
+
+    def _knowledge(self, model: MetricEstimate) -> BundleKnowledge | None:
+        """The known positions of cameras with inliers."""
+        seen = np.isin(self.centres.index, model.tracks.view_index[model.inlier])
+        if not seen.any():
+            return None
+        index, position, root = (a[seen] for a in vars(self.centres).values())
+        return BundleKnowledge(centres=PositionPrior(index, position, root))
 
     def linearised(self, model: MetricEstimate) -> LinearisedFit:
         """The linearised adjustment of a model at its minimum."""

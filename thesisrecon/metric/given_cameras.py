@@ -14,7 +14,7 @@ from thesisrecon import records
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import Camera, angles_of_view
 from thesisrecon.errors import Notice, StageFailure, UsageError, counted
-from thesisrecon.geometry.strata import estimate_similarity, transform
+from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import BASE, simplest_row
 from thesisrecon.metric import _model, _resection
 from thesisrecon.metric._adjustment import MIN_OBSERVATIONS, MetricAdjustment, inlier_observations
@@ -22,6 +22,7 @@ from thesisrecon.metric._checks import MIN_INLIER_RATIO, self_check, triangulabl
 from thesisrecon.metric._model import FOCAL, K1, LATE_SIGMAS, WIDTH, MetricEstimate
 from thesisrecon.metric._uncertainty import USUAL_INFLATION, intrinsic_columns
 from thesisrecon.metric.refinement import MetricRefinement, as_reconstruction
+from thesisrecon.metric.world import centres_of, moved
 from thesisrecon.optimize.bundle.knowledge import BundleKnowledge
 from thesisrecon.optimize.bundle.metric import refine_metric_bundle
 from thesisrecon.optimize.bundle.projection import MetricCameras
@@ -266,21 +267,6 @@ def _prior_of_stds(given: GivenCameras, prior: IntrinsicsPrior) -> IntrinsicsPri
 
 def _in_given_frame(given: GivenCameras, refined: records.MetricResult) -> records.MetricResult:
     """A refined result moved by the similarity that brings its centres nearest to the given ones."""
-    r = refined.reconstruction
-    assert r.K is not None
-    both = np.flatnonzero(r.registered & given.known)
-    Rt = np.linalg.solve(r.K[both], r.P[both])
-    now = -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
-    target = -np.einsum("vba,vb->va", given.R[both], given.t[both])
-    move = estimate_similarity(now, target)
-    H = np.eye(4)
-    H[:3, :3], H[:3, 3] = move.scale * move.R, move.t
-    P = transform(H, r.P, "cameras") * move.scale
-    P = np.where(r.registered[:, None, None], P, 0.0)
-    X = np.where(r.valid[:, None], transform(H, r.X, "points"), 0.0)
-    X = np.where(r.valid[:, None], X / np.where(r.valid, X[:, 3], 1.0)[:, None], 0.0)
-    std = refined.pose_std
-    if std is not None:
-        # Variances along other axes, without the correlations of those.
-        std = np.column_stack([std[:, :3], move.scale * np.sqrt(std[:, 3:] ** 2 @ (move.R**2).T)])
-    return replace(refined, reconstruction=replace(r, P=P, X=X), pose_std=std)
+    centres = -np.einsum("vba,vb->va", given.R, given.t)
+    both = refined.reconstruction.registered & given.known
+    return moved(refined, estimate_similarity(centres_of(refined.reconstruction)[both], centres[both]))

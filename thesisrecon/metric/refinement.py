@@ -28,6 +28,7 @@ from thesisrecon.metric._lens import (
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
+from thesisrecon.optimize.bundle.knowledge import NO_PRIOR, PositionPrior
 from thesisrecon.optimize.bundle.scatter import (
     BlockScatter,
     LinearisedFit,
@@ -63,9 +64,12 @@ class MetricRefinement:
     def refine(
         self, reconstruction: records.Reconstruction, calibration: records.SelfCalibration, *,
         prior: records.IntrinsicsPrior, rng: np.random.Generator, threads: int = 1,
+        centres: PositionPrior = NO_PRIOR,
     ) -> records.MetricResult:  # fmt: skip
-        """See `thesisrecon.config.MetricRefiner.refine`."""
-        adjustment = MetricAdjustment(prior, lens_std=0.02, noise_floor_px=0.02, threads=threads)
+        """See `thesisrecon.config.MetricRefiner.refine`; ``centres``: known positions of cameras."""
+        adjustment = MetricAdjustment(
+            prior, lens_std=0.02, noise_floor_px=0.02, threads=threads, centres=centres
+        )
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
         if not models:

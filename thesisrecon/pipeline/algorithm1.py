@@ -119,6 +119,7 @@ def metric_cameras(
     metric = stages.register_more(job, views, pairs, best.calibration, best.metric, chosen)
     job.run.cameras = job.known or stages.known_cameras(job.prior, metric)
     metric = join_left_over(job, replace(best, metric=metric), chosen)
+    metric = stages.metric_in_world(job, metric, chosen)
     stages.report_metric(job, metric)
     if len(tried) > 1:
         job.run.warnings.append(Notice("several-starts", len(tried)))
@@ -269,7 +270,8 @@ def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
 
 def _part_of(whole: Job, result: RunResult, directory: RunDirectory, views: Sequence[int]) -> Job:
     """The job of some images of a result, with what is known about their cameras."""
-    inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {})
+    of_all = whole.inputs.whole or whole.inputs
+    inputs = ImageSet(tuple(whole.inputs.decoded[i] for i in views), {}, of_all)
     model = result.best_reconstruction
     front = FromRun(whole, views, result.features, result.pairs, None if model is None else model.tracks)
     known = prior_of_views(whole.run.cameras or whole.prior, views)

@@ -259,6 +259,7 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         **({"images_elsewhere": run.images_elsewhere} if run.images_elsewhere else {}),
         **({} if run.masks_folder is None else {"masks_folder": str(run.masks_folder)}),
         **({"as_stored": True} if run.as_stored else {}),
+        **({"world": run.world} if run.world else {}),
         **({"groups": run.groups} if run.groups else {}),
         "threads": run.workers.threads,
         "executor": run.workers.name,
@@ -328,7 +329,9 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
     # A run of known cameras has no projective model.
     for item, model in (stages["projective"] or dict.fromkeys(stages["metric"])).items():
         # The last of the metric records of an attempt.
-        found = [stages["metric"].get(f"{item}{suffix}") for suffix in ("-joined", "-more", "")]
+        metrics = stages["metric"]
+        found = [metrics.get(f"{item}{suffix}") for suffix in ("-joined", "-more", "")]
+        found = [metrics.get(f"{item}-world", {}).get("result"), *found]
         metric = next((record for record in found if record is not None), None)
         calibration = stages["selfcalibration"].get(item)
         attempts.append(replace(result, projective=model, calibration=calibration, metric=metric))

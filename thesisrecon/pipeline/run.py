@@ -90,6 +90,7 @@ class Run:
     reports: dict[str, StageReport] = field(default_factory=dict, init=False)
     resumed: list[str] = field(default_factory=list, init=False)  #: stages read from the cache
     warnings: list[str] = field(default_factory=list, init=False)
+    world: dict[str, Any] = field(default_factory=dict, init=False)  #: frame of the model by GPS
     groups: list[dict[str, Any]] = field(default_factory=list, init=False)  #: results of runs inside this one
     cameras: IntrinsicsPrior | None = field(default=None, init=False)  #: known before models are joined
     lens: F64 | None = field(default=None, init=False)

@@ -16,12 +16,15 @@ from thesisrecon._numba import code_digest
 from thesisrecon.arrays import B8
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
-from thesisrecon.errors import Notice, StageFailure
+from thesisrecon.errors import Notice, StageFailure, UsageError
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.imaging.on_demand import OnDemand
+from thesisrecon.io._models import east_north_up
 from thesisrecon.matching.pair_selection import reject_repeated_structure
 from thesisrecon.metric.given_cameras import metric_from_given
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.world import constrained, placed
 from thesisrecon.pipeline.large_sets import align_parts, calibrate_with_core, from_metric, tracks_of_part
 from thesisrecon.pipeline.lens import straight_pair, straight_tracks
 from thesisrecon.pipeline.matching import build_tracks
@@ -110,6 +113,47 @@ def metric_of_given(job: Job, tracks: Tracks, pairs: Sequence[TwoView]) -> Metri
             given, tracks, job.sizes, noise_px=noise, prior=prior, rng=rng, threads=threads
         ),
     )  # fmt: skip
+
+
+def metric_in_world(job: Job, metric: MetricResult, attempt: int) -> MetricResult:
+    """Move a model to the GPS positions of its images, and adjust it to them if their deviation is given."""
+    run, images, places = job.run, job.config.images, job.inputs.places
+    if not images.gps:
+        return metric
+    if not np.isfinite(places).all(axis=1).any():
+        run.warnings.append(Notice("no-gps"))
+        return metric
+    # Groups of images have the origin of all.
+    whole = job.inputs.whole or job.inputs
+    positions, origin = east_north_up(places, east_north_up(whole.places)[1])
+    refiner = job.config.metric
+
+    def place() -> dict[str, Any]:
+        found = placed(metric, positions)
+        if images.gps_std_m and isinstance(refiner, MetricRefinement):
+            prior, threads = job.prior, run.workers.threads
+            rng = stream(run.seed, "metric", attempt, 3)
+            found = constrained(
+                found, positions, images.gps_std_m, refiner=refiner, prior=prior, rng=rng, threads=threads
+            )
+        return found._asdict()
+
+    keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(f"attempt-{attempt}")]
+    code = code_digest(placed, constrained)
+    key = run.key("metric", keys, positions, images.gps_std_m, run.variant_key("metric"), code, run.seed)
+    try:
+        found = run.cached("metric", f"attempt-{attempt}-world", key, place)
+    except UsageError as error:
+        run.warnings.append(Notice("gps-unused", error))
+        return metric
+    off = np.linalg.norm(found["residual"], axis=1)
+    run.world = {
+        "axes": "metres east, north, up", "origin": origin, "used": int(found["used"].sum()),
+        "rms_m": float(np.sqrt(np.mean(off[found["used"]] ** 2))),
+        "residual_m": {name: float(d) for name, d in zip(job.names, off, strict=True) if np.isfinite(d)},
+    }  # fmt: skip
+    result: MetricResult = found["result"]
+    return result
 
 
 def report_projective(job: Job, result: RunResult) -> None:

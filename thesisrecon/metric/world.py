@@ -1,0 +1,161 @@
+"""The frame of a metric result: a similarity to known positions of cameras, which may constrain it, too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import UsageError
+from thesisrecon.geometry.strata import estimate_similarity, transform, upgrade_points
+from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.optimize.bundle.knowledge import PositionPrior
+from thesisrecon.records import (
+    IntrinsicsPrior,
+    MetricResult,
+    Reconstruction,
+    SelfCalibration,
+    Similarity,
+    Upgrade,
+)
+
+_INLIER_SIGMAS = 3.37  # 99 % of the lengths of three-dimensional normal residuals are shorter
+
+
+class Placed(NamedTuple):
+    """A result in the frame of positions; ``residual`` (V, 3) centre minus position, NaN where unknown.
+
+    ``used`` (V,) are the positions that determined the frame, ``sigma`` is the noise of a coordinate.
+    """
+
+    result: MetricResult
+    residual: F64
+    used: B8
+    sigma: float
+
+
+def centres_of(r: Reconstruction) -> F64:
+    """Camera centres (V, 3), NaN where not registered."""
+    assert r.K is not None
+    views, centres = np.flatnonzero(r.registered), np.full((len(r.P), 3), np.nan)
+    Rt = np.linalg.solve(r.K[views], r.P[views])
+    centres[views] = -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
+    return centres
+
+
+def moved(result: MetricResult, move: Similarity) -> MetricResult:
+    """A result in another world, y = scale R x + t."""
+    r, H, std = result.reconstruction, np.eye(4), result.pose_std
+    H[:3, :3], H[:3, 3] = move.scale * move.R, move.t
+    P = np.where(r.registered[:, None, None], move.scale * transform(H, r.P, "cameras"), 0.0)
+    X = transform(H, r.X, "points")
+    X = np.where(r.valid[:, None], X / np.where(r.valid, X[:, 3], 1.0)[:, None], 0.0)
+    if std is not None:
+        # Variances along other axes, without the correlations of those.
+        std = np.column_stack([std[:, :3], move.scale * np.sqrt(std[:, 3:] ** 2 @ (move.R**2).T)])
+    return replace(result, reconstruction=replace(r, P=P, X=X), pose_std=std)
+
+
+def placed(result: MetricResult, positions: F64) -> Placed:
+    """Move a result to the positions (V, 3) of its cameras, NaN: unknown; ``UsageError`` if impossible."""
+    centres = centres_of(result.reconstruction)
+    known = np.isfinite(positions).all(axis=1) & result.reconstruction.registered
+    if known.sum() < 3:
+        raise UsageError(f"only {known.sum()} registered images have a position; three are needed")
+    require_width(centres[known], "camera centres", 0.0)
+    move, inlier, sigma = robust_similarity(centres[known], positions[known], 0)
+    require_width(positions[known][inlier], "positions", sigma)
+    used = known.copy()
+    used[known] = inlier
+    residual = np.where(known[:, None], move.apply(np.nan_to_num(centres)) - positions, np.nan)
+    return Placed(moved(result, move), residual, used, sigma)
+
+
+def constrained(
+    found: Placed, positions: F64, std: float, *, refiner: MetricRefinement, prior: IntrinsicsPrior,
+    rng: np.random.Generator, threads: int = 1,
+) -> Placed:  # fmt: skip
+    """Adjust a placed result again, with the positions that it used as observations of deviation ``std``.
+
+    They also bound what the images hardly determine, such as the doming of a flat block (Wu, 2014).
+    """
+    r = found.result.reconstruction
+    assert r.K is not None
+    spread = upgrade_points(r.X, r.valid, np.eye(4))[2]
+    unit = moved(found.result, Similarity(1.0 / spread, np.eye(3), np.zeros(3))).reconstruction
+    only = Upgrade(np.eye(4), r.K, 0.0, "positions")
+    start = SelfCalibration(np.eye(4), r.K, np.full_like(r.K, np.nan), True, (), (only,))
+    # Positions that a domed model contradicts may be right.
+    for _ in range(3):
+        index = np.flatnonzero(found.used)
+        roots = np.tile(np.eye(3) * spread / std, (len(index), 1, 1))
+        centres = PositionPrior(index, positions[index] / spread, roots)
+        result = refiner.refine(unit, start, prior=prior, rng=rng, threads=threads, centres=centres)
+        result = moved(result, Similarity(spread, np.eye(3), np.zeros(3)))
+        residual = centres_of(result.reconstruction) - positions
+        used = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf) < _INLIER_SIGMAS * std
+        before, found = found.used, Placed(result, residual, used | found.used, found.sigma)
+        if (found.used == before).all():
+            break
+    return found
+
+
+def require_width(points: F64, what: str, sigma: float) -> None:
+    """Require points off a line by more than their noise: the rotation about the line is free otherwise."""
+    along, across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[:2] / math.sqrt(len(points))
+    if across <= max(1e-3 * along, sigma):
+        spread = f"RMS {across:.3g} across the line, {along:.3g} along it, noise {sigma:.2g}"
+        raise UsageError(
+            f"the {what} of the {len(points)} images lie on one line ({spread}), which leaves the rotation "
+            "about it undetermined; add positions off the line, or use only the scale (--scale)"
+        )
+
+
+def robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity, B8, float]:
+    """Similarity, inliers and noise of one coordinate."""
+    n = len(source)
+    # Residuals below are rounding.
+    floor = 1e-9 * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
+
+    def distances(found: Similarity) -> F64:
+        return np.asarray(np.linalg.norm(found.apply(source) - target, axis=1))
+
+    # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.
+    rank = (n + 4) // 2
+    best, least = None, math.inf
+    # All up to 18 positions; of 1000, about 125 are right even if half of the positions are wrong.
+    triples: Iterable[Any] = combinations(range(n), 3)
+    if math.comb(n, 3) > 1000:
+        rng = np.random.default_rng(seed)
+        triples = (rng.choice(n, 3, replace=False) for _ in range(1000))
+    for triple in map(list, triples):
+        try:
+            found = estimate_similarity(source[triple], target[triple])
+        except ValueError:
+            continue
+        quantile = float(np.partition(distances(found), rank - 1)[rank - 1])
+        if quantile < least:
+            best, least = found, quantile
+    if best is None:
+        require_width(target, "positions", 0.0)
+        best = estimate_similarity(source, target)
+    # Rousseeuw's correction for few points, and the quantile of the lengths of normal residuals.
+    normal = math.sqrt(2.0 * scipy.special.gammaincinv(1.5, rank / (n + 1)))
+    sigma = least * (1.0 + 5.0 / max(n - 3, 1)) / normal
+    inlier = distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
+    for _ in range(20):
+        require_width(target[inlier], "positions", 0.0)
+        best = estimate_similarity(source[inlier], target[inlier])
+        free = 3 * int(inlier.sum()) - 7
+        sigma = math.sqrt(float(np.sum(distances(best)[inlier] ** 2)) / free)
+        before, inlier = inlier, distances(best) <= _INLIER_SIGMAS * max(sigma, floor)
+        if inlier.sum() < 3 or (inlier == before).all():
+            inlier = before
+            break
+    return best, inlier, sigma
