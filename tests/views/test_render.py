@@ -208,10 +208,3 @@ def test_psnr_is_that_of_its_formula_and_exposure_is_made_alike():
     # Pixels at the rim are not whole.
     rim = RenderedView(real, np.zeros((40, 50), np.float32), mask)
     np.testing.assert_array_equal(covered_pixels(rim), binary_erosion(mask, np.ones((3, 3))))
-
-
-@pytest.mark.parametrize("compare", [psnr_db, ssim, match_exposure])
-def test_pictures_that_do_not_belong_together_are_refused(compare):
-    real, noisy = pictures()
-    refuses(ValueError, "the same size", compare, real, noisy[:-1], np.ones((40, 50), bool))
-    refuses(ValueError, "no pixel is shown by both", compare, real, noisy, np.zeros((40, 50), bool))

@@ -173,14 +173,6 @@ class InterpolatedPair(Record):
     left: DisparityMap  #: of the first image in the rectified frame, x_right = x_left - d
     right: DisparityMap  #: of the second image, of the same sign
 
-    def __post_init__(self) -> None:
-        a, b = (image.shape for image in self.images)
-        if a != b or len(a) != 3 or a[2] != 3:
-            raise ValueError(f"views need two images (h, w, 3) of the same size; got {a} and {b}")
-        if self.left.disparity.shape != self.right.disparity.shape:
-            shapes = f"{self.left.disparity.shape} and {self.right.disparity.shape}"
-            raise ValueError(f"disparities of both sides must have the same shape; got {shapes}")
-
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the images and of the views."""

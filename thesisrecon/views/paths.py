@@ -37,11 +37,8 @@ def orbit(
     camera; otherwise it swings over the arc that they cover. The radius grows up to threefold until the
     circle keeps clear of X and every frame shows about as much of X as the cameras do.
     """
-    _check(cameras, frames)
     X = np.asarray(X, dtype=np.float64).reshape(-1, 3)
     X = X[np.isfinite(X).all(axis=1)]
-    if not len(X):
-        raise ValueError("an orbit needs at least one point of the scene; got none that is finite")
     X = X[:: -(-len(X) // SAMPLE)]
     size = size or cameras[0].size
     middle, up = _geometric_median(X), estimate_up(cameras)
@@ -71,7 +68,6 @@ def interpolate_cameras(
     Centres follow a centripetal Catmull-Rom spline (Yuksel et al. 2011) at constant speed, slower where the
     rotation per path length is large; rotations are interpolated as quaternions, K linearly.
     """
-    _check(cameras, frames)
     shown = [_fit_to_size(camera, size or cameras[0].size) for camera in cameras]
     if len(shown) == 1 or frames == 1:
         return [shown[0]] * frames
@@ -126,13 +122,6 @@ def sample_surface(mesh: TexturedMesh, count: int = SAMPLE) -> F64:
     u, v = np.where(folded, 1.0 - u, u)[:, None], np.where(folded, 1.0 - v, v)[:, None]
     a, b, c = a[face], b[face], c[face]
     return np.asarray(a + u * (b - a) + v * (c - a))
-
-
-def _check(cameras: Sequence[Camera], frames: int) -> None:
-    if not cameras:
-        raise ValueError("a path needs at least one camera; got none")
-    if frames < 1:
-        raise ValueError(f"a path needs at least one frame; got {frames}")
 
 
 def _typical(offset: F64, up: F64, spread: float) -> tuple[float, float]:

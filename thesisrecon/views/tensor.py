@@ -28,12 +28,6 @@ from thesisrecon.views._warping import distances_to_known, fill_holes, forward_m
 AGREE_PX = 1.5  #: tolerance of the forward-backward check: half a pixel of rounding and a pixel of noise
 
 
-def _require_motion(R: F64, t: F64) -> None:
-    arrays.require_shapes("view synthesis", R=(R, (3, 3)), t=(t, (3,)))
-    arrays.require_finite("view synthesis", R, t)
-    arrays.require_rotations("view synthesis", R)
-
-
 @dataclass(frozen=True, eq=False)
 class CalibratedPair(Record):
     """Two calibrated cameras, X_2 = R X_1 + t. For two images |t| = 1 is the unit of length."""
@@ -42,13 +36,6 @@ class CalibratedPair(Record):
     K2: F64
     R: F64  #: (3, 3) and ``t`` (3,) from the first to the second camera frame
     t: F64
-
-    def __post_init__(self) -> None:
-        arrays.require_calibration("view synthesis", self.K1)
-        arrays.require_calibration("view synthesis", self.K2)
-        _require_motion(self.R, self.t)
-        if not np.linalg.norm(self.t) > 0.0:
-            raise ValueError("CalibratedPair needs a translation other than 0")
 
     @property
     def P2(self) -> F64:
@@ -80,9 +67,6 @@ def pair_from_fundamental(F: F64, xy1: F64, xy2: F64, *, K1: F64, K2: F64) -> Ca
     contradicts it.
     """
     in_front = 0.75  # Share of matches that must lie in front of both cameras
-    arrays.require_finite("pair_from_fundamental", F, xy1, xy2)
-    arrays.require_calibration("view synthesis", K1)
-    arrays.require_calibration("view synthesis", K2)
     require_parallax_of_matches(F, xy1, xy2)
     E = K2.T @ F @ K1
     rays1, rays2 = (homogenize(xy) @ np.linalg.inv(K).T for xy, K in ((xy1, K1), (xy2, K2)))
@@ -125,7 +109,8 @@ class VirtualCamera(Record):
     size: tuple[int, int]  #: width and height in pixels
 
     def __post_init__(self) -> None:
-        _require_motion(self.rotation, self.translation)
+        R, t = (self.rotation, (3, 3)), (self.translation, (3,))
+        arrays.require_rotations("view synthesis", arrays.checked("view synthesis", R=R, t=t)[0])
         arrays.require_calibration("view synthesis", self.K)
         if min(self.size) < 1:
             raise ValueError(f"an image is at least 1 x 1 px; got {self.size}")
