@@ -13,7 +13,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from thesisrecon.api.given import Model, as_sparse_model, cameras_of_model
-from thesisrecon.arrays import B8, F64, I64, Record, number, numbers, whole_number
+from thesisrecon.arrays import B8, F64, Record, number, numbers, whole_number
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
@@ -436,7 +436,8 @@ def _pairs_by_time(
     if times is None or times_b is None or not any(map(_is_trajectory, (a, b))):
         return []
     times_b = times_b + offset
-    nearest, nearest_a = _nearest(times, times_b), _nearest(times_b, times)
+    both = (times[:, None], times_b[:, None]), (times_b[:, None], times[:, None])
+    nearest, nearest_a = (scipy.spatial.cKDTree(others).query(some)[1] for some, others in both)
     mutual = nearest_a[nearest] == np.arange(len(times))
     least = np.abs(times - times_b[nearest])
     pairs = [(int(i), int(nearest[i])) for i in np.flatnonzero(mutual & (least <= tolerance))]
@@ -450,15 +451,6 @@ def _pairs_by_time(
     given = f"at most {most:.3g} s apart (tolerance {tolerance:g} s, offset {offset:g} s)"
     notes.append(f"{counts} were paired by time, {given}")
     return pairs
-
-
-def _nearest(times: F64, others: F64) -> I64:
-    """The number of the nearest other time of each time."""
-    order = np.argsort(others, kind="stable")
-    after = np.searchsorted(others, times, sorter=order).clip(0, len(others) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(others[order[before]] - times) <= np.abs(others[order[after]] - times)
-    return np.asarray(order[np.where(closer, before, after)])
 
 
 def _is_trajectory(model: SparseModel) -> bool:
