@@ -16,7 +16,6 @@ B8 = NDArray[np.bool_]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 U32 = NDArray[np.uint32]
-U64 = NDArray[np.uint64]
 
 Stratum = Literal["projective", "affine", "metric"]
 

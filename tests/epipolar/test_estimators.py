@@ -81,16 +81,6 @@ def test_seven_point_contains_the_truth_and_every_solution_is_valid(seed):
     assert min(angle_between(candidate, pair.F) for candidate in F) < 1e-5
 
 
-def test_the_default_works_with_seventy_percent_of_outliers():
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        pair = make_pair(600, rng)
-        xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.7)
-        fit = estimate_fundamental(xy1, xy2, seed=seed)
-        assert error_px(fit.F, pair) < 0.5
-        assert fit.inliers[~wrong].mean() > 0.9
-
-
 @pytest.mark.parametrize("estimator", ROBUST)
 def test_same_generator_same_bytes(estimator):
     rng = np.random.default_rng(4)
@@ -246,9 +236,12 @@ def test_heavy_tails_stay_where_asked_for_and_no_noise_is_invented():
     # Of many wrong matches some are near any wide band: they must not widen the noise.
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        xy1, xy2, wrong = spoil(make_pair(200, rng), rng, sigma=0.3, outliers=0.75)
+        pair = make_pair(200, rng)
+        xy1, xy2, wrong = spoil(pair, rng, sigma=0.3, outliers=0.75)
         fit = estimate_fundamental(xy1, xy2, seed=seed)
         assert fit.sigma_px < 0.5
+        assert error_px(fit.F, pair) < 0.5
+        assert fit.inliers[~wrong].mean() > 0.9
         assert fit.inliers[wrong].mean() < 0.05
 
 

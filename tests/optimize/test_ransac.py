@@ -155,7 +155,7 @@ def test_samples_are_distinct_and_cover_all_data(n, size):
     assert np.abs(counts - 2000 * size / n).max() < 6.0 * np.sqrt(2000 * size / n) + 1
 
 
-def test_roots_of_quartics_are_those_of_the_companion_matrix():
+def test_positive_real_roots_of_quartics():
     rng = np.random.default_rng(0)
     c = np.concatenate([rng.normal(size=(300, 5)), [np.poly(r) for r in rng.uniform(0.1, 3.0, (50, 4))]])
     linear, biquadratic = [0.0, 1.0, 2.0, 3.0, 4.0], [1.0, 0.0, -5.0, 0.0, 4.0]

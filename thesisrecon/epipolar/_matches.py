@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, checked
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.optimize.least_squares import MAD_FACTOR
@@ -21,13 +21,7 @@ MAX_PX, MIN_PX = 1e15, 1e-50
 
 def as_matches(xy1: F64, xy2: F64) -> tuple[F64, F64]:
     """Matches as contiguous float64 arrays (N, 2); ValueError if shapes or coordinates are impossible."""
-    if np.iscomplexobj(xy1) or np.iscomplexobj(xy2):
-        raise ValueError("a fundamental matrix needs real pixel coordinates; got complex ones")
-    xy1, xy2 = np.ascontiguousarray(xy1, dtype=np.float64), np.ascontiguousarray(xy2, dtype=np.float64)
-    if xy1.shape != xy2.shape or xy1.ndim != 2 or xy1.shape[1] != 2:
-        raise ValueError(f"a fundamental matrix needs two (N, 2) arrays; got {xy1.shape} and {xy2.shape}")
-    if not (np.isfinite(xy1).all() and np.isfinite(xy2).all()):
-        raise ValueError("a fundamental matrix needs finite pixel coordinates; some are NaN or infinite")
+    xy1, xy2 = checked("a fundamental matrix", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     if max(np.abs(xy1).max(initial=0.0), np.abs(xy2).max(initial=0.0)) > MAX_PX:
         raise ValueError(
             f"a fundamental matrix needs pixel coordinates of images; some are beyond {MAX_PX:g}"

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from thesisrecon._numba import empty, kernel
-from thesisrecon.arrays import F64, require_finite, require_shapes
+from thesisrecon.arrays import F64, checked, require_finite, require_shapes
 from thesisrecon.geometry._polynomials import roots_in_unit_interval
 from thesisrecon.geometry.homogeneous import checked_unit, cross_matrix
 from thesisrecon.geometry.triangulation import sort_by_point, triangulate_linear
@@ -173,10 +173,8 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
 
     The minimum is global. A match with a point on its epipole is exact with every partner and is not moved.
     """
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    require_shapes("correct_matches", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite("correct_matches", xy1, xy2)
-    F = checked_unit(np.asarray(F, dtype=np.float64), "correct_matches")
+    F, xy1, xy2 = checked("correct_matches", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    F = checked_unit(F, "correct_matches")
     xy = np.stack([xy1, xy2])
     scale, centre, T = _conditioning(xy)
     back = np.linalg.inv(T)

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from thesisrecon.arrays import F64, require_finite, require_shapes
+from thesisrecon.arrays import F64, checked
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.camera_matrix import camera_centre, depth, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
@@ -211,9 +211,7 @@ def pair_of_cameras(
 def _checked_call(xy1: F64, xy2: F64, size1: Size, size2: Size) -> tuple[F64, F64]:
     if min(*size1, *size2) < 2:
         raise ValueError(f"an image must have at least 2 x 2 px; got {size1} and {size2}")
-    xy1, xy2 = np.asarray(xy1, dtype=np.float64), np.asarray(xy2, dtype=np.float64)
-    require_shapes("rectification", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
-    require_finite("rectification, for its matches,", xy1, xy2)
+    xy1, xy2 = checked("rectification, for its matches,", xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     return xy1, xy2
 
 
