@@ -345,6 +345,20 @@ def test_what_no_intrinsic_explains_is_named_and_widens_the_interval():
     assert centre_error(result, scene) < 0.02
 
 
+@pytest.mark.parametrize("ratio", [1.25, 0.9])
+def test_pixels_that_are_not_square_are_found_and_named(ratio):
+    """As frames of a video are stored; they look like images zoomed and cropped one by one."""
+    scene = make_scene(sigma_px=0.2, points=400, seed=3)
+    xy = scene.tracks.xy * [1.0, ratio]
+    result = run(with_xy(scene, xy))
+    assert result.trusted, result.failed_checks
+    assert any("pixels are not square" in text for text in result.limitations)
+    own = result.intrinsics[0]
+    for name, truth in (("aspect", ratio), ("focal_px", scene.K[0, 0, 0])):
+        assert abs(own[name].value - truth) < 3.0 * own[name].std < 0.02 * truth
+    assert centre_error(result, scene) < 0.01
+
+
 def test_held_out_blocks_and_differences_of_models():
     _, _, model = setting()
     held = _adjustment.held_out_observations(model)

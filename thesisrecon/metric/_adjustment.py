@@ -16,6 +16,7 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric._model import (
+    ASPECT,
     CENTRE,
     DECENTRING,
     DECENTRING_STD,
@@ -205,7 +206,21 @@ def with_own_values(
     """The model with one value per image in some columns of the intrinsics, without hierarchical prior."""
     shared = adjustment.prior.shared.copy()
     shared[:, columns] = np.arange(len(shared))[:, None]
-    prior = replace(adjustment.prior, shared=shared)
+    return _with_prior(model, adjustment, replace(adjustment.prior, shared=shared))
+
+
+def with_free_aspect(
+    model: MetricEstimate, adjustment: MetricAdjustment
+) -> tuple[MetricEstimate, MetricAdjustment]:
+    """The model with an unknown aspect ratio of the pixels, without hierarchical prior."""
+    std = adjustment.prior.std.copy()
+    std[:, ASPECT] = np.inf
+    return _with_prior(model, adjustment, replace(adjustment.prior, std=std))
+
+
+def _with_prior(
+    model: MetricEstimate, adjustment: MetricAdjustment, prior: IntrinsicsPrior
+) -> tuple[MetricEstimate, MetricAdjustment]:
     group, table = camera_rows(prior)
     first = np.unique(group, return_index=True)[1]
     intrinsics = model.cameras.intrinsics[model.cameras.group[first]]

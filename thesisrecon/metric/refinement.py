@@ -193,11 +193,17 @@ def _start(
 def settle_camera_model(simple: _Finished) -> _Settled:
     """Choose between the shared camera model and richer ones if the images contradict shared intrinsics.
 
-    One value per image is adopted if it predicts held-out observations far better. If it hardly changes the
-    cameras, contradictions are limitations, and the differences, over the focal, widen the intervals.
+    Pixels that are not square look like zooms and crops: an unknown aspect ratio is tried first. One value
+    per image is adopted if it predicts held-out observations far better. If it hardly changes the cameras,
+    contradictions are limitations, and the differences, over the focal, widen the intervals.
     """
     chosen, sharing = simple, _shared_camera.check_shared_cameras(*simple[:2])
-    limitations, difference = tuple[str, ...](), (0.0, 0.0)
+    square, limitations, difference = tuple[str, ...](), tuple[str, ...](), (0.0, 0.0)
+    if sharing.failed_checks and not simple.adjustment.prior.std[:, _model.ASPECT].any():
+        rich = finish_metric(*_adjustment.with_free_aspect(simple.model, simple.adjustment))
+        if _adjustment.remaining_cost(simple[:2], rich[:2]) < MAX_REMAINING:
+            simple = chosen = rich
+            sharing, square = _shared_camera.check_shared_cameras(*rich[:2]), (_aspect_ratios(rich.model),)
     for columns in _adjustment.richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
@@ -210,7 +216,13 @@ def settle_camera_model(simple: _Finished) -> _Settled:
     if sharing.failed_checks and any(difference):
         limitations += tuple(f"{fact}. {NOT_EXPLAINED}" for fact, _ in sharing.found)
         sharing = replace(sharing, found=())
-    return chosen, sharing, limitations, difference
+    return chosen, sharing, (*square, *limitations), difference
+
+
+def _aspect_ratios(model: MetricEstimate) -> str:
+    """A sentence with the largest deviation of the pixels from squares."""
+    ratios = model.cameras.intrinsics[model.cameras.group[model.registered], _model.ASPECT]
+    return Notice("pixels-not-square", ratios[np.abs(np.log(ratios)).argmax()])
 
 
 def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finished:
