@@ -224,7 +224,7 @@ def test_wrong_calls_are_named():
         (ValueError, "finite", np.full((3, 8, 2), np.nan), {}),
         (ValueError, "needs xy1", np.ones((3, 8, 3)), {}),
         (ValueError, "needs xy1", np.ones((3, 5)), {}),
-        (ValueError, "needs points", points, {"segments": segments[:, :, 0]}),
+        (ValueError, "needs xy1.*segments", points, {"segments": segments[:, :, 0]}),
         (ValueError, "no length", points, {"segments": point_like}),
         (ValueError, "loss_px", points, {"loss_px": 0.0}),
     ):
