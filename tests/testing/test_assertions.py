@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon.testing as gates
 from thesisrecon import Camera, estimate_fundamental
+from thesisrecon.epipolar.refinement import wrong_match_covariance
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle.covariance import gauge_directions
 
@@ -190,3 +191,24 @@ def test_a_gate_that_cannot_see_what_it_is_for_is_not_collected(tmp_path):
         tmp_path, FOREIGN.replace("def test_my", "@pytest.mark.accuracy_gate(sees=1)\ndef test_my")
     )
     assert (code, "accuracy_gate takes numbers sees, noise and limit" in said) == (4, True)
+
+
+def test_the_covariance_of_F_contains_accepted_wrong_matches():
+    """200 matches, a fifth of them wrong: a third of the pairs accepts one, which turns F towards itself."""
+    z = {False: [], True: []}
+    for seed in range(100):
+        pair = gates.two_views(200, noise_px=0.5, outliers=0.2, seed=1000 + seed)
+        found = estimate_fundamental(pair.xy1, pair.xy2)
+        accepted = bool((found.inliers & ~pair.inlier).any())
+        z[accepted].append(gates.assert_fundamental(found, pair.F, false_alarm=1e-300))
+        added = wrong_match_covariance(found, pair.xy1, pair.xy2)
+        # A covariance, of matrices of rank 2 and unit norm.
+        assert np.linalg.eigvalsh(added).min() >= -1e-9 * np.trace(added)
+        assert np.abs(added @ found.F.ravel()).max() <= 1e-6 * np.trace(added)
+    assert 25 < len(z[True]) < 60
+    for squares, low, high in ((z[False], 0.9, 1.1), (z[True], 0.9, 1.3), (z[False] + z[True], 0.95, 1.15)):
+        assert low < np.sqrt(np.mean(np.square(squares))) < high
+    # Without the addition 70 of 100.
+    assert sum(7.0 * v**2 < 14.07 for v in z[False] + z[True]) >= 90
+    found.inliers[:] = True
+    assert not wrong_match_covariance(found, pair.xy1, pair.xy2).any()

@@ -1,7 +1,7 @@
 """Two and three images: matches, fundamental matrix, homography, trifocal tensor and epipolar lines."""
 
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -17,6 +17,7 @@ from thesisrecon.epipolar._matches import MAX_PX
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
 from thesisrecon.epipolar.homography import HomographyFit, fit_homography
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
+from thesisrecon.epipolar.refinement import wrong_match_covariance
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
 from thesisrecon.errors import Notice, StageFailure, require_word
 from thesisrecon.geometry.homogeneous import unit_norm
@@ -287,8 +288,9 @@ def estimate_fundamental(
     FundamentalEstimate
         F with x2' F x1 = 0, inliers, noise and covariance. ``determined``: no other F explains the matches as
         well; otherwise ``reasons`` says why. The covariance is that of the minimum of the Sampson distances,
-        a lower bound for the linear methods. For "seven-point" noise and covariance are NaN (there are no
-        residuals), and ``competing_models`` are the other solutions.
+        a lower bound for the linear methods; those that search add what accepted wrong matches contribute.
+        For "seven-point" noise and covariance are NaN (there are no residuals), and ``competing_models`` are
+        the other solutions.
 
     Raises
     ------
@@ -334,8 +336,12 @@ def estimate_fundamental(
             fit = ThesisRansac(threshold_px=threshold_px).estimate(xy1, xy2, rng)
         else:
             fit = fit_all(xy1, xy2, refined=method == "gold-standard")
+    noise = fit.covariance
+    if method in ("locally-optimised", "ransac"):
+        fit = replace(fit, covariance=noise + wrong_match_covariance(fit, xy1, xy2))
     # Copies: the test is made later.
-    return FundamentalEstimate(**vars(fit), xy1=xy1.copy(), xy2=xy2.copy(), unit_px=threshold_px)
+    copies: Any = {"xy1": xy1.copy(), "xy2": xy2.copy(), "noise_covariance": noise}
+    return FundamentalEstimate(**vars(fit), **copies, unit_px=threshold_px)
 
 
 def epipolar_lines(F: F64, xy1: F64) -> F64:

@@ -4,7 +4,7 @@ If most matches lie on one plane with homography H, every [e]x H explains them: 
 matches off the plane, and a wrong F has as many inliers as the right one.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -224,18 +224,23 @@ class FundamentalEstimate(FundamentalFit):
         The matches, px.
     unit_px : float
         Error of epipolar lines that matters: the threshold of the search.
+    noise_covariance : ndarray (9, 9), optional
+        The part of the covariance without accepted wrong matches, of which the test takes its own account.
     """
 
     xy1: F64 = field(kw_only=True, repr=False)
     xy2: F64 = field(kw_only=True, repr=False)
     unit_px: float = field(default=1.0, kw_only=True, repr=False)
+    noise_covariance: F64 | None = field(default=None, kw_only=True, repr=False)
 
     @cached_property
     def degeneracy(self) -> DegeneracyReport:
         """The test for degenerate configurations with its evidence; the same for the same matches and F."""
         if len(self.xy1) < MINIMUM:
             return DegeneracyReport(False, (f"{len(self.xy1)} matches are too few to test F",))
-        return assess_degeneracy(self, self.xy1, self.xy2, rng=np.random.default_rng(0), unit_px=self.unit_px)
+        noise = self.covariance if self.noise_covariance is None else self.noise_covariance
+        fit, rng = replace(self, covariance=noise), np.random.default_rng(0)
+        return assess_degeneracy(fit, self.xy1, self.xy2, rng=rng, unit_px=self.unit_px)
 
     @property
     def determined(self) -> bool:

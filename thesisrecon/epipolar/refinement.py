@@ -14,7 +14,9 @@ from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import PairFrame, check_matches, check_start
 from thesisrecon.errors import unknown_word
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.small_matrices import orthogonalize_columns, solve_damped
+from thesisrecon.records import FundamentalFit
 
 SAMPSON, EPIPOLAR_DISTANCE, REPROJECTION = 0, 1, 2
 # Steps to the nearest exact match; each reduces the error by about (noise / distance to the epipole)^2.
@@ -289,6 +291,37 @@ def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) 
     moved -= np.outer(pixels, pixels @ moved) / norm**2
     covariance: F64 = sigma**2 * moved @ moved.T
     return covariance
+
+
+RING, MOST = 20.0, 0.95  # End of the ring of wrong matches in inlier limits; largest leverage
+
+
+def wrong_match_covariance(fit: FundamentalFit, xy1: F64, xy2: F64) -> F64:
+    """Covariance (9, 9) of vec(F) that accepted wrong matches add to that of the noise.
+
+    A wrong match within the inlier limit has a depth of its own: it turns F towards itself, the more the
+    larger its leverage h, the share of its own residual that it removes. The rejected matches in a ring
+    around the limit give the expected number m of accepted wrong ones. They take any leverage: of the k
+    matches with at least that of a match, a share of m / (m + k - 1/2) is wrong. The residual of a wrong
+    match to an F without it is uniform up to limit / (1 - h).
+    """
+    x1, x2 = homogenize(xy1), homogenize(xy2)
+    gradient = np.sqrt(sum(np.sum(line[:, :2] ** 2, axis=1) for line in (x1 @ fit.F.T, x2 @ fit.F)))
+    J = (x2[:, :, None] * x1[:, None, :]).reshape(-1, 9) / np.maximum(gradient, 1e-300)[:, None]
+    residual, right = np.abs(J @ fit.F.ravel()), fit.inliers
+    limit = float(residual[right].max(initial=0.0))
+    accepted = np.count_nonzero(residual[~right] < RING * limit) / (RING - 1.0)
+    moved = J[right] @ fit.covariance
+    leverage = np.sum(moved * J[right], axis=1)
+    # Leverages add up to the number of parameters.
+    variance = float(leverage.sum()) / 7.0
+    if not (accepted > 0.0 and variance > 0.0):
+        return np.zeros((9, 9))
+    leverage = np.minimum(leverage / variance, MOST)
+    larger = np.searchsorted(np.sort(-leverage), -leverage, "right")
+    wrong = accepted / (accepted + larger - 0.5)
+    weight = wrong * (limit / (1.0 - leverage)) ** 2 / 3.0
+    return np.asarray((moved.T * weight) @ moved / variance**2)
 
 
 Criterion = Literal["sampson", "epipolar-distance", "reprojection"]
