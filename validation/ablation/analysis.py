@@ -260,20 +260,8 @@ def _compared(table: _Table, measure: Measure, variant: str, other: str, conditi
     rank, p_rank = signed_rank_test(table.clusters(loss, judged))
     p_success = sign_test(np.array([c.mean() for c in table.clusters(failed, judged)]))
     counts = int(np.sum(failed[judged] > 0)), int(np.sum(failed[judged] < 0))
-    by_quotients = table.by_quotients(measure)
-    return Comparison(
-        measure,
-        variant,
-        other,
-        condition,
-        interval,
-        by_quotients,
-        *counts,
-        rank,
-        interval.p,
-        p_success,
-        p_rank,
-    )
+    place, all_p = (measure, variant, other, condition), (interval.p, p_success, p_rank)
+    return Comparison(*place, interval, table.by_quotients(measure), *counts, rank, *all_p)
 
 
 def _verdict(found: Comparison) -> Verdict:
