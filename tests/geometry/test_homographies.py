@@ -14,7 +14,13 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import camera_matrix as matrix
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.camera_matrix import camera_centre, project
-from thesisrecon.geometry.homogeneous import cross_matrix, dehomogenize, homogenize, unit_normals
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    homogenize,
+    normalizing_transform,
+    unit_normals,
+)
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import homography_linear, homography_residuals, require_parallax_of_matches
 from validation.scenes.rigs import random_transform
@@ -365,3 +371,11 @@ def test_3_27_cheirality_is_a_sign_of_depth_that_no_scale_changes(rng):
     at_infinity = np.append(rng.normal(size=3), 0.0)[None]
     assert thesisrecon.cheirality(P, at_infinity)[0] == 0.0
     np.testing.assert_array_equal(thesisrecon.cheirality(P.tolist(), X.tolist()), chi)
+
+
+@pytest.mark.parametrize("far", [0.0, 1e3, -1e6])
+def test_normalised_points_have_their_centroid_at_zero_and_a_mean_distance_of_root_two(far):
+    xy = far + np.random.default_rng(0).normal(size=(50, 2)) * [30.0, 5.0]
+    moved = dehomogenize(homogenize(xy) @ normalizing_transform(xy).T)
+    np.testing.assert_allclose(moved.mean(axis=0), 0.0, atol=1e-9 * max(abs(far), 1.0))
+    assert np.linalg.norm(moved, axis=1).mean() == pytest.approx(np.sqrt(2.0), rel=1e-9)

@@ -16,12 +16,15 @@ from thesisrecon import reconstruct, reconstruct_from_tracks
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle.identifiability import (
+    CalibrationProblem,
     UpgradedCameras,
+    identifiability_report,
     measure_motion,
     nearest_critical_motion,
 )
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 from thesisrecon.pipeline.large_sets import restrict_views
-from thesisrecon.records import IdentifiabilityReport
+from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior
 from thesisrecon.selfcalibration._upgrade import check_identifiability
 
 SETS = (
@@ -206,3 +209,19 @@ def test_stated_numbers_of_photographs_are_those_of_the_written_cameras(name, tm
     assert_written(tmp_path)
     assert_points_seen(result.metric.reconstruction)
     assert result.summary["motion"]["nearest_critical"] == result.metric.identifiability.motion
+
+
+def test_the_focal_std_is_that_of_all_observations_and_not_of_the_ones_adjusted():
+    """A model is adjusted to a share of its observations; the evidence is that of the whole."""
+    scene = make_scene(sigma_px=0.5, seed=3)
+    t, n = scene.tracks, scene.tracks.n_views
+    intrinsics = np.tile([1500.0, 1.0, 0.0, *scene.K[0, :2, 2], 0.0, 0.0, 0.0], (n, 1))
+    cameras = MetricCameras(scene.R, scene.t, intrinsics, np.arange(n), np.zeros((n, 8), dtype=np.int64))
+    std = np.tile([np.inf, 0.0, 0.0, 15.0, 15.0, 0.0, 0.0, 0.0], (n, 1))
+    found = []
+    for kept, share in ((np.ones(len(t.xy), dtype=bool), 1.0), (t.point_index < 75, 0.25)):
+        seen = Observations(t.view_index[kept], t.point_index[kept], t.xy[kept])
+        prior, longest = IntrinsicsPrior.unshared(intrinsics, std), np.full(n, 1536.0)
+        problem = CalibrationProblem(cameras, scene.X, seen, prior, 0.5, share, longest, np.arange(n))
+        found.append(identifiability_report(problem, 20).evidence["focal_std_rel"])
+    assert found[1] == pytest.approx(found[0], rel=0.4)
