@@ -62,6 +62,8 @@ _EXECUTORS = "local|processes|dask://HOST:PORT"
 Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
 _GPS_HELP = "Move the model to the GPS positions of the images: metres east, north, up."
 Gps = Annotated[bool, typer.Option("--gps", help=_GPS_HELP)]
+_UP_HELP = "Turn the model until z is up, by the horizontal sides of the images."
+Up = Annotated[Literal["none", "auto"], typer.Option("--up", help=_UP_HELP)]
 _KNOWN_HELP = "Cameras that are known: cameras.json, COLMAP model, run, or another file of cameras."
 Known = Annotated[Path | None, common.folder_option(_KNOWN_HELP, "--known", metavar="MODEL")]
 _REFINE_HELP = "With --known and --into: adjust these cameras, too."
@@ -76,7 +78,7 @@ OverwriteRun = Annotated[bool, typer.Option("--overwrite", help=_OVERWRITE_HELP)
 def reconstruct(
     images: Images = None, out: Out = None, into: Into = None, every: Every = None, source: Source = None,
     images_folder: ImagesFolder = None, masks: Masks = None, known: Known = None, refine: Refine = False,
-    gps: Gps = False, preset: Preset = None, cameras: Cameras = None,
+    gps: Gps = False, up: Up = "none", preset: Preset = None, cameras: Cameras = None,
     config: Config = None, settings: Settings = None, seed: common.Seed = 0, threads: common.Threads = 0,
     max_size: common.MaxSize = None, pairs: Pairs = None, until: Until = None, executor: Executor = "local",
     overwrite: OverwriteRun = False,
@@ -84,8 +86,8 @@ def reconstruct(
     """Reconstruct cameras, points and a textured model from images."""
     common.cap_threads(threads)
     chosen: dict[str, Any] = {"config": config, "preset": preset, "cameras": cameras, "pairs": pairs}
-    chosen |= {"max_size": max_size, "set": [*(settings or []), *(["images.gps=true"] if gps else [])]}
-    chosen |= {"masks": masks}
+    frame = [*(["images.gps=true"] if gps else []), *(["images.up=auto"] if up == "auto" else [])]
+    chosen |= {"max_size": max_size, "set": [*(settings or []), *frame], "masks": masks}
     options = {"until": until, "threads": threads or None, "executor": executor, "overwrite": overwrite}
     if (out is None) == (into is None):
         raise UsageError(Notice("no-output-folder"))

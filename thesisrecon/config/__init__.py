@@ -10,7 +10,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -281,6 +281,8 @@ class ImageOptions:
     gps_std_m : float
         Standard deviation of a coordinate of these positions, which are then observations of the adjustment,
         too; 0: they determine the frame alone.
+    up : {"none", "auto"}
+        "auto": without GPS the model is turned until z is up, by the horizontal sides of the images.
     """
 
     max_size_px: int = 1600
@@ -288,6 +290,7 @@ class ImageOptions:
     part_views: int = 400
     gps: bool = False
     gps_std_m: float = 0.0
+    up: Literal["none", "auto"] = "none"
 
     def __post_init__(self) -> None:
         require_range(self, max_size_px="[64, inf)", part_views="[0, inf)", gps_std_m="[0, inf)")

@@ -5,8 +5,10 @@ all of them but nerfstudio, where it is (0.5, 0.5) and cameras look along -z wit
 format returns its main file; images lie in ``images/`` beside it, masks in ``masks/``.
 """
 
+import csv
 import io
 import json
+import math
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
@@ -207,6 +209,20 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
         "(0, 0) is the centre of the top-left pixel"
     )
     return {"convention": convention, "cameras": listed}
+
+
+def cameras_csv(cameras: Mapping[str, Camera]) -> str:
+    """Content of ``cameras.csv``: centres, focal lengths and their standard deviations, one image per line."""
+    stds = [f"{what}_{axis}{unit}" for what, unit in (("centre", ""), ("rotation", "_deg")) for axis in "xyz"]
+    names = ["name", "x", "y", "z", "focal_px", *(f"std_{std}" for std in ("focal_px", *stds))]
+    table = io.StringIO()
+    rows = csv.writer(table, lineterminator="\n")
+    rows.writerow(names)
+    for name, camera in cameras.items():
+        std = camera.std or {}
+        values = [*camera.centre, camera.K[0, 0], *(std.get(one, math.nan) for one in ("focal_px", *stds))]
+        rows.writerow([name, *(f"{value:.9g}" for value in values)])
+    return table.getvalue()
 
 
 def write_image(path: Path, rgb: U8) -> None:

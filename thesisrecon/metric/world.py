@@ -62,6 +62,52 @@ def moved(result: MetricResult, move: Similarity) -> MetricResult:
     return replace(result, reconstruction=replace(r, P=P, X=X), pose_std=std)
 
 
+MAX_ROLL_DEG = 15.0
+"""Root mean square roll of the cameras beyond which they do not tell where up is."""
+
+
+def up_direction(R: F64) -> tuple[F64, float]:
+    """Direction up (3,) of cameras (V, 3, 3) that are held level or upright, and their RMS roll in degrees.
+
+    The side of an image that is nearly horizontal is perpendicular to it. ``UsageError`` if the sides have
+    one direction only, or the cameras were rolled.
+    """
+    # Perpendicular to the x axes of two images, and nearly to those of most: few images are turned.
+    first = R[:: max(len(R) // 40, 1), 0]
+    normals = np.cross(first[:, None], first[None]).reshape(-1, 3)
+    normals = normals[np.linalg.norm(normals, axis=1) > 0.1]
+    if not len(normals):
+        raise UsageError("the images have one horizontal direction; up is undetermined")
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cost = np.sort(np.abs(normals @ R[:, 0].T), axis=1)[:, : len(R) // 2 + 1].sum(axis=1)
+    sides, u = R[:, 0], normals[int(cost.argmin())]
+    for _ in range(10):
+        # Images turned by 90 degrees have their y axis level.
+        sides = np.where((np.abs(R[:, 0] @ u) > 0.7)[:, None], R[:, 1], R[:, 0])
+        off = np.maximum(np.abs(sides @ u), 0.02)
+        values, vectors = np.linalg.eigh(np.einsum("vi,v,vj->ij", sides, 1.0 / off, sides))
+        before, u = u, vectors[:, 0]
+        if abs(before @ u) > 1.0 - 1e-12:
+            break
+    roll = float(np.degrees(np.sqrt(np.mean(np.arcsin(np.clip(sides @ u, -1.0, 1.0)) ** 2))))
+    if values[1] < 0.01 * values[2]:
+        raise UsageError("the images have one horizontal direction; up is undetermined")
+    if roll > MAX_ROLL_DEG:
+        raise UsageError(f"the cameras were rolled by {roll:.0f} degrees (RMS); up is undetermined")
+    # The bottom of an image, or what a camera that looks down sees, is down.
+    return (u if float(np.sum((R[:, 1] + R[:, 2]) @ u)) < 0.0 else -u), roll
+
+
+def upright(result: MetricResult) -> tuple[MetricResult, float]:
+    """A result with z up by :func:`up_direction`, and the RMS roll."""
+    r = result.reconstruction
+    assert r.K is not None
+    views = r.registered
+    u, roll = up_direction(np.asarray(np.linalg.solve(r.K[views], r.P[views])[:, :, :3]))
+    turn = scipy.spatial.transform.Rotation.align_vectors([[0.0, 0.0, 1.0]], [u])[0].as_matrix()
+    return moved(result, Similarity(1.0, turn, np.zeros(3))), roll
+
+
 def placed(result: MetricResult, positions: F64) -> Placed:
     """Move a result to the positions (V, 3) of its cameras, NaN: unknown; ``UsageError`` if impossible."""
     centres = centres_of(result.reconstruction)

@@ -18,7 +18,7 @@ from thesisrecon.camera import finite_cameras
 from thesisrecon.config.text import toml_from_config
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
 from thesisrecon.io._colmap import COLMAP_FILES, write_colmap_model
-from thesisrecon.io._exports import cameras_table, write_point_cloud
+from thesisrecon.io._exports import cameras_csv, cameras_table, write_point_cloud
 from thesisrecon.io._files import as_read, read_json, write_atomically, write_json, write_text
 from thesisrecon.io._images import image_without_pixels
 from thesisrecon.io._meshes import glb_bytes
@@ -37,7 +37,7 @@ from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, texture_mesh
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 PAGE, SURFACE_FILES = "report.html", ("model.glb", "model-full.glb")
-MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", *SURFACE_FILES)
+MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "cameras.csv", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FILES))
 """Files of another run that a run removes from its folder."""
@@ -183,6 +183,7 @@ def _write_records(directory: RunDirectory, result: RunResult) -> None:
         directory.remove(MODEL_FILES)
     else:
         write_json(directory.path / "cameras.json", cameras_table(result.cameras))
+        write_text(directory.path / "cameras.csv", cameras_csv(result.cameras))
     write_json(directory.path / SUMMARY, result.summary)
 
 

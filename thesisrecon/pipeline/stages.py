@@ -24,7 +24,7 @@ from thesisrecon.io._models import east_north_up
 from thesisrecon.matching.pair_selection import reject_repeated_structure
 from thesisrecon.metric.given_cameras import metric_from_given
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.world import constrained, placed
+from thesisrecon.metric.world import constrained, placed, upright
 from thesisrecon.pipeline.large_sets import align_parts, calibrate_with_core, from_metric, tracks_of_part
 from thesisrecon.pipeline.lens import straight_pair, straight_tracks
 from thesisrecon.pipeline.matching import build_tracks
@@ -116,44 +116,50 @@ def metric_of_given(job: Job, tracks: Tracks, pairs: Sequence[TwoView]) -> Metri
 
 
 def metric_in_world(job: Job, metric: MetricResult, attempt: int) -> MetricResult:
-    """Move a model to the GPS positions of its images, and adjust it to them if their deviation is given."""
-    run, images, places = job.run, job.config.images, job.inputs.places
-    if not images.gps:
+    """Move a model to the GPS positions of its images, or stand it upright, if that is asked for."""
+    run, images = job.run, job.config.images
+    if not (images.gps or images.up == "auto"):
         return metric
+    keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(f"attempt-{attempt}")]
+    code, options = code_digest(placed, constrained, upright), [images.gps, images.gps_std_m, images.up]
+    key = run.key("metric", keys, job.inputs.places, options, run.variant_key("metric"), code, run.seed)
+    by = partial(_placed_by_gps, job, metric, attempt) if images.gps else partial(_stood_upright, metric)
+    try:
+        found = run.cached("metric", f"attempt-{attempt}-world", key, by)
+    except UsageError as error:
+        run.warnings.append(Notice("frame-unknown", error))
+        return metric
+    run.world = dict(found["facts"])
+    result: MetricResult = found["result"]
+    return result
+
+
+def _stood_upright(metric: MetricResult) -> dict[str, Any]:
+    result, roll = upright(metric)
+    return {"result": result, "facts": {"axes": "z up", "roll_rms_deg": roll}}
+
+
+def _placed_by_gps(job: Job, metric: MetricResult, attempt: int) -> dict[str, Any]:
+    """The result in metres east, north and up, adjusted to the positions if their deviation is given."""
+    places, images, refiner = job.inputs.places, job.config.images, job.config.metric
     if not np.isfinite(places).all(axis=1).any():
-        run.warnings.append(Notice("no-gps"))
-        return metric
+        raise UsageError("no image has a GPS position with a height")
     # Groups of images have the origin of all.
     whole = job.inputs.whole or job.inputs
     positions, origin = east_north_up(places, east_north_up(whole.places)[1])
-    refiner = job.config.metric
-
-    def place() -> dict[str, Any]:
-        found = placed(metric, positions)
-        if images.gps_std_m and isinstance(refiner, MetricRefinement):
-            prior, threads = job.prior, run.workers.threads
-            rng = stream(run.seed, "metric", attempt, 3)
-            found = constrained(
-                found, positions, images.gps_std_m, refiner=refiner, prior=prior, rng=rng, threads=threads
-            )
-        return found._asdict()
-
-    keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(f"attempt-{attempt}")]
-    code = code_digest(placed, constrained)
-    key = run.key("metric", keys, positions, images.gps_std_m, run.variant_key("metric"), code, run.seed)
-    try:
-        found = run.cached("metric", f"attempt-{attempt}-world", key, place)
-    except UsageError as error:
-        run.warnings.append(Notice("gps-unused", error))
-        return metric
-    off = np.linalg.norm(found["residual"], axis=1)
-    run.world = {
-        "axes": "metres east, north, up", "origin": origin, "used": int(found["used"].sum()),
-        "rms_m": float(np.sqrt(np.mean(off[found["used"]] ** 2))),
+    found = placed(metric, positions)
+    if images.gps_std_m and isinstance(refiner, MetricRefinement):
+        found = constrained(
+            found, positions, images.gps_std_m, refiner=refiner, prior=job.prior,
+            rng=stream(job.run.seed, "metric", attempt, 3), threads=job.run.workers.threads,
+        )  # fmt: skip
+    off = np.linalg.norm(found.residual, axis=1)
+    facts = {
+        "axes": "metres east, north, up", "origin": origin, "used": int(found.used.sum()),
+        "rms_m": float(np.sqrt(np.mean(off[found.used] ** 2))),
         "residual_m": {name: float(d) for name, d in zip(job.names, off, strict=True) if np.isfinite(d)},
     }  # fmt: skip
-    result: MetricResult = found["result"]
-    return result
+    return {"result": found.result, "facts": facts}
 
 
 def report_projective(job: Job, result: RunResult) -> None:

@@ -1,4 +1,4 @@
-"""GPS positions of EXIF: the frame of the model, and observations of the adjustment."""
+"""The frame of a model: GPS positions of EXIF, and the direction up."""
 
 import json
 import math
@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
+from scipy.spatial.transform import Rotation
 
-from thesisrecon import load, read_cameras, reconstruct
+from thesisrecon import UsageError, compare_models, load, read_cameras, reconstruct
 from thesisrecon.config import ImageOptions
+from thesisrecon.metric.world import up_direction
 
 HOME = Path(__file__).parents[2] / "fixtures" / "courtyard"
 LATITUDE, LONGITUDE, HEIGHT = -33.9, 18.4, 120.0
@@ -69,7 +71,45 @@ def test_images_without_positions_keep_their_frame_and_say_so(tmp_path):
     given = {"max_size": 320, "until": "metric", "threads": 1}
     plain = reconstruct(files, tmp_path / "a", **given)
     found = reconstruct(files, tmp_path / "b", set=["images.gps=true"], **given)
-    assert any("no image has a GPS position" in text for text in found.warnings)
+    assert any("frame: no image has a GPS position" in text for text in found.warnings)
     assert np.array_equal(found.cameras[0].t, plain.cameras[0].t)
     with pytest.raises(ValueError, match="gps_std_m"):
         ImageOptions(gps_std_m=2.0)
+
+
+def turned(about_z, *, pitch=0.0, roll=0.0):
+    """A camera that looks along the ground, turned about the vertical, then tilted and rolled (degrees)."""
+    level = (
+        np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ Rotation.from_euler("z", about_z, True).as_matrix()
+    )
+    return Rotation.from_euler("zx", [roll, pitch], True).as_matrix() @ level
+
+
+def test_up_is_found_by_the_level_sides_of_images_also_of_turned_ones_and_from_above():
+    rng, world = np.random.default_rng(2), Rotation.from_euler("xyz", [40, -70, 20], True).as_matrix()
+    angles = rng.uniform(0, 90, 12)
+    cases = [{"pitch": -10.0}, {"pitch": 30.0}, {"pitch": 90.0}]
+    for case in cases:
+        R = np.array(
+            [turned(a, roll=rng.normal(0, 1) + 90 * (k % 4 == 0), **case) for k, a in enumerate(angles)]
+        )
+        u, roll = up_direction(R @ world.T)
+        assert np.degrees(np.arccos(world[:, 2] @ u)) < 1.5, case
+        assert 0.3 < roll < 2.0
+    with pytest.raises(UsageError, match="one horizontal direction"):
+        up_direction(np.array([turned(0.1 * a, pitch=a) for a in angles]))
+    with pytest.raises(UsageError, match="rolled"):
+        up_direction(np.array([turned(a, roll=40 * (-1) ** k) for k, a in enumerate(angles)]))
+
+
+def test_a_model_that_stands_upright_has_z_up(tmp_path):
+    truth = read_cameras(HOME / "cameras.json")
+    files = sorted((HOME / "images").glob("*.jpg"))[:5]
+    given = {"max_size": 320, "until": "metric", "threads": 1}
+    out = tmp_path / "out"
+    result = reconstruct(files, out, set=["images.up=auto"], **given)
+    found = compare_models(result, truth)
+    up = found.similarity.R[:, 2]
+    assert np.degrees(np.arccos(up[2])) < 5.0
+    assert result.summary["world"]["axes"] == "z up"
+    assert np.allclose(load(out).cameras[0].t, result.cameras[0].t)
