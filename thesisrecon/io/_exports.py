@@ -212,7 +212,7 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def cameras_csv(cameras: Mapping[str, Camera]) -> str:
-    """Content of ``cameras.csv``: centres, focal lengths and their standard deviations, one image per line."""
+    """Content of ``cameras.csv``: centres and focal lengths with standard deviations, an image per line."""
     stds = [f"{what}_{axis}{unit}" for what, unit in (("centre", ""), ("rotation", "_deg")) for axis in "xyz"]
     names = ["name", "x", "y", "z", "focal_px", *(f"std_{std}" for std in ("focal_px", *stds))]
     table = io.StringIO()
