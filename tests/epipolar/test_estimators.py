@@ -456,3 +456,13 @@ def test_distances_and_epipoles_move_as_their_derivatives_say():
         np.testing.assert_allclose(
             np.outer(difference, difference), found.covariance, atol=1e-2 * np.abs(found.covariance).max()
         )
+
+
+def test_the_thesis_searches_at_least_once_and_may_leave_out_the_rounds():
+    assert (ransac.ThesisRansac(samples=1, rounds=0).samples, ransac.ThesisRansac(samples=1).rounds > 0) == (
+        1,
+        True,
+    )
+    for given in ({"samples": 0}, {"rounds": -1}):
+        with pytest.raises(ValueError, match="samples >= 1, rounds >= 0"):
+            ransac.ThesisRansac(**given)
