@@ -112,7 +112,6 @@ def reconstruct(
         if Path(images).is_file() and frames is None:
             message = f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
             raise UsageError(message)
-        run.title = _images.scene_name(Path(images)) or run.title
     else:
         images = _images.list_of_images("reconstruct", images)
     run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
@@ -123,6 +122,8 @@ def reconstruct(
             raise UsageError(f"there are no images in {images} and its subfolders")
         if len(folders := Counter(Path(name).parent.as_posix() for name in source)) > 1:
             run.warnings.append(Notice("subfolders", ", ".join(f"{n} ({k})" for n, k in folders.items())))
+    if isinstance(images, str | Path):
+        run.title = _images.scene_name(Path(images)) or run.title
     if masks is not None:
         run.masks_folder = _images.check_masks_folder(masks, run.images_folder)
     cameras_known = None if known is None else known_by_name("reconstruct", known, until)
