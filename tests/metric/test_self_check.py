@@ -13,7 +13,7 @@ from thesisrecon.metric._checks import check_views, self_check, triangulable_obs
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
-    focal_std_of_deviations,
+    deviations_of_images,
     inconsistent_principal_point,
 )
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
@@ -239,7 +239,8 @@ def test_deviations_of_few_images_are_learned_from_their_residuals(views):
             model, adjustment = settled(changed(scene, np.ones(views), shift))
             adjustment = replace(adjustment, inflation=block_scatter(adjustment.linearised(model)).inflation)
             model = adjustment.run(model, settled=_adjustment.SETTLED, keep_noise=True)[0]
-            widths.append(focal_std_of_deviations(model, adjustment, critical=False, contradicted=False))
+            deviations = deviations_of_images(model, adjustment, critical=False, contradicted=False)
+            widths.append(deviations.focal)
             noise = np.sqrt(block_scatter(adjustment.linearised(model)).variance[0, 0])
             focal = model.cameras.intrinsics[0, 0] / scene.K[0, 0, 0]
             sigmas.append(np.log(focal) / np.hypot(noise, widths[-1]))
@@ -248,7 +249,8 @@ def test_deviations_of_few_images_are_learned_from_their_residuals(views):
     assert min(widths[2:]) > 0.01
     assert min(widths[2:]) > 3.0 * max(widths[:2])
     # Contradicted by all images together, the deviations are not averaged over smaller ones.
-    assert focal_std_of_deviations(model, adjustment, critical=False, contradicted=True) > widths[-1]
+    deviations = deviations_of_images(model, adjustment, critical=False, contradicted=True)
+    assert deviations.focal > widths[-1]
 
 
 def test_harmless_differences_beyond_chance_widen_the_intervals():

@@ -1,5 +1,6 @@
 """A focal length that depends on deviations from the camera model has an interval that contains them."""
 
+import re
 from collections import namedtuple
 
 import numpy as np
@@ -144,6 +145,18 @@ def test_a_rolling_shutter_widens_the_interval_of_a_video_by_its_effect():
     assert straight[2] < 0.01
     assert abs(rolling[1]) > 0.005
     assert abs(rolling[1]) < 1.5 * rolling[2]
+
+
+@pytest.mark.parametrize("readout", [0.0, 0.1, -0.2])
+def test_a_rolling_shutter_is_named_with_its_readout(readout):
+    scene = hand_held(1, Lens(readout=readout))
+    warnings = reconstruct_from_tracks(scene.xy, [scene.size] * len(scene.xy)).metric.warnings
+    named = [text for text in warnings if text.code == "rolling-shutter"]
+    assert bool(named) == bool(readout)
+    for text in named:
+        found, std = (float(word.rstrip("%")) / 100.0 for word in re.findall(r"[\d.]+%", text)[:2])
+        assert abs(found - abs(readout)) < 3.0 * std
+        assert std < 0.1
 
 
 @pytest.mark.parametrize("seed", [2, 3])

@@ -9,6 +9,7 @@ widened.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -113,10 +114,26 @@ def _adjust_per_view(
     return _adjusted(model, replace(adjustment, inflation=1.0), case)
 
 
-def focal_std_of_deviations(
-    model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool, contradicted: bool
-) -> float:
+class Deviations(NamedTuple):
     """Relative standard deviation of the focal lengths by deviations of the images from the camera model.
+
+    ``readout`` is that of a rolling shutter, in times between consecutive images; 0: no evidence.
+    """
+
+    focal: float
+    readout: float = 0.0
+    readout_std: float = 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence about a rolling shutter."""
+        return (Notice("rolling-shutter", abs(self.readout), self.readout_std),) if self.readout else ()
+
+
+def deviations_of_images(
+    model: MetricEstimate, adjustment: MetricAdjustment, *, critical: bool, contradicted: bool
+) -> Deviations:
+    """Measure the effect of deviations of the images from the camera model.
 
     Images may have own aspect ratios and skews; with up to six images or after a ``critical`` motion own
     principal points too, as large as possible if ``contradicted``. Videos may show a rolling shutter.
@@ -125,12 +142,13 @@ def focal_std_of_deviations(
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
     few = len(focal) <= 6
     if not few and len(np.unique(focal)) == len(focal):
-        return 0.0
+        return Deviations(0.0)
     model, weak = runs_of_views(model), few or critical
     scales = np.ones(1) if weak and contradicted else (np.arange(50) + 0.5) / 50
     kinds = ((ASPECT, SKEW), CENTRE) if weak else ((ASPECT, SKEW),)
     variance = sum(_variance_by_own_values(model, adjustment, columns, scales) for columns in kinds)
-    return float(np.hypot(np.sqrt(variance), _change_by_rolling_shutter(model, adjustment)))
+    shutter = _change_by_rolling_shutter(model, adjustment)
+    return shutter._replace(focal=float(np.hypot(np.sqrt(variance), shutter.focal)))
 
 
 def _variance_by_own_values(
@@ -165,8 +183,8 @@ def _variance_by_own_values(
     return float((posterior @ ((w @ (b * h).T) ** 2 + w @ (b**2).T)).max() / posterior.sum())
 
 
-def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustment) -> float:
-    """Largest change of a focal length (log) by the readout time of a rolling shutter; 0 without evidence.
+def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustment) -> Deviations:
+    """Largest change of a focal length (log) by the readout time of a rolling shutter, and the readout.
 
     A point in row y is seen when the camera has moved by (y / height - 1/2) of the readout to the next image.
     """
@@ -175,7 +193,7 @@ def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustme
     shift = _displacement_to_next(model, index)
     # The readout is a part of the time between the images of a video, and meaningless between photographs.
     if np.median(np.linalg.norm(shift, axis=1) / model.sizes[view].max(axis=1)) > 0.1:
-        return 0.0
+        return Deviations(0.0)
     shift *= (t.xy[index, 1] / model.sizes[view, 1] - 0.5)[:, None]
 
     def adjusted(readout: float) -> MetricBundleResult:
@@ -188,14 +206,17 @@ def _change_by_rolling_shutter(model: MetricEstimate, adjustment: MetricAdjustme
     low, high = adjusted(-READOUT_STEP).cost, adjusted(READOUT_STEP).cost
     slope, curvature = (high - low) / 2.0, high + low - 2.0 * before.cost
     if not (curvature > 0.0 and _beyond_chance(0.5 * slope**2 / curvature, 1)):
-        return 0.0
+        return Deviations(0.0)
     search = {"bounds": (-1.0, 1.0), "method": "bounded", "options": {"xatol": 0.01}}
     found = scipy.optimize.minimize_scalar(lambda readout: adjusted(readout).cost, **search)
     after = adjusted(float(found.x))
     if not _beyond_chance(before.cost - after.cost, 1):
-        return 0.0
+        return Deviations(0.0)
     focals = (one.cameras.intrinsics[:, FOCAL] for one in (before, after))
-    return float(np.abs(np.subtract(*map(np.log, focals))).max())
+    change = float(np.abs(np.subtract(*map(np.log, focals))).max())
+    # The cost is half of chi-square, of residuals that depend on each other.
+    std = USUAL_INFLATION * READOUT_STEP / float(np.sqrt(curvature))
+    return Deviations(change, float(found.x), std)
 
 
 def _displacement_to_next(model: MetricEstimate, index: I64) -> F64:

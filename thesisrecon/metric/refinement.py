@@ -128,10 +128,10 @@ def _assess(
     complete = _model.with_tracks(model, tracks)
     motion = identifiability.measure_motion(returned_cameras(complete))
     critical = identifiability.nearest_critical_motion(motion)[1] < 1.0
-    deviations = _shared_camera.focal_std_of_deviations(
+    deviations = _shared_camera.deviations_of_images(
         model, adjustment, critical=critical, contradicted=bool(enlarged)
     )
-    intervals = _uncertainty.widen_by_camera_model(intervals, (deviations, 0.0), 1.0)
+    intervals = _uncertainty.widen_by_camera_model(intervals, (deviations.focal, 0.0), 1.0)
     angles = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
     if undetermined_lens(model, angles, motion) or (critical and reach_of_points(model) < MIN_REACH):
         # Distortion in the middle of the images is hardly told from other errors.
@@ -147,11 +147,11 @@ def _assess(
     failed_checks = [*([] if report.identifiable else report.sentences), *start, *checked.failed]
     failed_checks += [*_shared_camera.contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
     failed_checks += _shared_camera.inconsistent_principal_point(model, adjustment, scatter)
-    if deviations > _adjustment.MAX_CHANGE:
-        failed_checks.append(Notice("focal-by-camera-model", deviations))
+    if deviations.focal > _adjustment.MAX_CHANGE:
+        failed_checks.append(Notice("focal-by-camera-model", deviations.focal))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
-    warnings += undetermined_lens(model, intervals, motion)
+    warnings += undetermined_lens(model, intervals, motion) + deviations.warnings
     result = records.MetricResult(
         as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
         tuple(failed_checks), warnings, (*enlarged, *checked.limitations), report, poses,
