@@ -74,6 +74,7 @@ from thesisrecon.api.export import write_mesh as write_mesh
 from thesisrecon.api.export import read_mesh as read_mesh
 from thesisrecon.api.models import align_to_positions as align_to_positions
 from thesisrecon.api.models import scaled as scaled
+from thesisrecon.api.models import scaled_by_points as scaled_by_points
 from thesisrecon.api.models import compare_models as compare_models
 from thesisrecon.results import ModelComparison as ModelComparison
 

@@ -3,7 +3,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
-from thesisrecon import Camera, UsageError, align_to_positions, reconstruction_from_cameras, scaled
+from thesisrecon import (
+    Camera,
+    UsageError,
+    align_to_positions,
+    reconstruction_from_cameras,
+    scaled,
+    scaled_by_points,
+)
 from thesisrecon.results import SparseModel, SparseView
 
 R0, T0, S0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix(), np.array([40.0, -7.0, 3.0]), 2.5
@@ -125,3 +132,30 @@ def test_a_known_distance_gives_the_scale():
         (("1.jpg", "2.jpg"), np.nan, "got nan"),
     ]:
         refuses(UsageError, words, scaled, model, *names, distance)
+
+
+def test_two_points_seen_in_images_set_the_scale_also_with_a_lens_and_from_a_file(tmp_path):
+    rng = np.random.default_rng(4)
+    K = np.array([[900.0, 0, 640], [0, 900, 480], [0, 0, 1]])
+    ends = np.array([[0.2, -0.3, 0.1], [0.6, 0.4, -0.2]])
+    R = Rotation.from_euler("yx", rng.uniform(-0.3, 0.3, (3, 2))).as_matrix()
+    t = np.column_stack([rng.uniform(-1, 1, (3, 2)), np.full(3, 5.0)])
+    size, lens = (1280, 960), np.array([-0.15, 0.02])
+    model = {f"{i}.jpg": Camera(K, R[i], t[i], size, lens) for i in range(3)}
+    pixels = {name: camera.project(ends) + rng.normal(0, 0.02, (2, 2)) for name, camera in model.items()}
+    found = scaled_by_points(model, pixels, 1.25)
+    true = 1.25 / np.linalg.norm(ends[1] - ends[0])
+    for view, camera in zip(found.views, model.values(), strict=True):
+        assert view.centre == pytest.approx(true * camera.centre, rel=2e-3)
+    lines = [f"{name},{','.join(map(str, xy.ravel()))}" for name, xy in pixels.items()]
+    (tmp_path / "ruler.csv").write_text("name,x1,y1,x2,y2\n" + "\n".join(lines))
+    again = scaled_by_points(model, tmp_path / "ruler.csv", 1.25)
+    assert again.views[2].centre == pytest.approx(found.views[2].centre)
+    (tmp_path / "ruler.csv").write_text("0.jpg,1,2,3\n")
+    words = "line 1 of .* must hold name,x1,y1,x2,y2"
+    refuses(UsageError, words, scaled_by_points, model, tmp_path / "ruler.csv", 1.0)
+    refuses(UsageError, "two images", scaled_by_points, model, {"0.jpg": pixels["0.jpg"]}, 1.0)
+    refuses(UsageError, "not an image", scaled_by_points, model, {"x": pixels["0.jpg"]}, 1.0)
+    swapped = {**pixels, "1.jpg": pixels["1.jpg"][::-1]}
+    refuses(UsageError, "not show the same two points", scaled_by_points, model, swapped, 1.0)
+    refuses(UsageError, "positive distance", scaled_by_points, model, pixels, 0.0)

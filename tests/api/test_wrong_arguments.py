@@ -243,6 +243,10 @@ CALLS = {
         {"camera": FRONT, "background": (10, 20, 30), "samples": 1},
     ),
     "align_to_positions": (tr.align_to_positions, {"model": NAMED, "positions": POSITIONS, "seed": 0}),
+    "scaled_by_points": (
+        lambda ends, distance: tr.scaled_by_points(NAMED, dict.fromkeys(("0.jpg", "1.jpg"), ends), distance),
+        {"ends": None, "distance": None},
+    ),
     "scaled": (tr.scaled, {"model": NAMED, "name1": "0.jpg", "name2": "1.jpg", "distance": 2.0}),
     "compare_models": (
         tr.compare_models,

@@ -12,14 +12,16 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from thesisrecon.api.cameras import triangulate
 from thesisrecon.api.given import Model, as_sparse_model, cameras_of_model
+from thesisrecon.api.lenses import undistort_points
 from thesisrecon.arrays import B8, F64, Record, number, numbers, whole_number
 from thesisrecon.camera import Camera
 from thesisrecon.errors import UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import as_path, name_without_suffix, read_json
-from thesisrecon.io._models import read_calibration, read_model, read_positions
+from thesisrecon.io._models import read_calibration, read_model, read_point_pairs, read_positions
 from thesisrecon.metric.world import require_width, robust_similarity
 from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
@@ -214,6 +216,78 @@ def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel
     if not (0.0 < distance < math.inf and now > 0.0):
         have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
         raise UsageError(f"the scale needs a positive distance of two different cameras; {have}")
+    return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))
+
+
+def scaled_by_points(
+    model: Model, pixels: Mapping[str, ArrayLike] | str | Path, distance: float
+) -> SparseModel:
+    """Scale a model so that two points of the scene, seen in two or more images, have a known distance.
+
+    Parameters
+    ----------
+    model : path, RunResult, SparseModel, Reconstruction, mapping of str to Camera or sequence of Camera
+        As for :func:`align_to_positions`.
+    pixels : mapping of str to (2, 2), or path
+        Image name -> pixels of both points in the original image, such as the ends of a ruler; or a CSV file
+        of ``name,x1,y1,x2,y2``.
+    distance : float
+        Distance of the points in the new unit.
+
+    Returns
+    -------
+    SparseModel
+        The scaled model; the origin stays.
+
+    Raises
+    ------
+    UsageError
+        If fewer than two images of the model are named, they do not show the points from two places, the
+        pixels disagree, or the distance is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import Camera, scaled_by_points
+    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    >>> model = {n: Camera(K, np.eye(3), np.array([x, 0.0, 4]), (640, 480)) for n, x in (("a", 0), ("b", -1))}
+    >>> ends = np.array([[0.0, 0, 0], [0.5, 0, 0]])
+    >>> pixels = {name: camera.project(ends) for name, camera in model.items()}
+    >>> round(float(np.linalg.norm(scaled_by_points(model, pixels, 2.0).views[1].centre - [0, 0, -16])), 6)
+    4.0
+    """
+    if isinstance(pixels, str | PathLike):
+        pixels = read_point_pairs(Path(pixels))
+    if not isinstance(pixels, Mapping):
+        raise UsageError(f"the scale needs pixels by image name, or a CSV file; got {in_words(pixels)}")
+    model = as_sparse_model(model)
+    cameras = cameras_of_model(model, "the model")
+    if unknown := [name for name in pixels if name not in cameras]:
+        raise UsageError(f"the pixels name {unknown[0]!r}, which is not an image of the model")
+    xy = []
+    for name, given in pixels.items():
+        (ends,) = numbers("scaled_by_points", pixels=given)
+        if ends.shape != (2, 2) or not np.isfinite(ends).all():
+            raise UsageError(
+                f"the scale needs two points, (2, 2) numbers, in each image; {name} has {given!r}"
+            )
+        xy.append(ends)
+    distance = number("scaled_by_points", "distance", distance, "a positive number")
+    if len(xy) < 2 or not 0.0 < distance < math.inf:
+        raise UsageError(
+            f"the scale needs two images and a positive distance; got {len(xy)} and {distance:g}"
+        )
+    chosen = [cameras[name] for name in pixels]
+    seen = np.stack([undistort_points(ends, one) for ends, one in zip(xy, chosen, strict=True)])
+    ends = triangulate(np.stack([one.P for one in chosen]), seen)
+    X = ends[:, :3] / ends[:, 3:]
+    off = max(float(np.abs(one.project(X) - p).max()) for one, p in zip(chosen, xy, strict=True))
+    longest = max(max(one.size) for one in chosen)
+    now = float(np.linalg.norm(X[0] - X[1]))
+    if not (np.isfinite(X).all() and now > 0.0 and off < 0.01 * longest):
+        raise UsageError(
+            f"the pixels do not show the same two points: they are {off:.0f} px from those that fit best"
+        )
     return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))
 
 

@@ -235,6 +235,8 @@ _ORIGINALS_HELP = "Folder of the original images (default: that of the run)."
 _MASKS_HELP = "Folder of the masks of the images (default: that of the run)."
 _SCALE_HELP = "Known distance of the cameras of two images."
 _SCALE = typer.Option("--scale", metavar="NAME1 NAME2 DISTANCE", help=_SCALE_HELP)
+_POINTS_HELP = "Known distance of two points: a CSV of name,x1,y1,x2,y2, their pixels in two or more images."
+_POINTS = typer.Option("--scale-points", metavar="FILE DISTANCE", help=_POINTS_HELP)
 _ALIGN_HELP = "Known camera positions: a CSV of name,x,y,z or name,lat,lon,alt."
 _PATH_HELP = "Camera path: orbit the model, or interpolate between the cameras."
 _SIZE_HELP = "Frame size (px); by default that of the first image, at most 1000."
@@ -314,16 +316,17 @@ def export(
     images: Annotated[Path | None, common.folder_option(_ORIGINALS_HELP, "--images")] = None,
     masks: Annotated[Path | None, common.folder_option(_MASKS_HELP, "--masks")] = None,
     scale: Annotated[tuple[str, str, float] | None, _SCALE] = None,
+    scale_points: Annotated[tuple[Path, float] | None, _POINTS] = None,
     align: Annotated[Path | None, typer.Option("--align", metavar="FILE", help=_ALIGN_HELP)] = None,
     threads: common.Threads = 0, overwrite: common.Overwrite = False,
 ) -> None:  # fmt: skip
     """Write cameras, points and undistorted images for another program."""
     common.cap_threads(threads)
-    if scale is not None and align is not None:
-        raise UsageError("--scale and --align exclude each other; positions determine the scale")
+    if sum(one is not None for one in (scale, scale_points, align)) > 1:
+        raise UsageError("--scale, --scale-points and --align exclude each other; give one of them")
     from thesisrecon.api.export import export as write_export
     from thesisrecon.api.export import recorded_images, recorded_masks, require_separate
-    from thesisrecon.api.models import align_to_positions, scaled
+    from thesisrecon.api.models import align_to_positions, scaled, scaled_by_points
     from thesisrecon.io._models import read_model
 
     if folder.resolve() == model.resolve():
@@ -333,6 +336,8 @@ def export(
     found = read_model(model)
     if scale is not None:
         found = scaled(found, *scale)
+    if scale_points is not None:
+        found = scaled_by_points(found, *scale_points)
     if align is not None:
         found, report = align_to_positions(found, align)
         typer.echo("\n".join(map(printable, str(report).splitlines())))

@@ -216,6 +216,22 @@ def read_positions(path: Path) -> Positions:
     return Positions(placed, origin)
 
 
+def read_point_pairs(path: Path) -> dict[str, list[list[float]]]:
+    """Read the pixels of two points in images, "name,x1,y1,x2,y2" per line."""
+    found = {}
+    for number, cells in _rows(path):
+        try:
+            name, *values = (cell.strip() for cell in cells)
+            x1, y1, x2, y2 = map(float, values)
+        except ValueError:
+            if number == 0:
+                continue
+            what, line = "name,x1,y1,x2,y2: the pixels of two points", shortened(",".join(cells).strip())
+            raise UsageError(Notice("no-position-in-line", number, path, what, line)) from None
+        found[name] = [[x1, y1], [x2, y2]]
+    return found
+
+
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line numbers and cells; number 0 marks a header, which may be a comment before the first line."""
     comment, first = list[str](), True
