@@ -167,3 +167,47 @@ def test_the_blocks_of_the_page_of_exports_run(place, monkeypatch, finished):
     assert (place / "metres" / "sparse" / "0").is_dir()
     written = thesisrecon.read_cameras(place / "metres" / "sparse" / "0")
     assert np.linalg.norm(written["0001.jpg"].centre - written["0002.jpg"].centre) == pytest.approx(1.5)
+
+
+ANSWERS = (PAGE.parent / "you-asked.md").read_text("utf-8").split("\n## ")[1:]
+ASKED = {part.split("\n")[0]: re.findall(r"```python\n(.*?)```", part, re.S) for part in ANSWERS}
+ASKED = {question: code for question, code in ASKED.items() if code}
+
+
+@pytest.fixture(scope="module")
+def asked(place, request):
+    """The folder with what the answers read: five images in a run, one more, and the ends of a ruler."""
+    request.getfixturevalue("finished")
+    home = place / "asked"
+    shutil.copytree(place / "images", home / "images")
+    (home / "more").mkdir()
+    (home / "images" / "0005.jpg").rename(home / "more" / "0005.jpg")
+    shutil.copy(home / "more" / "0005.jpg", home / "query.jpg")
+    shutil.copy(PAGE.parents[2] / "fixtures" / "courtyard" / "cameras.json", home)
+    thesisrecon.reconstruct(home / "images", home / "out", until="metric", max_size=400)
+    shutil.copytree(place / "sparse", home / "sparse")
+    return home
+
+
+@pytest.mark.parametrize("question", ASKED)
+def test_the_answers_on_the_page_run_and_are_short(question, asked, tmp_path, monkeypatch):
+    home = tmp_path / "here"
+    shutil.copytree(asked, home)
+    monkeypatch.chdir(home)
+    (code,) = ASKED[question]
+    assert len(code.splitlines()) <= 10
+    cameras = thesisrecon.load("out").cameras
+    ends = thesisrecon.load("out").points[[0, 50]]
+    names = {"__name__": "answer"}
+    for image, letters in (("0001.jpg", "xy"), ("0003.jpg", "uv")):
+        for k, pixel in enumerate(cameras[image].project(ends), start=1):
+            names |= {f"{letter}{k}": value for letter, value in zip(letters, pixel.tolist(), strict=True)}
+    exec(compile(code, f"you-asked.md: {question}", "exec"), names)
+    if "more" in question:
+        assert "0005.jpg" in names["result"].cameras
+    if "camera" in names and "Where" in question:
+        assert max(names["camera"].std[f"centre_{axis}"] for axis in "xyz") < 0.05
+    if "result" in names:
+        assert names["result"].metric.trusted
+    if "model" in names:
+        assert np.linalg.norm(np.diff(names["model"].X[[0, 50]], axis=0)) == pytest.approx(0.3, rel=0.01)
