@@ -108,6 +108,19 @@ def cost_of_planes(P, xy):
     return total.min(axis=1)
 
 
+def test_the_frame_of_points_at_infinity_does_not_depend_on_their_rounding():
+    rng = np.random.default_rng(0)
+    P, X = two_views("points at infinity", rng)
+    xy = images(P, X)
+    view, point = np.repeat([0, 1], len(X)), np.tile(np.arange(len(X)), 2)
+    order = np.argsort(point, kind="stable")
+    start = X / np.linalg.norm(X, axis=1, keepdims=True)
+    # One more unit in the last place than before made such a point one of the scene, at a distance of 1e15.
+    start[:, 3] = 3e-16 * rng.choice([-1.0, 1.0], len(X)) * (np.arange(len(X)) == 3)
+    found = minimize_reprojection(P, start, view[order], point[order], xy.reshape(-1, 2)[order])
+    assert np.abs(images(P, found) - xy).max() < 1e-7
+
+
 @holds_for_every(st.sampled_from(KINDS))
 def test_6_3_3_exact_matches_are_left_where_they_are_and_points_found(rng, kind):
     P, X = two_views(kind, rng)

@@ -139,7 +139,8 @@ class SpaceFrame(NamedTuple):
 
 def centring_transform(X: F64) -> F64:
     """Similarity (4, 4) that takes the median of homogeneous points to 0, their median distance to 1."""
-    finite = np.abs(X[:, 3]) > np.finfo(float).eps * np.linalg.norm(X, axis=1)
+    # The rounding of points at infinity is a few units in the last place, as of a point at 1e15.
+    finite = np.abs(X[:, 3]) > 1e-12 * np.linalg.norm(X, axis=1)
     origin, scale = scene_frame(X[finite, :3] / X[finite, 3:])
     return np.block([[scale * np.eye(3), -scale * origin[:, None]], [np.eye(4)[3:]]])
 
