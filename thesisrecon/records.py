@@ -336,6 +336,10 @@ class SelfCalibration(Record):
         return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
 
 
+GIVEN = "given"
+"""Source of the intrinsics of a camera that was known."""
+
+
 @dataclass(frozen=True, eq=False)
 class IntrinsicInterval(Record):
     """One intrinsic of one view with its standard deviation (in pixels or dimensionless) and source."""

@@ -85,6 +85,7 @@ def test_added_images_are_in_the_frame_of_the_run_and_its_cameras_do_not_move(ru
     assert same_poses(poses(found.cameras), poses(again.cameras))
     assert again.cameras["0000.jpg"].std == pytest.approx(old.cameras["0000.jpg"].std)
     assert not (run / "affine.ply").exists()
+    assert "Lengths have no absolute scale" in (run / "report.html").read_text("utf-8")
     # A second time nothing is new, and the files of the images are known.
     assert same_poses(poses(found.cameras), poses(add_images(run, FILES[7:8], threads=1).cameras))
 
@@ -145,6 +146,8 @@ def test_known_cameras_keep_their_frame_and_another_image_is_registered(tmp_path
     known = {name: truth[name] for name in [path.name for path in FILES[:5]]}
     found = reconstruct_with_cameras(FILES[:6], known, tmp_path / "out", **SMALL)
     assert found.metric.trusted
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "Lengths and axes are those of the cameras that were given." in page
     assert same_poses(poses(known), poses(found.cameras))
     new = found.cameras["0005.jpg"]
     std = np.array([new.std[f"centre_{axis}"] for axis in "xyz"])

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,8 @@ def test_the_model_is_in_metres_east_north_and_up_and_says_how_well_the_position
     assert np.abs(off - np.median(off, axis=0)).max() < 0.1
     world = json.loads((tmp_path / "out" / "summary.json").read_text())["world"]
     assert world["used"] == 5
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert re.search("east, north and up: 5 GPS positions fit to 0.0[0-9]+ m", page)
     assert 0.005 < world["rms_m"] < 0.1
     assert world["residual_m"][files[3].name] > 4e4
     assert np.allclose(load(tmp_path / "out").cameras[files[0].name].centre, ours[0])

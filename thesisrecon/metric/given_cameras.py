@@ -35,7 +35,7 @@ MIN_EXPLAINED = 0.3
 """Share of the observations of points in two given cameras that these explain, unless they are wrong."""
 MAX_NOISE_RATIO = 3.0
 """Noise in the given cameras over that of the matches beyond which the cameras are inexact."""
-GIVEN, ANGLES = "given", ("angle_of_view_deg", "corner_deg")
+EARLIER, ANGLES = "the run before images were added", ("angle_of_view_deg", "corner_deg")
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def metric_from_given(
         return result
     start = result.reconstruction
     assert start.K is not None
-    only = records.Upgrade(np.eye(4), start.K, 0.0, GIVEN)
+    only = records.Upgrade(np.eye(4), start.K, 0.0, records.GIVEN)
     calibration = records.SelfCalibration(
         np.eye(4), start.K, np.full_like(start.K, np.nan), True, (), (only,)
     )
@@ -193,7 +193,8 @@ def _finished(
     poses[:, :3] = np.radians(poses[:, :3])
     if (new := model.registered & ~given.known).any():
         model = _with_stds(model, adjustment, new, stds, poses)
-    sources = {view: GIVEN if given.known[view] else "resection" for view in range(len(stds))}
+    known = EARLIER if given.of_images else records.GIVEN
+    sources = {view: known if given.known[view] else "resection" for view in range(len(stds))}
     intervals = tuple(
         _interval(model, view, stds[view], sources[view]) if there else {}
         for view, there in enumerate(model.registered.tolist())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from thesisrecon import records
 from thesisrecon.arrays import F32, F64, U8, rows_of_views
-from thesisrecon.errors import StageFailure
+from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.lens import distort
 from thesisrecon.results import RunResult, in_original_pixels, pose_deviations
@@ -43,6 +43,18 @@ class ReportData(RunResult):
     def of(cls, result: RunResult, **more: Any) -> ReportData:
         """The content of a result with ``more``."""
         return cls(**{f.name: getattr(result, f.name) for f in fields(result)}, **more)
+
+    @property
+    def unit_of_length(self) -> str:
+        """A sentence about the frame and scale of the model."""
+        world = self.summary.get("world", {})
+        if "rms_m" in world:
+            fit = f"{counted(world['used'], 'GPS position')} fit to {world['rms_m']:.2g} m (RMS)"
+            return f"Lengths are metres, the axes east, north and up: {fit}."
+        if any(found.source == records.GIVEN for view in self.original_intrinsics for found in view.values()):
+            return "Lengths and axes are those of the cameras that were given."
+        free = "Lengths have no absolute scale, which images alone do not determine."
+        return f"{free} The z axis points up." if world else free
 
     @property
     def original_intrinsics(self) -> tuple[Mapping[str, records.IntrinsicInterval], ...]:
