@@ -18,6 +18,9 @@ from thesisrecon.lens import (
     named_lens,
 )
 
+POSE_STDS = (*(f"rotation_{axis}_deg" for axis in "xyz"), *(f"centre_{axis}" for axis in "xyz"))
+"""Names in :attr:`Camera.std` of the standard deviations of a pose."""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera(Record):

@@ -323,6 +323,23 @@ class SelfCalibration(Record):
     candidates: tuple[Upgrade, ...] = ()  #: all candidates, best first
     identifiability: IdentifiabilityReport | None = None  #: the evidence; None: not tested
 
+    @classmethod
+    def of_metric(cls, K: F64, method: str) -> "SelfCalibration":
+        """Return the calibration of cameras that are metric already.
+
+        Parameters
+        ----------
+        K, method : ndarray (V, 3, 3), str
+            Calibration matrices, and where they are from.
+
+        Returns
+        -------
+        SelfCalibration
+            With one candidate, the identity.
+        """
+        only = Upgrade(np.eye(4), K, 0.0, method)
+        return cls(np.eye(4), K, np.full_like(K, np.nan), True, (), (only,))
+
     @property
     def Q(self) -> F64:
         """Absolute dual quadric in the projective frame (4, 4), rank 3, unit norm."""
@@ -532,6 +549,11 @@ class Similarity(Record):
     scale: float
     R: F64
     t: F64
+
+    @classmethod
+    def scaling(cls, scale: float) -> "Similarity":
+        """Return the similarity x -> scale x."""
+        return cls(scale, np.eye(3), np.zeros(3))
 
     def apply(self, X: F64) -> F64:
         """Transform points (N, 3)."""

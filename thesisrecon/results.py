@@ -13,7 +13,7 @@ import scipy
 
 from thesisrecon import records
 from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
-from thesisrecon.camera import Camera, camera_of_row
+from thesisrecon.camera import POSE_STDS, Camera, camera_of_row
 
 SUMMARY = "summary.json"
 
@@ -40,8 +40,7 @@ def pose_deviations(metric: records.MetricResult, i: int) -> dict[str, float]:
     if metric.pose_std is None or not np.isfinite(metric.pose_std[i]).all():
         return {}
     rotation, centre = np.degrees(metric.pose_std[i, :3]).tolist(), metric.pose_std[i, 3:].tolist()
-    stds = {f"rotation_{axis}_deg": std for axis, std in zip("xyz", rotation, strict=True)}
-    return stds | {f"centre_{axis}": std for axis, std in zip("xyz", centre, strict=True)}
+    return dict(zip(POSE_STDS, [*rotation, *centre], strict=True))
 
 
 def _number_of(image: str | int, images: tuple[records.Image, ...]) -> int:
@@ -75,9 +74,8 @@ class Cameras(Mapping[str, Camera]):
         Rt = np.linalg.solve(r.K[i], r.P[i])
         std = {name: in_original_pixels(name, value, one.scale).std for name, value in intrinsics.items()}
         std |= pose_deviations(self._metric, i)
-        K = one.original_from_working @ r.K[i]
-        pose, size = (K, Rt[:, :3], Rt[:, 3]), one.original_size
-        return camera_of_row(pose, size, r.distortion[i], std=std, as_stored=self._as_stored)
+        pose = one.original_from_working @ r.K[i], Rt[:, :3], Rt[:, 3]
+        return camera_of_row(pose, one.original_size, r.distortion[i], std=std, as_stored=self._as_stored)
 
     def __iter__(self) -> Iterator[str]:
         registered = self._metric.reconstruction.registered

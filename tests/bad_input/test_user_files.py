@@ -116,7 +116,7 @@ def patched():
         patch.setattr(_frames, "_decoded", decoded)
         patch.setattr(
             "thesisrecon.cli.commands._run",
-            lambda _, out, options, *__: reconstruct(
+            lambda _, __, out, options: reconstruct(
                 photographs(2), out, config=fake_config(), threads=1, overwrite=options["overwrite"]
             ),
         )

@@ -47,6 +47,7 @@ from thesisrecon.optimize.bundle.projection import (
     MetricModel,
     Observations,
     image_points,
+    pinhole_rows,
     read_observations,
     sort_observations,
 )
@@ -330,10 +331,8 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
         if number.shape != (n,):
             raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
     lenses = lens_table("bundle_adjust", views, BASE + 1 if free[8:].any() else 3)
-    table = np.column_stack([np.zeros((n, 5)), lenses])
+    table = np.column_stack([pinhole_rows(np.array([view.K for view in views])), lenses])
     _require_free(table, free)
-    for row, K in zip(table, (view.K for view in views), strict=True):
-        row[:5] = K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2]
     R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
     sharing = np.where(free[: table.shape[1]], number[:, None], np.arange(n)[:, None])
     return MetricCameras(R, t, table, np.arange(n), sharing)

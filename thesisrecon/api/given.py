@@ -12,6 +12,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64, numbers, require_shapes, sizes_of_images
 from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import UsageError, in_words
+from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import ImageSet
 from thesisrecon.io._models import read_model
@@ -192,8 +193,7 @@ def _registered_cameras(caller: str, r: Reconstruction) -> list[Camera]:
     lenses = np.zeros((len(r.P), 3)) if r.distortion is None else r.distortion
     views = []
     for i in np.flatnonzero(r.registered):
-        Rt = np.linalg.solve(r.K[i], r.P[i])
-        pose = r.K[i], Rt[:, :3], Rt[:, 3]
+        pose = r.K[i], *pose_of_camera(r.K[i], r.P[i])
         views.append(camera_of_row(pose, tuple(r.sizes[i].tolist()), lenses[i]))
     return views
 

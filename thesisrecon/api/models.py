@@ -216,7 +216,7 @@ def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel
     if not (0.0 < distance < math.inf and now > 0.0):
         have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
         raise UsageError(f"the scale needs a positive distance of two different cameras; {have}")
-    return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))
+    return model.transformed(Similarity.scaling(distance / now))
 
 
 def scaled_by_points(
@@ -288,7 +288,7 @@ def scaled_by_points(
         raise UsageError(
             f"the pixels do not show the same two points: they are {off:.0f} px from those that fit best"
         )
-    return model.transformed(Similarity(distance / now, np.eye(3), np.zeros(3)))
+    return model.transformed(Similarity.scaling(distance / now))
 
 
 def read_cameras(path: str | Path) -> dict[str, Camera]:

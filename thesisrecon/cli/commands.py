@@ -96,7 +96,7 @@ def reconstruct(
         if images is None or any(others):
             raise UsageError(Notice("options-of-into"))
         del options["overwrite"]
-        _run(images, into, {"refine": refine} | options, "add_images")
+        _run("add_images", (into, images), into, {"refine": refine} | options)
         return
     if refine and known is None:
         raise UsageError("--refine adjusts the cameras of --known or --into; give one of them")
@@ -105,11 +105,12 @@ def reconstruct(
     if source is None:
         if images is None or images_folder is not None:
             raise UsageError(Notice("no-source"))
-        _run(images, out, chosen | options | {"every": every, "known": known, "refine": refine})
+        chosen |= {"every": every, "known": known, "refine": refine}
+        _run("reconstruct", (images, out), out, chosen | options)
         return
     if images is not None or chosen.pop("pairs") is not None or every is not None or known is not None:
         raise UsageError(Notice("images-of-source"))
-    _run(source, out, chosen | options | {"images": images_folder}, "reconstruct_from_colmap")
+    _run("reconstruct_from_colmap", (source, out), out, chosen | options | {"images": images_folder})
 
 
 def demo(
@@ -120,17 +121,17 @@ def demo(
     from thesisrecon.io._images import demo_images
 
     options = {"threads": threads or None, "overwrite": overwrite}
-    _run(demo_images(), out, {"set": _DEMO_SETTINGS} | options)
+    _run("reconstruct", (demo_images(), out), out, {"set": _DEMO_SETTINGS} | options)
 
 
-def _run(source: Any, out: Path, options: Mapping[str, Any], call: str = "reconstruct") -> None:
+def _run(call: str, given: tuple[Any, Any], out: Path, options: Mapping[str, Any]) -> None:
+    """Make a call that writes a run to ``out``, and print its summary."""
     import thesisrecon
 
-    function, given = getattr(thesisrecon, call), (out, source) if call == "add_images" else (source, out)
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     advice = f"repeat the command to resume from {printable(str(out))}"
     with common.interruptible(advice), common.progress_bars() as progress:
-        result = function(*given, progress=progress, **options)
+        result = getattr(thesisrecon, call)(*given, progress=progress, **options)
     typer.echo(summary_text(result.summary, out))
 
 

@@ -43,6 +43,12 @@ def principal_ray(P: F64) -> F64:
     return np.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True))
 
 
+def pose_of_camera(K: F64, P: F64) -> tuple[F64, F64]:
+    """R (..., 3, 3) and t (..., 3) of cameras P = K [R t]."""
+    Rt = np.asarray(np.linalg.solve(K, P), dtype=np.float64)
+    return Rt[..., :3], Rt[..., 3]
+
+
 def camera_centre(P: F64) -> F64:
     """The centre C with P C = 0, homogeneous with the signs of the minors (3.24 - 3.26)."""
     minors = [np.linalg.det(np.delete(P, k, axis=-1)) for k in range(4)]

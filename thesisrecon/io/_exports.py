@@ -18,7 +18,7 @@ import numpy as np
 import PIL.Image
 
 from thesisrecon.arrays import F64, U8
-from thesisrecon.camera import Camera
+from thesisrecon.camera import POSE_STDS, Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
@@ -213,7 +213,7 @@ def cameras_table(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 def cameras_csv(cameras: Mapping[str, Camera]) -> str:
     """Content of ``cameras.csv``: centres and focal lengths with standard deviations, an image per line."""
-    stds = [f"{what}_{axis}{unit}" for what, unit in (("centre", ""), ("rotation", "_deg")) for axis in "xyz"]
+    stds = [*POSE_STDS[3:], *POSE_STDS[:3]]
     names = ["name", "x", "y", "z", "focal_px", *(f"std_{std}" for std in ("focal_px", *stds))]
     table = io.StringIO()
     rows = csv.writer(table, lineterminator="\n")

@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.lens import stacked_rows, undistort
 from thesisrecon.optimize.least_squares import central_differences
@@ -262,10 +263,10 @@ def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree:
     assert first.K is not None
     assert second.distortion is not None
     assert first.distortion is not None
-    Rt = np.linalg.solve(second.K[new], second.P[new])
-    R = Rt[:, :, :3] @ s.R.T
+    turn, t_new = pose_of_camera(second.K[new], second.P[new])
+    R = turn @ s.R.T
     P, K = first.P.copy(), first.K.copy()
-    P[new] = second.K[new] @ np.concatenate([R, s.scale * Rt[:, :, 3:] - R @ s.t[:, None]], axis=2)
+    P[new] = second.K[new] @ np.concatenate([R, s.scale * t_new[:, :, None] - R @ s.t[:, None]], axis=2)
     K[new] = second.K[new]
     only = second.valid & ~first.valid
     X = np.where(only[:, None], homogenize(s.apply(second.X[:, :3])), first.X)

@@ -12,7 +12,7 @@ import numpy as np
 
 from thesisrecon import records
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
-from thesisrecon.camera import Camera, angles_of_view
+from thesisrecon.camera import POSE_STDS, Camera, angles_of_view
 from thesisrecon.errors import Notice, StageFailure, UsageError, counted
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import BASE, simplest_row
@@ -25,7 +25,7 @@ from thesisrecon.metric.refinement import MetricRefinement, as_reconstruction
 from thesisrecon.metric.world import centres_of, moved
 from thesisrecon.optimize.bundle.knowledge import BundleKnowledge
 from thesisrecon.optimize.bundle.metric import refine_metric_bundle
-from thesisrecon.optimize.bundle.projection import MetricCameras
+from thesisrecon.optimize.bundle.projection import MetricCameras, pinhole_rows
 from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import IntrinsicInterval, IntrinsicsPrior, Tracks
 
@@ -67,13 +67,13 @@ class GivenCameras:
         for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
             if camera is None:
                 continue
-            K = np.linalg.solve(image.original_from_working, camera.K)
+            K = np.asarray(np.linalg.solve(image.original_from_working, camera.K), dtype=np.float64)
             row = simplest_row(camera.lens, np.zeros(1) if camera.distortion is None else camera.distortion)
             if np.any(row[BASE + 1 :]):
                 raise UsageError(Notice("given-lens", image.name, camera.lens))
             row = row[: BASE + 1]
             R[i], t[i] = camera.R, camera.t
-            table[i, :K1] = K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2]
+            table[i, :K1] = pinhole_rows(K)
             table[i, K1 : K1 + len(row)] = row
             given = camera.std or {}
             stds[i] = {k: v * image.scale if k.endswith("_px") else v for k, v in given.items()}
@@ -113,10 +113,7 @@ def metric_from_given(
         return result
     start = result.reconstruction
     assert start.K is not None
-    only = records.Upgrade(np.eye(4), start.K, 0.0, records.GIVEN)
-    calibration = records.SelfCalibration(
-        np.eye(4), start.K, np.full_like(start.K, np.nan), True, (), (only,)
-    )
+    calibration = records.SelfCalibration.of_metric(start.K, records.GIVEN)
     wide = prior if given.of_images else _prior_of_stds(given, prior)
     refined = MetricRefinement().refine(start, calibration, prior=wide, rng=rng, threads=threads)
     return _in_given_frame(given, refined)
@@ -170,9 +167,10 @@ def _with_other_images(
             break
         for _ in range(2):
             model = _resection.adjust_window(model, adjustment, joined)
-    wrong = model.registered & ~first & (_model.inlier_ratios(model) < MIN_INLIER_RATIO)
+    share = _model.inlier_ratios(model)
+    wrong = model.registered & ~first & (share < MIN_INLIER_RATIO)
     for view in np.flatnonzero(wrong).tolist():
-        rejected[view] = Notice("contradicted-by-others", _model.inlier_ratios(model)[view])
+        rejected[view] = Notice("contradicted-by-others", share[view])
     if wrong.any():
         model = _model.retriangulate_tracks(
             replace(model, registered=model.registered & ~wrong), sigmas=LATE_SIGMAS
@@ -187,9 +185,8 @@ def _finished(
     """State the deviations, and check the model."""
     stds: list[Mapping[str, float]] = list(given.std)
     poses = np.full((len(model.registered), 6), np.nan)
-    names = [*(f"rotation_{axis}_deg" for axis in "xyz"), *(f"centre_{axis}" for axis in "xyz")]
     for view in np.flatnonzero(given.known).tolist():
-        poses[view] = [stds[view].get(name, np.nan) for name in names]
+        poses[view] = [stds[view].get(name, np.nan) for name in POSE_STDS]
     poses[:, :3] = np.radians(poses[:, :3])
     if (new := model.registered & ~given.known).any():
         model = _with_stds(model, adjustment, new, stds, poses)
@@ -252,7 +249,7 @@ def _interval(
 
 def _prior_of_stds(given: GivenCameras, prior: IntrinsicsPrior) -> IntrinsicsPrior:
     """The prior of a refinement: given intrinsics with their deviations; without any they stay known."""
-    known, wide = given_prior(given, prior), prior
+    known = given_prior(given, prior)
     std, columns = known.std.copy(), intrinsic_columns(known.mean.shape[1])
     for row in np.flatnonzero(given.known).tolist():
         for name, column in columns.items():
@@ -260,7 +257,7 @@ def _prior_of_stds(given: GivenCameras, prior: IntrinsicsPrior) -> IntrinsicsPri
             std[row, column] = given.std[row].get(name, 0.0) / unit
     for column in range(std.shape[1]):
         for view in np.flatnonzero(~given.known):
-            peers = given.known & (wide.shared[:, column] == wide.shared[view, column])
+            peers = given.known & (prior.shared[:, column] == prior.shared[view, column])
             if peers.any():
                 std[view, column] = std[peers, column].min()
     return replace(known, std=std)
@@ -268,6 +265,6 @@ def _prior_of_stds(given: GivenCameras, prior: IntrinsicsPrior) -> IntrinsicsPri
 
 def _in_given_frame(given: GivenCameras, refined: records.MetricResult) -> records.MetricResult:
     """A refined result moved by the similarity that brings its centres nearest to the given ones."""
-    centres = -np.einsum("vba,vb->va", given.R, given.t)
     both = refined.reconstruction.registered & given.known
-    return moved(refined, estimate_similarity(centres_of(refined.reconstruction)[both], centres[both]))
+    target = -np.einsum("vba,vb->va", given.R[both], given.t[both])
+    return moved(refined, estimate_similarity(centres_of(refined.reconstruction)[both], target))

@@ -134,7 +134,7 @@ def _assess(
     intervals = _uncertainty.widen_by_camera_model(intervals, (deviations.focal, 0.0), 1.0)
     angles = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
     if undetermined_lens(model, angles, motion) or (critical and reach_of_points(model) < MIN_REACH):
-        # Distortion in the middle of the images is hardly told from other errors.
+        # Near the centre of the images the effect of distortion is as small as other errors.
         expected = _uncertainty.changes_by_expected_lens(model, adjustment, uncertainty)
         intervals = _uncertainty.widen_by_camera_model(intervals, expected, 1.0)
     report = check_returned(model, adjustment, motion, intervals)

@@ -13,6 +13,7 @@ import scipy
 
 from thesisrecon.arrays import B8, F64
 from thesisrecon.errors import UsageError
+from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.geometry.strata import estimate_similarity, transform, upgrade_points
 from thesisrecon.metric.refinement import MetricRefinement
 from thesisrecon.optimize.bundle.knowledge import PositionPrior
@@ -22,9 +23,10 @@ from thesisrecon.records import (
     Reconstruction,
     SelfCalibration,
     Similarity,
-    Upgrade,
 )
 
+MAX_ROLL_DEG = 15.0
+"""Root mean square roll of the cameras beyond which they do not tell where up is."""
 _INLIER_SIGMAS = 3.37  # 99 % of the lengths of three-dimensional normal residuals are shorter
 
 
@@ -44,15 +46,13 @@ def centres_of(r: Reconstruction) -> F64:
     """Camera centres (V, 3), NaN where not registered."""
     assert r.K is not None
     views, centres = np.flatnonzero(r.registered), np.full((len(r.P), 3), np.nan)
-    Rt = np.linalg.solve(r.K[views], r.P[views])
-    centres[views] = -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
+    centres[views] = -np.einsum("vba,vb->va", *pose_of_camera(r.K[views], r.P[views]))
     return centres
 
 
 def moved(result: MetricResult, move: Similarity) -> MetricResult:
     """A result in another world, y = scale R x + t."""
-    r, H, std = result.reconstruction, np.eye(4), result.pose_std
-    H[:3, :3], H[:3, 3] = move.scale * move.R, move.t
+    r, H, std = result.reconstruction, move.matrix, result.pose_std
     P = np.where(r.registered[:, None, None], move.scale * transform(H, r.P, "cameras"), 0.0)
     X = transform(H, r.X, "points")
     X = np.where(r.valid[:, None], X / np.where(r.valid, X[:, 3], 1.0)[:, None], 0.0)
@@ -60,10 +60,6 @@ def moved(result: MetricResult, move: Similarity) -> MetricResult:
         # Variances along other axes, without the correlations of those.
         std = np.column_stack([std[:, :3], move.scale * np.sqrt(std[:, 3:] ** 2 @ (move.R**2).T)])
     return replace(result, reconstruction=replace(r, P=P, X=X), pose_std=std)
-
-
-MAX_ROLL_DEG = 15.0
-"""Root mean square roll of the cameras beyond which they do not tell where up is."""
 
 
 def up_direction(R: F64) -> tuple[F64, float]:
@@ -94,7 +90,7 @@ def up_direction(R: F64) -> tuple[F64, float]:
         raise UsageError("the images have one horizontal direction; up is undetermined")
     if roll > MAX_ROLL_DEG:
         raise UsageError(f"the cameras were rolled by {roll:.0f} degrees (RMS); up is undetermined")
-    # The bottom of an image, or what a camera that looks down sees, is down.
+    # Up is against the y axes of the images, or against the viewing directions if cameras look down.
     return (u if float(np.sum((R[:, 1] + R[:, 2]) @ u)) < 0.0 else -u), roll
 
 
@@ -102,8 +98,7 @@ def upright(result: MetricResult) -> tuple[MetricResult, float]:
     """A result with z up by :func:`up_direction`, and the RMS roll."""
     r = result.reconstruction
     assert r.K is not None
-    views = r.registered
-    u, roll = up_direction(np.asarray(np.linalg.solve(r.K[views], r.P[views])[:, :, :3]))
+    u, roll = up_direction(pose_of_camera(r.K[r.registered], r.P[r.registered])[0])
     turn = scipy.spatial.transform.Rotation.align_vectors([[0.0, 0.0, 1.0]], [u])[0].as_matrix()
     return moved(result, Similarity(1.0, turn, np.zeros(3))), roll
 
@@ -134,16 +129,15 @@ def constrained(
     r = found.result.reconstruction
     assert r.K is not None
     spread = upgrade_points(r.X, r.valid, np.eye(4))[2]
-    unit = moved(found.result, Similarity(1.0 / spread, np.eye(3), np.zeros(3))).reconstruction
-    only = Upgrade(np.eye(4), r.K, 0.0, "positions")
-    start = SelfCalibration(np.eye(4), r.K, np.full_like(r.K, np.nan), True, (), (only,))
+    unit = moved(found.result, Similarity.scaling(1.0 / spread)).reconstruction
+    start = SelfCalibration.of_metric(r.K, "positions")
     # Positions that a domed model contradicts may be right.
     for _ in range(3):
         index = np.flatnonzero(found.used)
         roots = np.tile(np.eye(3) * spread / std, (len(index), 1, 1))
         centres = PositionPrior(index, positions[index] / spread, roots)
         result = refiner.refine(unit, start, prior=prior, rng=rng, threads=threads, centres=centres)
-        result = moved(result, Similarity(spread, np.eye(3), np.zeros(3)))
+        result = moved(result, Similarity.scaling(spread))
         residual = centres_of(result.reconstruction) - positions
         used = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf) < _INLIER_SIGMAS * std
         before, found = found.used, Placed(result, residual, used | found.used, found.sigma)

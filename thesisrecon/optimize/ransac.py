@@ -18,6 +18,7 @@ from thesisrecon.geometry.camera_matrix import depth, project
 from thesisrecon.geometry.homogeneous import homogenize, whitened_frame
 from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear, resect_six
 from thesisrecon.optimize.bundle.partial import refine_camera, refine_pose
+from thesisrecon.optimize.bundle.projection import pinhole_rows
 from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
 
 # Data on which all models are tried first, and data on which the remaining ones are scored.
@@ -266,7 +267,7 @@ def _no_camera(evidence: str) -> StageFailure:
 def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:
     """The camera of least reprojection error of the inliers near P or [R t], its covariance for 1 px."""
     if K is not None:
-        row = np.array([K[0, 0], K[1, 1] / K[0, 0], K[0, 1], K[0, 2], K[1, 2], 0.0])
+        row = np.append(pinhole_rows(K), 0.0)
         pose = refine_pose(
             start[:, :3], start[:, 3], row, X[inliers], xy[inliers], free=np.zeros(6, bool), loss_px=np.inf
         )

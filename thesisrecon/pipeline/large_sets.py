@@ -47,7 +47,7 @@ MIN_COMMON = 3  # Common cameras that determine the similarity between two parts
 MAX_OFFSET_REL, MIN_AGREEMENT = 0.005, 0.5
 """Largest distance, relative to the long side, between the projections of a point that two parts agree on,
 and the fraction of the common points that must agree; otherwise two parts are not aligned."""
-_IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
+_IDENTITY = Similarity.scaling(1.0)
 
 
 def calibrate_with_core(

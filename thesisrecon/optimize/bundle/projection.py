@@ -194,6 +194,12 @@ def calibrations(intrinsics: F64) -> F64:
     return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
+def pinhole_rows(K: F64) -> F64:
+    """Rows (..., 5) of focal length, aspect ratio, skew and principal point of K (..., 3, 3)."""
+    f = K[..., 0, 0]
+    return np.stack([f, K[..., 1, 1] / f, K[..., 0, 1], K[..., 0, 2], K[..., 1, 2]], axis=-1)
+
+
 POSE_DOF = 6
 FOCAL = 0
 
