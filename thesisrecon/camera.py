@@ -19,7 +19,7 @@ from thesisrecon.lens import (
 )
 
 POSE_STDS = (*(f"rotation_{axis}_deg" for axis in "xyz"), *(f"centre_{axis}" for axis in "xyz"))
-"""Names in :attr:`Camera.std` of the standard deviations of a pose."""
+"""Names in ``Camera.std`` of the standard deviations of a pose."""
 
 
 @dataclass(frozen=True, eq=False)
