@@ -90,6 +90,22 @@ def test_added_images_are_in_the_frame_of_the_run_and_its_cameras_do_not_move(ru
     assert same_poses(poses(found.cameras), poses(add_images(run, FILES[7:8], threads=1).cameras))
 
 
+def test_depth_maps_of_cameras_that_do_not_move_are_kept(tmp_path):
+    options = {**SMALL, "max_size": 320, "until": "dense"}
+    old = reconstruct(FILES[:6], tmp_path / "out", **options)
+    before = content(tmp_path / "out" / "07-dense")
+    found = old.add(FILES[6:7], threads=1)
+    after = content(tmp_path / "out" / "07-dense")
+    records = [path for path in before if path.suffix == ".npz"]
+    assert len(records) == 12
+    assert all(after[path] == before[path] for path in records)
+    assert [m.view for m in found.depth_maps] == list(range(7))
+    assert np.isfinite(found.depth_maps[6].depth).mean() > 0.3
+    # Cameras that moved have other depths.
+    load(tmp_path / "out").add(FILES[7:8], refine=True, threads=1)
+    assert all(content(tmp_path / "out" / "07-dense")[path] != before[path] for path in records)
+
+
 def test_all_cameras_may_be_refined_in_the_old_frame(run, truth):
     old = load(run)
     found = add_images(run, FILES[6:8], refine=True, threads=1)

@@ -28,7 +28,7 @@ from thesisrecon.metric.world import constrained, placed, upright
 from thesisrecon.pipeline.large_sets import align_parts, calibrate_with_core, from_metric, tracks_of_part
 from thesisrecon.pipeline.lens import straight_pair, straight_tracks
 from thesisrecon.pipeline.matching import build_tracks
-from thesisrecon.pipeline.run import Batch, Job, name_images, stream
+from thesisrecon.pipeline.run import FOLDERS, Batch, Job, name_images, stream
 from thesisrecon.records import (
     DepthMap,
     HeldOut,
@@ -232,9 +232,12 @@ def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap]
             own = {j: maps[place[j]] for j in sorted(near[order[n]])}
             yield [n], (job.config, scene, own, order[n])
 
-    keys = {f"{i:05d}": run.key("dense", key, i) for i in order}
+    # Cameras that did not move keep the depth maps of the run to which images were added.
+    unmoved = run.directory.continues and job.given is not None and not job.given.refine
+    kept = run.directory.stage(FOLDERS["dense"]).keys() if unmoved else {}
+    keys = {(item := f"{i:05d}"): kept.get(item) or run.key("dense", key, i) for i in order}
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
-    keys = {f"confirmed-{i:05d}": run.key("dense", key, i, "confirmed") for i in order}
+    keys = {(item := f"confirmed-{i:05d}"): kept.get(item) or run.key("dense", key, i, "confirmed") for i in order}
     # The maps of 12 neighbours take longer to send than to compare.
     final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True, here=True)
     # The views for stereo matching need not stay in memory.

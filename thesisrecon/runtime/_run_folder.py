@@ -192,6 +192,14 @@ class StageFolder:
         except (TypeError, KeyError, AttributeError):
             return None
 
+    def keys(self) -> dict[str, str]:
+        """The keys of the records that the manifest lists, of those that are there."""
+        content = _files.read_json(self.path / MANIFEST_FILE)
+        try:
+            return {item: key for item, key in content["keys"].items() if (self.path / f"{item}.npz").exists()}
+        except (TypeError, KeyError, AttributeError):
+            return {}
+
 
 def _report(*, seconds: Any, counts: Any, metrics: Any, warnings: Any, stage: Any) -> StageReport:
     """A report from JSON values, checked."""
