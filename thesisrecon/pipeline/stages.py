@@ -237,7 +237,9 @@ def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap]
     kept = run.directory.stage(FOLDERS["dense"]).keys() if unmoved else {}
     keys = {(item := f"{i:05d}"): kept.get(item) or run.key("dense", key, i) for i in order}
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
-    keys = {(item := f"confirmed-{i:05d}"): kept.get(item) or run.key("dense", key, i, "confirmed") for i in order}
+    keys = {
+        (item := f"confirmed-{i:05d}"): kept.get(item) or run.key("dense", key, i, "confirmed") for i in order
+    }
     # The maps of 12 neighbours take longer to send than to compare.
     final = run.map_cached("dense", keys, _confirmed, confirmed, max_bytes=MAP_BYTES, silent=True, here=True)
     # The views for stereo matching need not stay in memory.

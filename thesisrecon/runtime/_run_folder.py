@@ -196,7 +196,9 @@ class StageFolder:
         """The keys of the records that the manifest lists, of those that are there."""
         content = _files.read_json(self.path / MANIFEST_FILE)
         try:
-            return {item: key for item, key in content["keys"].items() if (self.path / f"{item}.npz").exists()}
+            return {
+                item: key for item, key in content["keys"].items() if (self.path / f"{item}.npz").exists()
+            }
         except (TypeError, KeyError, AttributeError):
             return {}
 
