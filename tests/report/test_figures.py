@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.report.synthetic import made_up_cameras, made_up_run
 from thesisrecon.records import HeldOut
-from thesisrecon.report import _drawing as drawing
 from thesisrecon.report import _figures as figures
 
 
@@ -46,7 +45,7 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     depth = np.tile(np.linspace(2.0, 6.0, 300, dtype=np.float32), (200, 1))
     depth[:, 200:250] = np.nan
     depth[0, 0] = 1e4  # a stray takes none of the scale
-    drawn = drawing.draw_depth(depth, side=360)
+    drawn = figures.draw_depth(depth, side=360)
     assert (drawn.picture.width, drawn.picture.height) == (300, 200)
     assert drawn.near == pytest.approx(2.0, abs=0.06)
     assert drawn.far == pytest.approx(6.0, abs=0.06)
@@ -57,9 +56,9 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
     assert light[190] < 55
     assert light[290] < 20
     assert (np.diff(light[5:190:20]) < -2).all()
-    assert np.abs(pixels[100, 210:240] - drawing.UNKNOWN).max() < 8
+    assert np.abs(pixels[100, 210:240] - figures.UNKNOWN).max() < 8
     for value in (np.nan, 3.0):
-        drawn = drawing.draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
+        drawn = figures.draw_depth(np.full((30, 40), value, dtype=np.float32), side=360)
         assert drawn.share == float(np.isfinite(value))
         np.testing.assert_equal((drawn.near, drawn.far), (value, value))
 
@@ -67,18 +66,18 @@ def test_a_depth_map_is_bright_where_it_is_near_and_grey_where_unknown():
 def test_the_comparison_shows_the_differences():
     real = np.full((300, 400, 3), 120, dtype=np.uint8)
     rendered, compared = real.copy(), np.ones((300, 400), dtype=bool)
-    rendered[:, 200:] += np.uint8(drawing.DIFFERENCE_LIMIT)
+    rendered[:, 200:] += np.uint8(figures.DIFFERENCE_LIMIT)
     compared[200:] = False
-    pictures = drawing.draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
+    pictures = figures.draw_held_out(HeldOut(0, real, rendered, compared, 20.0, 0.9))
     photo, model, apart = (np.asarray(opened(p.uri)).astype(float) for p in pictures)
     assert np.abs(photo - 120).max() < 4
     assert np.abs(model[:190, 210:] - 184).max() < 4
     for picture in (model, apart):
-        assert np.abs(picture[210:] - drawing.UNKNOWN).max() < 8
+        assert np.abs(picture[210:] - figures.UNKNOWN).max() < 8
     assert lightness(apart[100, 100]) < 20
     assert lightness(apart[100, 300]) > 90
     large = HeldOut(0, *[np.zeros((900, 1200, 3), np.uint8)] * 2, np.ones((900, 1200), bool), 0.0, 0.0)
-    assert drawing.draw_held_out(large)[2].width == 640
+    assert figures.draw_held_out(large)[2].width == 640
 
 
 def test_up_is_found_in_any_frame_for_rings_and_for_parallel_cameras():

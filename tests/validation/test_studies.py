@@ -20,7 +20,7 @@ from validation.ablation.plan import STUDIES
 from validation.runs.processes import call_apart
 from validation.runs.study import MODULES, OF_PAGES, load_study, run_studies, run_study, study_parser
 from validation.runs.tables import Metric
-from validation.studies import benchmark_against, benchmark_table, subsets
+from validation.studies import benchmarks, subsets
 from validation.studies import growth_of_cost as growth
 from validation.studies.growth_of_cost import Meter, exponent
 from validation.studies.robustness import different, outputs
@@ -108,7 +108,7 @@ def test_a_slowdown_of_ten_per_cent_is_found_and_nothing_else():
             return {w: machine * slow.get(w, 1.0) * s * np.exp(0.03 * rng.normal()) for w, s in works.items()}
 
         trees = {"then": Path("then"), "now": Path("now")}
-        text = benchmark_against.compare_trees(trees, 11, measure, Path())
+        text = benchmarks.compare_trees(trees, 11, measure, Path())
         rows = [line for line in text.splitlines() if line.endswith("| slower |")]
         found += any(row.startswith("| work 7 ") for row in rows)
         false += sum(not row.startswith("| work 7 ") for row in rows)
@@ -125,12 +125,10 @@ def test_stored_runs_are_drawn(tmp_path, monkeypatch):
         }
         (tmp_path / f"{n}.json").write_text(json.dumps(run))
     (tmp_path / "other.json").write_text("{}")
-    page = benchmark_against.write_trend(sorted(tmp_path.glob("*.json")), tmp_path).read_text(
-        encoding="utf-8"
-    )
+    page = benchmarks.write_trend(sorted(tmp_path.glob("*.json")), tmp_path).read_text(encoding="utf-8")
     assert '"y": [1.0, 2.0]' in page or '"y":[1.0,2.0]' in page, "in the order of the dates"
     assert "abcdef0123 on a chip" in page
-    monkeypatch.setattr(benchmark_against, "STORE", tmp_path / "none")
+    monkeypatch.setattr(benchmarks, "STORE", tmp_path / "none")
     assert run_study("benchmark-against", ["--trend"]) == 2
     assert run_study("benchmark-against", ["--against", "no-such-revision"]) == 2
 
@@ -166,8 +164,8 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
         yield f"{sum(numbers)} {kind}"
         yield rows if kind == "b" else rows[:0]
 
-    monkeypatch.setitem(MODULES, "toy", "benchmark_table")
-    monkeypatch.setattr(benchmark_table, "toy_study", toy_study, raising=False)
+    monkeypatch.setitem(MODULES, "toy", "benchmarks")
+    monkeypatch.setattr(benchmarks, "toy_study", toy_study, raising=False)
     toy_study.__annotations__ = {"out": Path, "numbers": Sequence[int], "kind": Literal["a", "b"]}
     assert run_studies(["toy", "--numbers", "3", "4"]) == 0
     assert capsys.readouterr().out == "7 a\n\n"
@@ -198,7 +196,7 @@ def test_a_study_prints_writes_and_judges_its_tables(tmp_path, capsys, monkeypat
         yield "begun"
         raise failures.pop()
 
-    monkeypatch.setattr(benchmark_table, "toy_study", failing_study)
+    monkeypatch.setattr(benchmarks, "toy_study", failing_study)
     monkeypatch.setitem(OF_PAGES, "toy", [[]])
     for code in (2, 1):
         others.clear()

@@ -16,8 +16,7 @@ from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
-from thesisrecon.selfcalibration.parallel_lines import plane_from_vanishing_points
-from thesisrecon.selfcalibration.stratified import Stratified, upgrade_to_affine
+from thesisrecon.selfcalibration.stratified import Stratified, plane_from_vanishing_points, upgrade_to_affine
 
 METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
     **KINDS["selfcalibration"],

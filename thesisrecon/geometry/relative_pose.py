@@ -6,8 +6,8 @@ import numpy as np
 
 from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import F64
-from thesisrecon.geometry._polynomials import horner, roots_in_unit_interval
 from thesisrecon.geometry.homogeneous import cross_matrix
+from thesisrecon.geometry.polynomial_triangulation import horner, roots_in_unit_interval
 
 # Products of the unknowns (x, y, z, 1): those of three as in Nister's table, then those without x^2, xy, y^2.
 _CUBIC = ("000", "111", "001", "011", "002", "003", "112", "113", "012", "013", "022", "023", "033", "122",

@@ -22,7 +22,7 @@ from thesisrecon.camera import POSE_STDS, Camera
 from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE
 from thesisrecon.io._files import write_atomically, write_json, write_text
-from thesisrecon.io._other_models import LOOKS_BACK
+from thesisrecon.io._models import LOOKS_BACK
 from thesisrecon.lens import named_lens, undistort
 from thesisrecon.results import SparseModel, SparseView
 

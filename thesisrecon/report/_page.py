@@ -22,7 +22,6 @@ from thesisrecon.errors import made
 from thesisrecon.records import Reconstruction, StageReport
 from thesisrecon.report import _assessment as words
 from thesisrecon.report import _data
-from thesisrecon.report import _drawing as drawing
 from thesisrecon.report import _figures as figures
 from thesisrecon.results import ModelComparison
 
@@ -129,15 +128,15 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         given = (data.model, data.metric.reconstruction, names)
         model = pictures.make("the model", figures.viewer_data, *given)
-    side = drawing.depth_side(_sharing(len(data.depths)))
+    side = figures.depth_side(_sharing(len(data.depths)))
     depths = [
         (i + 1, names[i], picture)
         for i in _data.pictured(len(names))
         if i in data.depths
-        and (picture := pictures.make("a depth map", drawing.draw_depth, data.depths[i], side=side))
+        and (picture := pictures.make("a depth map", figures.draw_depth, data.depths[i], side=side))
     ]
     if data.held_out is not None:
-        held_out = pictures.make("the held-out image", drawing.draw_held_out, data.held_out)
+        held_out = pictures.make("the held-out image", figures.draw_held_out, data.held_out)
     scripts, content = _figure_content(plotted)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     cards = _cards(data, distances, bars, pictures)
@@ -152,8 +151,8 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
         filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
         text=words, data=data, version=__version__, overall=overall, cards=cards, depths=depths, model=model,
         intrinsic_columns=[(name, heading) for name, heading in _INTRINSICS.items() if name in estimated],
-        limit_px=limit_px, held_out=held_out, scale=drawing.SCALE, stages=_stages(data.reports), **content,
-        difference_limit=round(drawing.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
+        limit_px=limit_px, held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), **content,
+        difference_limit=round(figures.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
         shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
         warnings=_warnings(data, pictures.warnings), model_scripts=model_scripts,
@@ -213,7 +212,7 @@ def _cards(
         masked = "" if image.mask is None else f", {1.0 - image.mask.mean():.0%} masked"
         picture = None
         if i in shown:
-            picture = pictures.make("a thumbnail", drawing.thumbnail, image, _sharing(count))
+            picture = pictures.make("a thumbnail", figures.thumbnail, image, _sharing(count))
         card = {"number": i + 1, "name": image.name, "state": state, "level": level, "reason": reason}
         card |= {"size": f"{width} × {height} px{processed}{masked}", "picture": picture}
         card |= {"residuals": _data.summarize_distances(distances[i]), "bars": bars[i]}
@@ -244,7 +243,7 @@ def _drawn_pairs(data: _data.ReportData, pictures: _Pictures) -> list[dict[str, 
     for title, pair in titles:
         given = pair, data.images[pair.i], data.images[pair.j]
         sides = {"names": (given[1].name, given[2].name), "numbers": (pair.i + 1, pair.j + 1)}
-        if picture := pictures.make(f"the picture of the {title.lower()}", drawing.draw_pair, *given):
+        if picture := pictures.make(f"the picture of the {title.lower()}", figures.draw_pair, *given):
             drawn.append({"title": title, **sides, "facts": words.pair_text(pair), "picture": picture})
     return drawn
 

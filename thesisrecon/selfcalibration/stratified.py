@@ -1,4 +1,8 @@
-"""Stratified self-calibration (chapter 7): plane at infinity, affine upgrade, then calibration."""
+"""Stratified self-calibration (chapter 7): plane at infinity, affine upgrade, then calibration.
+
+Vanishing points of parallel lines in two images or more are triangulated to points at infinity, three of
+which span the plane (HZ 10.4.1).
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -9,11 +13,11 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.strata import affine_from_projective, transform
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
-from thesisrecon.selfcalibration._frame import ProjectiveScene, projective_scene
+from thesisrecon.selfcalibration._frame import ProjectiveScene, projective_scene, require_cameras_of_full_rank
 from thesisrecon.selfcalibration._refinement import dual_image_residuals
 from thesisrecon.selfcalibration._upgrade import Candidate, as_stage_failure, select_candidate
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
-from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
+from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint, unit_rows
 from thesisrecon.selfcalibration.quadric import minimize_quadric
 
 _MAX_REFINED = 3  # number of closed-form candidates to refine
@@ -132,3 +136,37 @@ def _facing(affine: Reconstruction) -> F64:
     depth = np.einsum("kj,kj->k", affine.P[view, 2], affine.X[point])
     balance = np.bincount(view, np.sign(depth), minlength=len(affine.P))
     return affine.P * np.where(balance < 0.0, -1.0, 1.0)[:, None, None]
+
+
+_MIN_SPREAD = 1e-3
+
+
+def plane_from_vanishing_points(P: F64, xyh: F64, unit: F64) -> F64:
+    """The unit plane at infinity (4,) from vanishing points xyh (V, D, 3), NaN where not seen."""
+    require_cameras_of_full_rank(P)
+    cameras = np.linalg.inv(unit) @ P
+    cameras = cameras / np.linalg.norm(cameras, axis=(1, 2), keepdims=True)
+    # In this frame of space the rows of the cameras are orthonormal.
+    M = np.linalg.qr(cameras.reshape(-1, 4))[1]
+    X = _points_at_infinity(cameras @ np.linalg.inv(M), np.einsum("vij,vdj->vdi", np.linalg.inv(unit), xyh))
+    _, s, Vt = np.linalg.svd(unit_rows(X))
+    if not s[2] / s[0] > _MIN_SPREAD:
+        raise StageFailure.of("directions-in-one-plane", s[2] / s[0])
+    plane = M.T @ Vt[-1]
+    return np.asarray(plane / np.linalg.norm(plane))
+
+
+def _points_at_infinity(P: F64, v: F64) -> F64:
+    """Triangulated points (D', 4), v x P X = 0, from vanishing points v (V, D, 3)."""
+    v = v / np.linalg.norm(v, axis=2, keepdims=True)
+    seen = np.asarray(np.isfinite(v).all(axis=2))
+    found = []
+    for d in np.flatnonzero(seen.sum(axis=0) >= 2):
+        rows = np.cross(v[seen[:, d], d, :, None], P[seen[:, d]], axisa=-2, axisb=-2, axisc=-2)
+        values, vectors = np.linalg.eigh(np.einsum("nri,nrj->ij", rows, rows))
+        # Epipoles determine nothing.
+        if values[1] > _MIN_SPREAD**2 * values[3]:
+            found.append(vectors[:, 0])
+    if len(found) < 3:
+        raise StageFailure.of("few-parallel-directions", len(found))
+    return np.stack(found)
