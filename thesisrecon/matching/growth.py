@@ -32,6 +32,10 @@ from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # Minimum verified seeds of a pair, and minimum correlation of a guided match.
 MIN_SEEDS, MIN_CORRELATION = 12, 0.7
+MIN_UNIQUE, UNIQUE_SAMPLE = 0.1, 200
+"""Least share of the matches whose corner of image 2 is the most similar one of the whole image, and number
+of matches tested: accepted real pairs reach 0.28; of n equal copies in a pattern about 1 / n is best.
+"""
 
 
 @kernel
@@ -318,6 +322,8 @@ class SeedsAndGrowth:
             matches = grow(view1, view2, start, estimate_fundamental, rng)
         else:
             matches = _seeds.corners_of_seeds(view1.features.xy, view2.features.xy, start[0])
+        if len(matches.xy1) and (share := _unique_share(view1, view2, matches)) < MIN_UNIQUE:
+            raise StageFailure.of("repeated-pattern", len(matches.xy1), share)
         if not self.align:
             return select_found(matches, strongest_distinct(matches))
         return align_matches(view1, view2, matches, affine_std=self.affine_std)
@@ -382,6 +388,20 @@ class SeedsAndGrowth:
         rows = one_to_one(index, score)
         one, two, found = chosen[rows], index[rows], view2.features.xy[index[rows]]
         return Matches(known.i, known.j, one, two, xy1[rows], found, score[rows], affine[rows])
+
+
+def _unique_share(view1: PreparedImage, view2: PreparedImage, matches: Matches) -> float:
+    """Share of the matches whose corner of image 2 is at the most similar one of the whole image."""
+    # The copies of a pattern may lie off the epipolar lines of an F that they determine: F = 0 has no lines.
+    some = select_found(matches, np.arange(0, len(matches.xy1), 1 + len(matches.xy1) // UNIQUE_SAMPLE))
+    n, (xy2, scale2) = len(some.xy1), (view2.features.xy, view2.features.scale)
+    whole_image = np.full(n, 2.0 * view2.long_side)
+    best = _match_guided(
+        view1.pyramid, (some.xy1, view1.features.scale[some.index1]), (some.affine, some.xy2, whole_image),
+        (xy2, scale2, view2.patches), view2.cells, (np.zeros((3, 3)), np.zeros(n), MIN_CORRELATION),
+    )[0]  # fmt: skip
+    apart = np.linalg.norm(xy2[best] - some.xy2, axis=1)
+    return float(np.mean((best < 0) | (apart <= 3.0 * scale2[best])))
 
 
 def _verified_seeds(
