@@ -362,7 +362,7 @@ def test_the_variances_are_those_of_bundle_adjustment_and_grow_with_the_intrinsi
     np.testing.assert_allclose(scatter.shared_variance, scatter.variance[0], rtol=1e-6)
     np.testing.assert_array_equal(np.isnan(scatter.ratio[0]), ~FREE)
     assert scatter.blocks >= 8
-    poses = pose_uncertainty(linear)
+    poses = pose_uncertainty(linear, 1e-3)
     own = np.sqrt(np.diag(poses.covariance))
     np.testing.assert_allclose(own, np.sqrt(scatter.variance[0][FREE]), rtol=1e-6)
     R, covariance = fit.cameras.R, ratio * fit.pose_covariance
@@ -434,7 +434,7 @@ def test_faults_of_the_camera_model_move_the_cameras_as_an_adjustment_does():
     exact, linear, _ = _scatter(block, block.xy)
     x, y = ((block.xy - q[:, 3:5]) / q[:, :1]).T
     fields = [(0 * x, y), (y, 0 * x), (3 * x**2 + y**2, 2 * x * y), (2 * x * y, x**2 + 3 * y**2)]
-    poses = pose_uncertainty(linear)
+    poses = pose_uncertainty(linear, 1e-3)
     for n, field in enumerate(fields):
         moved = _scatter(block, block.xy + eps * q[:, :1] * np.array(field).T)[0]
         turned = np.swapaxes(moved.cameras.R, 1, 2) @ exact.cameras.R

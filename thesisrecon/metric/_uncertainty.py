@@ -202,7 +202,7 @@ def intrinsic_intervals(
     largest *= tails
     share = lack_of_fit(scatter, model.tail)
     faults = MODEL_FLOOR_REL * np.sqrt(share) * np.linalg.norm(uncertainty.intrinsic_fault, axis=1)
-    faults = np.maximum(faults, np.abs(uncertainty.decentring_change))
+    faults = np.maximum(faults, uncertainty.decentring_change)
     answer: list[dict[str, IntrinsicInterval]] = [{} for _ in model.registered]
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]

@@ -121,7 +121,7 @@ def _assess(
     final, sharing, enlarged, difference = settled
     model, adjustment, own, fit, scatter = final
     shrinkage = _uncertainty.focal_shrinkage(own, adjustment.hierarchical, model.cameras.group)
-    uncertainty = pose_uncertainty(fit)
+    uncertainty = pose_uncertainty(fit, _uncertainty.MODEL_FLOOR_REL)
     intervals = _uncertainty.intrinsic_intervals(model, adjustment, scatter, shrinkage, uncertainty)
     intervals = _uncertainty.widen_unverified_focals(intervals, sharing.focal_std)
     intervals = _uncertainty.widen_by_camera_model(intervals, difference, sharing.misfit)
@@ -250,7 +250,8 @@ def _finished_with_decentring(
     finished = finish_metric(model, adjustment)
     narrow = adjustment.prior.lens_model == "auto" and model.cameras.intrinsics.shape[1] == _model.WIDTH
     limit = scipy.special.chdtri(2, 1e-3)
-    if narrow and adjustment.shares_a_lens(model) and decentring_score(finished.fit) > limit:
+    narrow &= adjustment.shares_a_lens(model)
+    if narrow and decentring_score(finished.fit, _model.DECENTRING_STD) > limit:
         free = with_decentring(model, adjustment)
         decentred = finish_metric(*free)
         if _adjustment.predicts_better(finished[:2], decentred[:2]):

@@ -148,8 +148,8 @@ class PoseUncertainty:
     intrinsics, ``response`` (V, 6, n) the derivative by each of the n unknown intrinsics, ``covariance``
     (n, n) theirs, ``number`` (G, C) theirs in the table, -1 if fixed. ``fault`` (V, 6, 4) is the change by a
     unit of aspect ratio, of skew over focal length, and of either decentring coefficient (Brown 1966), and
-    ``intrinsic_fault`` (n, 4) that of the intrinsics; ``decentring_change`` (n,) is that by the decentring
-    that the images show, 0 if that may be chance.
+    ``intrinsic_fault`` (n, 4) that of the intrinsics; ``decentring_change`` (n,) is its root mean square over
+    the decentring that the images leave possible, 0 if that is estimated.
     """
 
     views: I64
@@ -172,8 +172,11 @@ class PoseUncertainty:
         return np.asarray(noise**2 * self.variance + intrinsics + fault**2 * np.sum(self.fault**2, axis=2))
 
 
-def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
-    """Propagate noise, intrinsics and faults of the camera model to the poses after an adjustment (6.7)."""
+def pose_uncertainty(fit: LinearisedFit, decentring_std: float) -> PoseUncertainty:
+    """Propagate noise, intrinsics and faults of the camera model to the poses after an adjustment (6.7).
+
+    ``decentring_std``: of the decentring coefficients of lenses, before the images are seen.
+    """
     n, D, first = len(fit.views), fit.information.shape[0], fit.first
     R = fit.frame.R[fit.views]
     # Rows to (rotation, centre): C = -R' t moves by -R' d if t moves by d.
@@ -191,8 +194,8 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
         variance[v] = np.einsum("ka,ab,kb->k", turn[v], own, turn[v])
     fields = _faults(fit)
     moved = fit.solve(np.asarray(fit.J.T @ fields))
-    score, decentring = _decentring(fit, fields, moved)
-    beyond_chance = score > scipy.special.chdtri(2, 0.05)
+    _, mean, covariance = _decentring(fit, fields, moved, decentring_std)
+    change = moved[first:, 2:]
     return PoseUncertainty(
         fit.views,
         np.maximum(variance, 0.0),
@@ -201,34 +204,35 @@ def pose_uncertainty(fit: LinearisedFit) -> PoseUncertainty:
         fit.values.number,
         turn @ moved[:first].reshape(n, POSE_DOF, -1),
         moved[first:],
-        moved[first:, 2:] @ decentring if beyond_chance else np.zeros(D - first),
+        np.sqrt((change @ mean) ** 2 + np.einsum("na,ab,nb->n", change, covariance, change)),
     )
 
 
-def decentring_score(fit: LinearisedFit) -> float:
+def decentring_score(fit: LinearisedFit, std: float) -> float:
     """Twice the decrease of the cost that decentring promises, from a fit without it (score test, Rao 1948).
 
-    Chi-square with two degrees of freedom if the lens is centred.
+    Less the cost under a prior of standard deviation ``std``. At most chi-square with two degrees of freedom
+    if the lens is centred.
     """
     fields = _faults(fit)
-    return _decentring(fit, fields, fit.solve(np.asarray(fit.J.T @ fields)))[0]
+    return _decentring(fit, fields, fit.solve(np.asarray(fit.J.T @ fields)), std)[0]
 
 
-def _decentring(fit: LinearisedFit, fields: F64, moved: F64) -> tuple[float, F64]:
-    """Return the score of the last two faults, and the coefficients (2,) of one step from zero.
+def _decentring(fit: LinearisedFit, fields: F64, moved: F64, std: float) -> tuple[float, F64, F64]:
+    """Return the score of the last two faults, and mean (2,) and covariance (2, 2) of the coefficients.
 
-    Zeros if the lens is decentred already, or the observations do not determine the coefficients.
+    Given the observations and a prior of standard deviation ``std``, by one step from zero. Zeros if the lens
+    is decentred already.
     """
-    fields, moved = fields[:, 2:], moved[:, 2:]
-    whole = fields.T @ fields
-    information = whole - (fit.J.T @ fields).T @ moved
-    known = np.linalg.eigvalsh(information)[0] > 1e-9 * np.trace(whole)
-    if not known or np.isin(fit.values.column, (LENS - 2, LENS - 1)).any():
-        return 0.0, np.zeros(2)
+    if np.isin(fit.values.column, (LENS - 2, LENS - 1)).any():
+        return 0.0, np.zeros(2), np.zeros((2, 2))
+    fields = fields[:, 2:]
+    information = fields.T @ fields - (fit.J.T @ fields).T @ moved[:, 2:]
+    covariance = np.linalg.inv(information + np.eye(2) / std**2)
     # At the minimum residuals and prior have no gradient by the unknowns.
     gradient = fields.T @ fit.residual
-    step = np.linalg.solve(information, gradient)
-    return float(gradient @ step), step
+    mean = covariance @ gradient
+    return float(gradient @ mean), mean, covariance
 
 
 def _faults(fit: LinearisedFit) -> F64:
