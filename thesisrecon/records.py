@@ -416,7 +416,7 @@ class DisparityMap(Record):
 class DepthMap(Record):
     """Depth map of one view, distortion removed."""
 
-    view: int
+    view: int  #: number of the image, or that of :class:`PinholeView`
     P: F64  #: K [R t] for the pixels of this map, which may be fewer than those of the image
     depth: F32  #: (H, W) z in the camera frame, NaN where unknown
     std: F32  #: (H, W)
@@ -425,9 +425,9 @@ class DepthMap(Record):
 
 @dataclass(frozen=True, eq=False)
 class PinholeView(Record):
-    """An image with its distortion removed."""
+    """An image with its distortion removed, or a part of a wide one."""
 
-    view: int
+    view: int  #: number of the image; of V images those at the sides of a wide one have it plus V to 4 V
     P: F64  #: K [R t]
     rgb: NDArray[np.uint8]  #: (H, W, 3)
     seen: B8  #: (H, W) pixels inside the original image and its mask

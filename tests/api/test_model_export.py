@@ -235,8 +235,8 @@ def test_wide_images_are_divided_into_pinhole_images(tmp_path, images, to):
             pixels = pixels_of(tmp_path / "out" / "images" / name)
             masks = [p for p in (tmp_path / "out" / "masks").rglob("*") if Path(name).stem in p.name]
             mask = pixels_of(masks[0]) > 0
-            turned = export_module._FACES[face] @ one.R
-            ahead = (X @ turned.T + export_module._FACES[face] @ one.t)[:, 2] > 0.1
+            turned = export_module.FACES[face] @ one.R
+            ahead = (X @ turned.T + export_module.FACES[face] @ one.t)[:, 2] > 0.1
             index = np.flatnonzero(ahead & seen[i])
             used = project(X[index])
             inside = ((used > 1.0) & (used < np.array(size) - 2.0)).all(axis=1)

@@ -14,7 +14,7 @@ from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.imaging.resampling import pinhole_view
+from thesisrecon.imaging.pinholes import pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView
 from thesisrecon.stereo import correspondence, depth
 from thesisrecon.stereo._depth_fusion import _concatenated, fuse_inverse_depths, inverse_depths
@@ -243,7 +243,7 @@ def test_undistorted_and_smaller_views_have_the_camera_of_their_pixels(walled):
         assert (plain.rgb == straight.images[i].rgb).all()
     view, small = views_of(walled)[1], views_of(walled, max_side=120)[1]
     assert small.seen.shape == (SIZE[1] // 2, SIZE[0] // 2)
-    X = _sparse_points(walled.reconstruction).X
+    X = _sparse_points(walled.reconstruction, views_of(walled)).X
     np.testing.assert_allclose(project(small.P, X), (project(view.P, X) + 0.5) / 2.0 - 0.5, atol=1e-9)
     assert np.linalg.norm(small.P[2, :3]) == pytest.approx(1.0)
     image, r = walled.images[0], walled.reconstruction

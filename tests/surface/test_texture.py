@@ -184,15 +184,6 @@ def test_depths_that_one_image_contradicts_are_removed(sphere, monkeypatch):
     assert error[1] < 0.3 * error[0]
 
 
-def test_a_view_is_left_out(sphere):
-    views = [photograph(m) for m in ring_of()]
-    with_black = views.copy()
-    with_black[3] = replace(views[3], rgb=np.zeros_like(views[3].rgb))
-    one, other = (SurfaceModel().color(sphere, some, without=3) for some in (views, with_black))
-    np.testing.assert_array_equal(one.texture, other.texture)
-    np.testing.assert_array_equal(one.faces, sphere.faces)
-
-
 def test_combine_colors_matches_its_twin():
     rng = np.random.default_rng(2)
     weight = rng.random((5, 60)).astype(np.float32)

@@ -9,14 +9,14 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import F64, I64, flag, rows_of_views
-from thesisrecon.camera import angles_of_view, pixels_of_rays, viewing_rays, widest_angle
+from thesisrecon.camera import viewing_rays
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.imaging.pinholes import FACES, WIDE, is_wide, seen_faces
 from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.io import _exports as formats
 from thesisrecon.io import _images
@@ -58,15 +58,6 @@ _DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] 
     "kalibr": formats.write_kalibr,
 }
 """Formats of cameras with distortion, which need no images."""
-WIDE = 110.0  # degrees along the long side, of which an image is divided into several pinhole images
-_FACES = {
-    name: Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-    for name, axis, angle in (
-        ("front", "y", 0), ("left", "y", 90), ("right", "y", -90), ("up", "x", -90), ("down", "x", 90)
-    )
-}  # fmt: skip
-"""Rotations from the axes of a wide camera to those of its pinhole images of 90 x 90 degrees."""
-LEAST_SEEN = 0.05  # of a pinhole image, which is written from there on
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
 _LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
 """Lenses that a format has; others have all, or no distortion."""
@@ -282,12 +273,12 @@ def _undistorted(model: SparseModel) -> tuple[SparseModel, list[list[_Pinhole]]]
     rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         K, size, distortion = view.intrinsics
-        if angles_of_view(K, size, distortion)[0] > WIDE:
+        if is_wide(K, size, distortion):
             faces = _faces(view)
             xy[rows[i]], number = _in_faces(view, faces, xy[rows[i]])
             view_index[rows[i]] = len(views) + number
             views += faces.values()
-            pinholes.append([_Pinhole(face, _FACES[name]) for name, face in faces.items()])
+            pinholes.append([_Pinhole(face, FACES[name]) for name, face in faces.items()])
             continue
         key = (K.tobytes(), distortion.tobytes(), size)
         if key not in frames:
@@ -304,21 +295,14 @@ def _undistorted(model: SparseModel) -> tuple[SparseModel, list[list[_Pinhole]]]
 
 def _faces(view: SparseView) -> dict[str, SparseView]:
     """The pinhole views of 90 x 90 degrees of a wide view of which enough is seen, by name."""
-    K, size, lens = view.intrinsics
-    side = 2 * max(int(K[0, 0]), 8)
-    middle, path = (side - 1.0) / 2.0, PurePath(_file_name(view.name))
-    own = np.array([[side / 2.0, 0.0, middle], [0.0, side / 2.0, middle], [0.0, 0.0, 1.0]])
-    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 33)] * 2), axis=-1).reshape(-1, 2)
-    most, answer = widest_angle(K, size, lens), dict[str, SparseView]()
-    for name, turn in _FACES.items():
-        places = pixels_of_rays(homogenize(grid) @ turn, K, lens, most)
-        inside = ((places >= 0.0) & (places <= np.array(size) - 1.0)).all(axis=1)
-        if inside.sum() > LEAST_SEEN * len(grid):
-            file = path.with_stem(f"{path.stem}_{name}").as_posix()
-            answer[name] = replace(
-                view, name=file, R=turn @ view.R, t=turn @ view.t, K=own, size=(side, side),
-                distortion=np.zeros(3), std=None,
-            )  # fmt: skip
+    K, side, shown = seen_faces(*view.intrinsics)
+    path, answer = PurePath(_file_name(view.name)), dict[str, SparseView]()
+    for name in shown:
+        turn, file = FACES[name], path.with_stem(f"{path.stem}_{name}").as_posix()
+        answer[name] = replace(
+            view, name=file, R=turn @ view.R, t=turn @ view.t, K=K, size=(side, side),
+            distortion=np.zeros(3), std=None,
+        )  # fmt: skip
     return answer
 
 
@@ -326,7 +310,7 @@ def _in_faces(view: SparseView, faces: Mapping[str, SparseView], xy: F64) -> tup
     """Pixels (N, 2) of a wide view in the face that looks most in their direction, and its number (N,)."""
     K, _, lens = view.intrinsics
     rays = np.nan_to_num(viewing_rays(K, xy, lens), nan=1.0)
-    turns = np.stack([_FACES[name] for name in faces])
+    turns = np.stack([FACES[name] for name in faces])
     face = np.argmax(rays @ turns[:, 2].T, axis=1)
     turned = np.einsum("nab,nb->na", turns[face], rays)
     own = next(iter(faces.values())).intrinsics[0]

@@ -14,7 +14,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.errors import StageFailure, UsageError, counted
-from thesisrecon.imaging.resampling import pinhole_view
+from thesisrecon.imaging.pinholes import pinhole_numbers, pinhole_view
 from thesisrecon.io import _images
 from thesisrecon.lens import stacked_rows
 from thesisrecon.pipeline.matching import ImageInput
@@ -164,7 +164,8 @@ def depth_maps(
     -------
     tuple of DepthMap
         Per image ``depth`` (H, W), NaN where unknown, its ``std``, and ``P`` = K [R t] for its pixels, which
-        are undistorted and may be fewer than those of the image.
+        are undistorted and may be fewer than those of the image. Images wider than 110 degrees have several:
+        ``view`` modulo V is the number of the image.
 
     Raises
     ------
@@ -204,7 +205,10 @@ def depth_maps(
     maps = list(confirmed_depth_maps(dense, scene, threads=threads).values())
     if limits is not None:
         near, far = limits.T
-        maps = [keep_depths(m, (m.depth >= near[m.view]) & (m.depth <= far[m.view])) for m in maps]
+        maps = [
+            keep_depths(m, (m.depth >= near[m.view % len(near)]) & (m.depth <= far[m.view % len(far)]))
+            for m in maps
+        ]
     if not any(np.isfinite(one.depth).any() for one in maps):
         raise StageFailure.of("no-depth-in-range", counted(len(maps), "view"))
     return tuple(maps)
@@ -315,7 +319,8 @@ def texture(
     mesh = records.as_mesh("texture", mesh)
     method = as_config(config)
     read, model = _scene("texture", images, cameras, sizes, max_size or method.images.max_size_px)
-    views = [pinhole_view(image, model, i, max_side=max(image.size)) for i, image in enumerate(read)]
+    longest, n = max(max(image.size) for image in read), len(read)
+    views = [pinhole_view(read[i % n], model, i, max_side=longest) for i in pinhole_numbers(model)]
     return method.model.color(mesh, views, threads=threads)
 
 

@@ -253,14 +253,8 @@ class ModelBuilder(Protocol):
         A ``StageFailure`` if the maps contain no depths or no view sees the surface.
         """
 
-    def color(
-        self, surface: TexturedMesh, views: Sequence[PinholeView], *, without: int | None = None,
-        threads: int = 1,
-    ) -> TexturedMesh:  # fmt: skip
-        """Texture a surface from all views except ``without``, whose image is to be compared with the model.
-
-        The depths of that view remain part of the surface.
-        """
+    def color(self, surface: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
+        """Texture a surface from views, perhaps fewer than those of its depth maps."""
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon._numba import FAST, empty, kernel, zeros
-from thesisrecon.arrays import B8, F32, F64, I64, U8, Record, resizing_transform
+from thesisrecon.arrays import B8, F32, F64, I64, U8, Record
 from thesisrecon.camera import pixels_of_rays, widest_angle
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.lens import distort
-from thesisrecon.records import Image, PinholeView, Reconstruction
 
 MAX_TAPS = 24  #: limit of the filter width: reductions by more than 6 alias
 NOT_SHRUNK = 1.1  #: reduction up to which the filter is not widened
@@ -319,42 +318,3 @@ class Rectification(Record, ABC):
     def warp(self, image: F32, side: int) -> F32:
         """Resample an image (H, W) or (H, W, C) into the frame, NaN outside."""
         return warp_image(image, partial(self._lookup, side), self.size)
-
-
-def pinhole_frame(
-    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
-) -> PinholeView:
-    """The view of :func:`pinhole_view` without reading pixels: all are black and valid."""
-    P, _, size = _pinhole_camera(image, reconstruction, view, max_side)
-    black, seen = np.broadcast_to(np.uint8(0), (*size[::-1], 3)), np.broadcast_to(np.True_, size[::-1])
-    return PinholeView(view, P, black, seen)
-
-
-def pinhole_view(
-    image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
-) -> PinholeView:
-    """Undistort an image of a metric reconstruction, at most ``max_side`` long; P[2] X is the depth."""
-    P, K, size = _pinhole_camera(image, reconstruction, view, max_side)
-    distortion = np.zeros(3) if reconstruction.distortion is None else reconstruction.distortion[view]
-    if not distortion.any() and size == image.size and image.mask is None:
-        return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
-    assert reconstruction.K is not None
-    rgb, seen = undistort_image(image.rgb, reconstruction.K[view], distortion, K, size, mask=image.mask)
-    return PinholeView(view, P, rgb, seen)
-
-
-def _pinhole_camera(
-    image: Image, reconstruction: Reconstruction, view: int, max_side: int
-) -> tuple[F64, F64, tuple[int, int]]:
-    """P (3, 4), K (3, 3) and (width, height) of an undistorted image."""
-    K = reconstruction.K
-    if reconstruction.stratum != "metric" or K is None:
-        raise ValueError("undistorted views need a metric reconstruction with K")
-    if tuple(reconstruction.sizes[view]) != image.size:
-        raise ValueError(f"image {image.name} must be {reconstruction.sizes[view]} px; got {image.size}")
-    shrink = min(1.0, max_side / max(image.size))
-    size = (max(round(image.size[0] * shrink), 1), max(round(image.size[1] * shrink), 1))
-    S = resizing_transform(np.divide(size, image.size))
-    P = reconstruction.P[view]
-    P = S @ (P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3]))
-    return P, S @ K[view], size

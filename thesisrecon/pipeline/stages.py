@@ -249,9 +249,10 @@ def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap]
 
 def report_depth_maps(job: Job, maps: Sequence[DepthMap]) -> None:
     """Report the depth maps; raise ``StageFailure`` if none has a depth."""
-    known = [(m.view, int(np.isfinite(m.depth).sum()), m.depth.size) for m in maps]
+    known = [(m.view % len(job.images), int(np.isfinite(m.depth).sum()), m.depth.size) for m in maps]
     depths = sum(count for _, count, _ in known)
-    warnings = [Notice("no-depth-values", job.images[view].name) for view, count, _ in known if not count]
+    without = sorted({view for view, _, _ in known} - {view for view, count, _ in known if count})
+    warnings = [Notice("no-depth-values", job.images[view].name) for view in without]
     counts = {"views": len(known), "depths": depths}
     metrics = {"median_share_known": float(np.median([count / size for _, count, size in known]))}
     job.run.finish("dense", counts=counts, metrics=metrics, warnings=warnings)
@@ -288,8 +289,11 @@ def _compare_held_out(job: Job, views: Sequence[PinholeView], mesh: TexturedMesh
     C = np.array([camera_centre(view.P) for view in views])
     centres = C[:, :3] / C[:, 3:]
     view = views[int(np.argmin(scipy.spatial.distance.cdist(centres, centres).sum(axis=1)))]
+    n = len(job.images)
+    used = [k for k, other in enumerate(views) if (other.view - view.view) % n]
     try:
-        painted = job.config.model.color(mesh, views, without=view.view, threads=threads)
+        others = OnDemand(len(used), lambda k: views[used[k]])
+        painted = job.config.model.color(mesh, others, threads=threads)
     except StageFailure:
         return None
     height, width = view.rgb.shape[:2]
@@ -299,7 +303,7 @@ def _compare_held_out(job: Job, views: Sequence[PinholeView], mesh: TexturedMesh
         return None
     matched = match_exposure(view.rgb, rendered.color, compared)
     similarity = (psnr_db(view.rgb, matched, compared), ssim(view.rgb, matched, compared))
-    return HeldOut(view.view, view.rgb, matched, compared, *similarity)
+    return HeldOut(view.view % n, view.rgb, matched, compared, *similarity)
 
 
 NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k1")

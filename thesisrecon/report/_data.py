@@ -175,7 +175,7 @@ def _depth_maps(result: RunResult) -> list[dict[str, Any]] | None:
         return None
     return [
         {
-            "name": result.images[m.view].name,
+            "name": result.images[m.view % len(result.images)].name,
             "known_fraction": float(np.isfinite(m.depth).mean()),
             "median_std_rel": _median((m.std / m.depth)[np.isfinite(m.depth)].astype(np.float64)),
         }

@@ -13,7 +13,7 @@ from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.imaging.on_demand import MappingOnDemand
-from thesisrecon.imaging.resampling import pinhole_frame, pinhole_view
+from thesisrecon.imaging.pinholes import pinhole_frame, pinhole_numbers, pinhole_view
 from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView, Reconstruction
 from thesisrecon.stereo import _depth_fusion
 from thesisrecon.stereo._plane_refinement import refine_depths, search_planes
@@ -33,15 +33,22 @@ class SparsePoints:
     sampled: bool = False  #: samples: only those that both views show limit the disparities of a pair
 
 
-def _sparse_points(reconstruction: Reconstruction) -> SparsePoints:
-    """The valid points of a metric reconstruction with their inlier observations."""
+def _sparse_points(reconstruction: Reconstruction, frames: Mapping[int, PinholeView]) -> SparsePoints:
+    """The valid points of a metric reconstruction with their inlier observations in each of the views."""
     tracks = reconstruction.tracks
     seen = np.zeros((tracks.n_views, tracks.n_points), dtype=bool)
     good = reconstruction.inlier
     seen[tracks.view_index[good], tracks.point_index[good]] = True
     seen &= reconstruction.registered[:, None]
     valid = reconstruction.valid
-    return SparsePoints(reconstruction.X[valid, :3] / reconstruction.X[valid, 3:], seen[:, valid])
+    X, n = reconstruction.X[valid, :3] / reconstruction.X[valid, 3:], tracks.n_views
+    of_views = np.zeros((max(frames, default=0) + 1, len(X)), dtype=bool)
+    divided = {i % n for i in frames if i >= n}
+    for i, frame in frames.items():
+        of_views[i] = seen[i % n, valid]
+        if i % n in divided:
+            of_views[i] &= project_inside(frame, X)[1]
+    return SparsePoints(X, of_views)
 
 
 def _shared_projections(points: SparsePoints, a: PinholeView, b: PinholeView) -> tuple[F64, F64]:
@@ -170,8 +177,9 @@ def frustum_samples(
 ) -> tuple[F64, B8]:
     """Sample the common frusta: points (N, 3), and whether each of ``n_views`` shows them (V, N).
 
-    On the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2); without it another
-    view shows a point only at a triangulation angle from 0.5 to 40 degrees. Points of one view are left out.
+    On the rays of a grid of pixels of each view, at the depths of ``depth_range`` (V, 2) of its image;
+    without it another view shows a point only at a triangulation angle from 0.5 to 40 degrees. Points of one
+    view are left out.
     """
     min_angle_deg, max_angle_deg = 0.5, 40.0
     # Depths between given limits, evenly in inverse depth; ratio of successive depths without limits.
@@ -180,9 +188,10 @@ def frustum_samples(
     points, shown = [np.zeros((0, 3))], [np.zeros((n_views, 0), dtype=bool)]
     for i, view in views.items():
         away = [float(np.linalg.norm(centres[j] - centres[i])) for j in views if j != i]
-        away = [distance for distance in away if distance > 0.0]
+        # Views of one image have one centre, to rounding.
+        away = [distance for distance in away if distance > 1e-9 * max(away)]
         if depth_range is not None:
-            first, last = 1.0 / depth_range[i]
+            first, last = 1.0 / depth_range[i % len(depth_range)]
             depth = 1.0 / np.linspace(first, last, depths)
         elif away:
             nearest = 0.5 * min(away) / np.tan(np.radians(max_angle_deg))
@@ -235,7 +244,7 @@ def _angles_deg(a: F64, b: F64) -> F64:
 class MultiViewScene:
     """Input of multi-view stereo."""
 
-    views: Mapping[int, PinholeView]  #: undistorted views by number, in the size of their depth maps
+    views: Mapping[int, PinholeView]  #: pinhole views by number, in the size of their depth maps
     points: SparsePoints  #: points of the reconstruction
     neighbours: Mapping[int, tuple[int, ...]]  #: neighbours of each view, the most useful first
     matched: Mapping[int, PinholeView] = field(default_factory=dict)  #: in the size used for stereo matching
@@ -299,22 +308,24 @@ class MultiViewStereo:
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
-        registered = np.flatnonzero(reconstruction.registered).tolist()
+        numbers, n = pinhole_numbers(reconstruction), len(images)
 
         def undistorted(side: int) -> Mapping[int, PinholeView]:
             return MappingOnDemand(
-                registered, lambda i: pinhole_view(images[i], reconstruction, i, max_side=side), VIEW_BYTES
+                numbers, lambda i: pinhole_view(images[i % n], reconstruction, i, max_side=side), VIEW_BYTES
             )
 
-        frames = {i: pinhole_frame(images[i], reconstruction, i, max_side=self.max_side) for i in registered}
+        frames = {i: pinhole_frame(images[i % n], reconstruction, i, max_side=self.max_side) for i in numbers}
         views = undistorted(self.max_side)
         side = min(self.match_side, self.max_side)
         longest = max((max(frame.seen.shape) for frame in frames.values()), default=0)
         matched = undistorted(side) if longest > side else views
         if depth_range is None and len(reconstruction.tracks.xy):
-            points = _sparse_points(reconstruction)
+            points = _sparse_points(reconstruction, frames)
         else:
-            points = SparsePoints(*frustum_samples(frames, len(images), depth_range), sampled=True)
+            points = SparsePoints(
+                *frustum_samples(frames, max(numbers, default=0) + 1, depth_range), sampled=True
+            )
         chosen = {i: _select_neighbours(points, frames, i, self.max_neighbours) for i in frames}
         return MultiViewScene(views, points, chosen, matched)
 

@@ -325,12 +325,6 @@ class SurfaceModel:
                 depth_maps = list(pool.map(self.surface.smooth, depth_maps))
         return self.fusion.fuse(depth_maps, threads=threads)
 
-    def color(
-        self, surface: TexturedMesh, views: Sequence[PinholeView], *, without: int | None = None,
-        threads: int = 1,
-    ) -> TexturedMesh:  # fmt: skip
+    def color(self, surface: TexturedMesh, views: Sequence[PinholeView], *, threads: int = 1) -> TexturedMesh:
         """See `thesisrecon.config.ModelBuilder.color`."""
-        if without is not None:
-            used = [n for n, view in enumerate(views) if view.view != without]
-            given, views = views, OnDemand(len(used), lambda n: given[used[n]])
         return texture_mesh(surface, views, threads=threads)

@@ -14,7 +14,7 @@ import PIL.Image
 from thesisrecon.api.surface import confirmed_depth_maps
 from thesisrecon.arrays import F32, U8
 from thesisrecon.config import preset
-from thesisrecon.imaging.resampling import pinhole_view
+from thesisrecon.imaging.pinholes import pinhole_view
 from thesisrecon.io._files import write_text
 from thesisrecon.io._images import read_images
 from thesisrecon.records import DepthMap, Image, PinholeView, Reconstruction
