@@ -11,7 +11,8 @@ from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 
 from tests.report.synthetic import made_up_cameras, made_up_run
-from thesisrecon.records import HeldOut
+from thesisrecon.lens import lens_row
+from thesisrecon.records import HeldOut, IntrinsicInterval
 from thesisrecon.report import _figures as figures
 
 
@@ -26,6 +27,42 @@ def test_the_matrix_is_symmetric_and_marks_rejected_pairs():
     assert accepted["customdata"][bad.i][bad.j] is None
     assert accepted["customdata"][0][0] is None
     assert refused["text"][bad.i][bad.j] == f"× {bad.inliers}"
+
+
+@pytest.mark.parametrize(("lens", "degrees"), [("radial", 0.0), ("fisheye", 150.0)])
+def test_the_lens_is_drawn_with_its_intervals_and_the_straight_image_unfolded(lens, degrees):
+    data = made_up_run(points=300)
+    f = 240.0 / np.radians(degrees / 2.0) if degrees else 520.0
+    row = lens_row("fisheye", np.zeros(4)) if degrees else np.array([-0.03, 0.0, 0.0])
+    r, image = data.metric.reconstruction, data.images[2]
+    K = np.array([[f, 0.0, 239.5], [0.0, f, 159.5], [0.0, 0.0, 1.0]])
+    poses = np.linalg.solve(np.where(r.registered[:, None, None], r.K, np.eye(3)), r.P)
+    lenses = np.tile(row, (len(r.P), 1))
+    r = replace(r, P=K @ poses, K=np.tile(K, (len(r.P), 1, 1)), distortion=lenses)
+    angles = {
+        "angle_of_view_deg": IntrinsicInterval(1.0, 0.3, ""),
+        "corner_deg": IntrinsicInterval(1, 0.2, ""),
+    }
+    known = tuple(view | angles if view else view for view in data.metric.intrinsics)
+    data = replace(data, metric=replace(data.metric, reconstruction=r, intrinsics=known))
+    assert list(data.bent) == [data.images[0].name]
+    figure = figures.lens_figure(data.bent)
+    json.dumps(figure, allow_nan=False)
+    curve, pinhole, ends = figure["data"]
+    camera = data.bent[data.images[0].name]
+    assert camera.lens == lens
+    np.testing.assert_allclose(curve["y"][-1], camera.angles_of_view[1], atol=0.01)
+    np.testing.assert_allclose(ends["y"], np.array(camera.angles_of_view) * [0.5, 1.0])
+    np.testing.assert_allclose(ends["error_y"]["array"], 1.96 * np.array([0.15, 0.2]))
+    # A fisheye lens images wider angles than a pinhole camera of its focal length; so does a barrel.
+    assert pinhole["y"][-1] < curve["y"][-1]
+    original, straight = figures.draw_straight(image, r, 2)
+    assert (original.width, original.height) == (480, 320)
+    shown = np.asarray(opened(straight.uri), dtype=float)
+    # The middle of the front view is that of the image.
+    middle = image.rgb[157:163, 237:243].mean(axis=(0, 1))
+    y, x = (side // 2 for side in shown.shape[:2])
+    np.testing.assert_allclose(shown[y - 3 : y + 3, x - 3 : x + 3].mean(axis=(0, 1)), middle, atol=12.0)
 
 
 def opened(uri):

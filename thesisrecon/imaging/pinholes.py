@@ -54,7 +54,7 @@ def pinhole_numbers(reconstruction: Reconstruction) -> list[int]:
     """Numbers of the pinhole views of the registered images of a metric reconstruction, in order."""
     numbers, V, names = list[int](), len(reconstruction.P), list(FACES)
     for i in np.flatnonzero(reconstruction.registered).tolist():
-        camera = _camera(reconstruction, i)
+        camera = camera_of_image(reconstruction, i)
         shown = seen_faces(*camera)[2] if is_wide(*camera) else names[:1]
         numbers += [i + V * names.index(name) for name in shown]
     return sorted(numbers)
@@ -77,14 +77,14 @@ def pinhole_view(
     Images longer than ``max_side`` are reduced.
     """
     P, K, size, turn = _pinhole_camera(image, reconstruction, view, max_side)
-    own, _, lens = _camera(reconstruction, view % len(reconstruction.P))
+    own, _, lens = camera_of_image(reconstruction, view % len(reconstruction.P))
     if not lens.any() and size == image.size and image.mask is None:
         return PinholeView(view, P, image.rgb, np.ones(image.rgb.shape[:2], dtype=bool))
     rgb, seen = undistort_image(image.rgb, own, lens, K, size, mask=image.mask, turn=turn)
     return PinholeView(view, P, rgb, seen)
 
 
-def _camera(reconstruction: Reconstruction, image: int) -> tuple[F64, tuple[int, int], F64]:
+def camera_of_image(reconstruction: Reconstruction, image: int) -> tuple[F64, tuple[int, int], F64]:
     """K, size and lens of an image."""
     if reconstruction.stratum != "metric" or reconstruction.K is None:
         raise ValueError("undistorted views need a metric reconstruction with K")
@@ -98,7 +98,7 @@ def _pinhole_camera(
 ) -> tuple[F64, F64, tuple[int, int], F64 | None]:
     """P (3, 4), K (3, 3) and (width, height) of a pinhole view, and its rotation if it is one of several."""
     face, i = divmod(view, len(reconstruction.P))
-    K, size, lens = _camera(reconstruction, i)
+    K, size, lens = camera_of_image(reconstruction, i)
     if size != image.size:
         raise ValueError(f"image {image.name} must be {reconstruction.sizes[i]} px; got {image.size}")
     P, turn = reconstruction.P[i], None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from thesisrecon import records
 from thesisrecon.arrays import F32, F64, U8, rows_of_views
+from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.lens import distort
@@ -43,6 +44,15 @@ class ReportData(RunResult):
     def of(cls, result: RunResult, **more: Any) -> ReportData:
         """The content of a result with ``more``."""
         return cls(**{f.name: getattr(result, f.name) for f in fields(result)}, **more)
+
+    @property
+    def bent(self) -> Mapping[str, Camera]:
+        """A camera by image name of each number of a camera whose lens bends lines, at most four."""
+        numbers, found = dict[int, str](), {} if self.metric is None else self.cameras
+        for image, number in zip(self.images, self.groups, strict=True):
+            if image.name in found and not found[image.name].is_pinhole:
+                numbers.setdefault(int(number), image.name)
+        return {name: found[name] for name in [*numbers.values()][:4]}
 
     @property
     def unit_of_length(self) -> str:

@@ -6,9 +6,10 @@ version of plotly. Drawings are thumbnails, image pairs, depth maps and the held
 
 import base64
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,12 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 
 from thesisrecon.arrays import B8, F32, F64, I64, distinct_corners
-from thesisrecon.camera import decompose_camera, finite_cameras
+from thesisrecon.camera import Camera, decompose_camera, finite_cameras, viewing_rays
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import clip_line
+from thesisrecon.imaging.pinholes import camera_of_image, is_wide, pinhole_numbers, pinhole_view
+from thesisrecon.lens import angles_from_axis
 from thesisrecon.records import HeldOut, Image, Reconstruction, TexturedMesh, TwoView
 from thesisrecon.report._data import pictured
 from thesisrecon.results import ModelComparison, SparseModel
@@ -32,6 +35,7 @@ _PAIR_SCALE = [[0.0, "#e6f2f1"], [0.25, "#a9d6d2"], [0.5, "#5cb1ad"], [0.75, "#1
 MAX_MATRIX, MAX_CELLS = 200, 100
 """Largest number of views in the matrix of pairs, and cells per side for more."""
 MAX_PYRAMIDS = 250  # Cameras that are drawn as pyramids; of more, these are evenly spread
+HUES_OF_LENSES = ("#0b6e7f", "#c4560b", "#6a3d9a", "#4d7a18")
 COMPARED_COLORS = {"a": ("#ff9f43", "#ffc78a"), "b": ("#3fb8ff", "#9fd8f7")}
 """Cameras and points of each model in a comparison."""
 
@@ -277,6 +281,53 @@ def _matrix_layout(labels: list[str], block: int) -> Figure:
     }  # fmt: skip
 
 
+def lens_figure(cameras: Mapping[str, Camera]) -> Figure:
+    """Angle from the axis against the distance from the principal point, by name, and that of pinholes.
+
+    The bars are 95 % intervals: of half the angle of view, and of the farthest corner.
+    """
+    traces = list[Figure]()
+    for (name, camera), color in zip(cameras.items(), cycle(HUES_OF_LENSES), strict=False):
+        half = np.array(camera.angles_of_view) * [0.5, 1.0]
+        corners = np.array([[x, y] for x in (0, camera.size[0]) for y in (0, camera.size[1])]) - 0.5
+        far = max(corners - camera.K[:2, 2], key=lambda corner: float(np.linalg.norm(corner)))
+        radii = np.linspace(0.0, np.linalg.norm(far), 65)
+        rays = viewing_rays(
+            camera.K, camera.K[:2, 2] + np.linspace(0.0, 1.0, 65)[:, None] * far, camera.lens_row
+        )
+        angle = np.degrees(angles_from_axis(rays))
+        straight = np.degrees(np.arctan(radii / camera.K[0, 0]))
+        std = [(camera.std or {}).get(key, np.nan) for key in ("angle_of_view_deg", "corner_deg")]
+        bars = 1.96 * np.array(std) * [0.5, 1.0]
+        known = np.isfinite(half + bars)
+        at = np.array([max(camera.size) / 2.0, radii[-1]])
+        line: Figure = {
+            "type": "scatter",
+            "mode": "lines",
+            "x": np.round(radii, 1).tolist(),
+            "hoverinfo": "skip",
+        }
+        kept = [None if np.isnan(value) else round(float(value), 3) for value in angle]
+        traces.append({**line, "y": kept, "name": escape(name), "line": {"color": color}})
+        dashes = {"color": color, "dash": "dot", "width": 1}
+        traces.append({**line, "y": np.round(straight, 3).tolist(), "line": dashes, "name": "pinhole"})
+        traces.append({
+            "type": "scatter", "mode": "markers", "x": at[known].tolist(), "y": half[known].tolist(),
+            "marker": {"color": color, "size": 7}, "showlegend": False,
+            "error_y": {"type": "data", "array": bars[known].tolist(), "thickness": 2},
+            "hovertemplate": "%{y:.2f} degrees<extra></extra>",
+        })  # fmt: skip
+    axis = {"rangemode": "tozero", "gridcolor": "#d5dbe0", "fixedrange": True}
+    layout = {
+        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "#f4f6f7",
+        "margin": {"l": 56, "r": 8, "t": 8, "b": 46}, "legend": {"x": 0.02, "y": 0.98},
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1b2733"},
+        "xaxis": {**axis, "title": {"text": "distance from the principal point (px)"}},
+        "yaxis": {**axis, "title": {"text": "angle from the axis (degrees)"}},
+    }  # fmt: skip
+    return {"data": traces, "layout": layout}
+
+
 def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
     """Upper end of the distances (px, 98 % of them) and their histograms as SVG paths in equal boxes."""
     everything = np.concatenate([np.zeros(0), *distances])
@@ -409,6 +460,8 @@ SCALE = (
     "#019f91", "#00b08e", "#04c082", "#58cc78", "#87d86f", "#b1e167", "#d7e962", "#fcf265",
 )  # fmt: skip
 UNKNOWN = (201, 208, 214)
+CUBE = ((1, 1), (0, 1), (2, 1), (1, 0), (1, 2))
+"""Columns and rows of the pinhole views of a wide image: front, left, right, up, down."""
 
 
 @dataclass(frozen=True)
@@ -541,6 +594,28 @@ def draw_held_out(held_out: HeldOut) -> tuple[EmbeddedImage, EmbeddedImage, Embe
     sheets = map(PillowImage.fromarray, (held_out.real, rendered, _paint_scale(difference)))
     real, model, apart = (_small(sheet, 640) for sheet in sheets)
     return real, model, apart
+
+
+def draw_straight(
+    image: Image, reconstruction: Reconstruction, number: int
+) -> tuple[EmbeddedImage, EmbeddedImage]:
+    """Draw an image and what dense stages see of it: a pinhole view, or several as an unfolded cube."""
+    alone = replace(reconstruction, registered=np.arange(len(reconstruction.P)) == number)
+    views = [pinhole_view(image, alone, k, max_side=480) for k in pinhole_numbers(alone)]
+    sheet = views[0].rgb
+    if is_wide(*camera_of_image(alone, number)):
+        K = [decompose_camera(view.P)[0] for view in views]
+        focal, size = K[0][0, 0], int(6.0 * K[0][0, 0])
+        sheet, seen = np.full((size, size, 3), 255, np.uint8), np.zeros((size, size), bool)
+        for view, own in zip(views, K, strict=True):
+            cell = CUBE[view.view // len(alone.P)]
+            x, y = np.rint(focal * (2.0 * np.array(cell) + 1.0) - own[:2, 2]).astype(np.int64)
+            height, width = view.seen.shape
+            part = slice(y, y + height), slice(x, x + width)
+            sheet[part][view.seen], seen[part] = view.rgb[view.seen], view.seen
+        rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+        sheet = sheet[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return _small(_sampled(image), 480), _small(PillowImage.fromarray(sheet), 640)
 
 
 def _small(picture: PillowImage.Image, side: int) -> EmbeddedImage:

@@ -137,6 +137,11 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     ]
     if data.held_out is not None:
         held_out = pictures.make("the held-out image", figures.draw_held_out, data.held_out)
+    straight = None
+    if data.bent and data.metric is not None:
+        first = names.index(next(iter(data.bent)))
+        of_first = data.images[first], data.metric.reconstruction, first
+        straight = pictures.make("the straight image", figures.draw_straight, *of_first)
     scripts, content = _figure_content(plotted)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
     cards = _cards(data, distances, bars, pictures)
@@ -155,7 +160,7 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
         difference_limit=round(figures.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
         shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
-        warnings=_warnings(data, pictures.warnings), model_scripts=model_scripts,
+        warnings=_warnings(data, pictures.warnings), straight=straight, model_scripts=model_scripts,
         histogram_size=tuple(size.values()),
         summary_text=json.dumps({**data.summary, **long}, indent=2, ensure_ascii=False, default=str),
     )  # fmt: skip
@@ -193,6 +198,8 @@ def _figures(
         )
         if drawn is not None:
             found["affine-figure"], _, omitted = drawn
+    if data.bent:
+        found["lens-figure"] = pictures.make("the lens", figures.lens_figure, data.bent)
     if data.pairs:
         matrix = pictures.make("the matrix of pairs", figures.pair_matrix_figure, data.pairs, names)
         found["matrix-figure"] = matrix

@@ -84,7 +84,7 @@
     if (id === "matrix-figure" && element.clientWidth < 36 * cells.x.length) {
       figures[id].data.forEach(function (trace) { delete trace.texttemplate; });
     }
-    const options = Object.assign({}, bar, id === "matrix-figure" ? { displayModeBar: false } : {});
+    const options = Object.assign({}, bar, element.classList.contains("scene") ? {} : { displayModeBar: false });
     try {
       Plotly.newPlot(element, figures[id].data, figures[id].layout, options).then(
         function () { element.dataset.drawn = "yes"; },
