@@ -416,7 +416,7 @@ class DisparityMap(Record):
 class DepthMap(Record):
     """Depth map of one view, distortion removed."""
 
-    view: int  #: number of the image, or that of :class:`PinholeView`
+    view: int  #: number of the image, or of a ``PinholeView`` of it
     P: F64  #: K [R t] for the pixels of this map, which may be fewer than those of the image
     depth: F32  #: (H, W) z in the camera frame, NaN where unknown
     std: F32  #: (H, W)
