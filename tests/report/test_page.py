@@ -113,7 +113,7 @@ def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():
 
 def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     rng = np.random.default_rng(0)
-    noise = rng.integers(0, 255, (160, 240, 3), dtype=np.uint8)  # the hardest picture for a JPEG
+    noise = rng.integers(0, 255, (320, 480, 3), dtype=np.uint8)  # the hardest picture for a JPEG
     monkeypatch.setattr(synthetic, "made_up_photograph", lambda *_: noise)
     data = synthetic.made_up_run(names=[f"IMG_{n:04}.JPG" for n in range(1000)], points=200)
     cameras = [{"name": image.name, "focal_px": {"value": 520.3, "std": 0.4}} for image in data.images]
@@ -129,7 +129,7 @@ def test_a_thousand_views_stay_below_ten_megabytes(monkeypatch):
     structure = synthetic.Structure(page)
     # 25,000 coloured points take 0.7 MB more than those of this run.
     assert len(page.encode()) < 9_300_000
-    assert structure.count("img") == 100 + 2 + 100
+    assert structure.count("img") == 100 + 2 + 100 + 2
     assert "900 images without pictures" in page
     assert "1000 entries, see summary.json" in page
     assert all(image.name in page for image in data.images)

@@ -5,7 +5,6 @@ the number i, and those to the left, right, up and down i + V to i + 4 V.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64, resizing_transform
 from thesisrecon.camera import angles_of_view, pixels_of_rays, widest_angle
@@ -15,11 +14,12 @@ from thesisrecon.records import Image, PinholeView, Reconstruction
 
 WIDE = 110.0  # degrees along the long side, of which an image is divided into several pinhole views
 FACES = {
-    name: Rotation.from_euler(axis, angle, degrees=True).as_matrix()
-    for name, axis, angle in (
-        ("front", "y", 0), ("left", "y", 90), ("right", "y", -90), ("up", "x", -90), ("down", "x", 90)
-    )
-}  # fmt: skip
+    "front": np.eye(3),
+    "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "up": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
 """Rotations from the axes of a wide camera to those of its pinhole views of 90 x 90 degrees."""
 LEAST_SEEN = 0.05  # of a pinhole view, which is used from there on
 GRID = 33  # samples along a side of a pinhole view at which it is tested what the image shows
