@@ -20,7 +20,6 @@ from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
-from thesisrecon.pipeline.outputs import write_affine
 from thesisrecon.selfcalibration import cheirality
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
@@ -237,19 +236,3 @@ def test_a_plane_may_be_given_and_wrong_calls_and_hopeless_data_are_refused():
     refuses(ValueError, "plane", upgrade_to_affine, given, np.zeros(4))
     few = replace(given, registered=np.arange(8) < 2)
     refuses(StageFailure, "at least 3", thesisrecon.upgrade_affine, few)
-
-
-def test_points_and_camera_centres_are_written_but_for_those_at_infinity(tmp_path):
-    affine = upgrade_to_affine(projective_reconstruction(make_scene()), np.array([0.02, -0.03, 0.01, 1.0]))
-    near = affine.valid & (np.abs(affine.X[:, :3]) < 1e3).all(axis=1)
-    P = affine.P.copy()
-    P[1, 2, :3] = P[1, 0, :3] + P[1, 1, :3]
-    P[2, 2, :3] = 0.0
-    for some, centres in ((affine, 8), (replace(affine, P=P), 6)):
-        write_affine(tmp_path / "affine.ply", some, np.full((300, 3), 77, dtype=np.uint8))
-        head, _, body = (tmp_path / "affine.ply").read_bytes().partition(b"end_header\n")
-        assert f"element vertex {near.sum() + centres}\n".encode() in head
-        vertices = np.frombuffer(body, dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-        assert (vertices["rgb"][-centres:] == [255, 0, 0]).all()
-        assert (vertices["rgb"][:-centres] == 77).all()
-        np.testing.assert_allclose(vertices["xyz"][:-centres], affine.X[near, :3], rtol=1e-5)

@@ -14,7 +14,6 @@ import numpy as np
 from thesisrecon import __version__
 from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F32, U8
-from thesisrecon.camera import finite_cameras
 from thesisrecon.config.text import toml_from_config
 from thesisrecon.errors import NOT_MADE, Notice, StageFailure, UsageError, counted, made
 from thesisrecon.io._colmap import COLMAP_FILES, write_colmap_model
@@ -37,25 +36,13 @@ from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, texture_mesh
 DEPTH_PX = 400
 PAGE_FACES, PAGE_TEXELS = 45_000, 2048 * 2048
 PAGE, SURFACE_FILES = "report.html", ("model.glb", "model-full.glb")
-MODEL_FILES = (*COLMAP_FILES, "points.ply", "affine.ply", "cameras.json", "cameras.csv", *SURFACE_FILES)
+MODEL_FILES = (*COLMAP_FILES, "points.ply", "cameras.json", "cameras.csv", *SURFACE_FILES)
 RESULT_FILES = (SUMMARY, PAGE, *MODEL_FILES)
 REPLACED_FILES = (*RESULT_FILES, *(f"group-[0-9]*/{name}" for name in RESULT_FILES))
 """Files of another run that a run removes from its folder."""
 CONFIG = "config.toml"
 WRITTEN_FILES = (*REPLACED_FILES, CONFIG, *(f"group-[0-9]*/{name}" for name in (CONFIG, RUN_FILE)))
 """Files that a run writes beside the results of its stages."""
-MAX_AFFINE = 1e3  # largest affine coordinate in affine.ply, in median depths of the best observed view
-
-
-def write_affine(path: Path, affine: Reconstruction, colors: U8) -> None:
-    """Write the affine points and the camera centres (red) within ``MAX_AFFINE`` as a PLY file."""
-    X = affine.X[:, :3]
-    near = affine.valid & (np.abs(X) < MAX_AFFINE).all(axis=1)
-    P = affine.P[affine.registered & finite_cameras(affine.P)]
-    centres = -np.linalg.solve(P[:, :, :3], P[:, :, 3:])[..., 0]
-    centres = centres[(np.abs(centres) < MAX_AFFINE).all(axis=1)]
-    red = np.tile(np.array([255, 0, 0], dtype=np.uint8), (len(centres), 1))
-    write_point_cloud(path, np.concatenate([X[near], centres]), np.concatenate([colors[near], red]))
 
 
 def write_outputs(run: Run, result: RunResult, *, until: str, failure: StageFailure | None) -> RunResult:
@@ -206,11 +193,6 @@ def _write_exports(
     if projective is not None and calibration is not None:
         plane = calibration.plane_at_infinity
         affine = made("the affine points", lambda: upgrade_to_affine(projective, plane), warnings, None)
-    if affine is None:
-        directory.remove(["affine.ply"])
-    else:
-        path, upgraded = directory.path / "affine.ply", affine
-        made(path.name, lambda: write_affine(path, upgraded, point_colors(upgraded, images)), warnings, None)
     return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
 
 
