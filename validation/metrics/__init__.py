@@ -3,7 +3,15 @@
 The names here are for studies of your own.
 """
 
-from validation.metrics.cameras import measure_cameras, measure_reprojection, pose_pair_errors
+from validation.metrics.cameras import (
+    area_under_recall,
+    mean_accuracy,
+    measure_cameras,
+    measure_reprojection,
+    pose_pair_errors,
+    recall,
+    relative_pose_errors,
+)
 from validation.metrics.depth import bad_pixels
 from validation.metrics.focal_bound import focal_bound
 from validation.metrics.fundamental_precision import (
@@ -11,7 +19,6 @@ from validation.metrics.fundamental_precision import (
     fundamental_bound,
     rms_epipolar_distance,
 )
-from validation.metrics.poses import area_under_recall, mean_accuracy, recall, relative_pose_errors
 from validation.metrics.searches import traced
 
 __all__ = [

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from thesisrecon.arrays import F64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.camera import project_camera
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.records import MetricResult, Reconstruction
 from thesisrecon.testing import pose_errors
-from validation.metrics.poses import relative_pose_errors
 
 TrueCameras = tuple[F64, F64, F64]
 """K, R (V, 3, 3), R world-to-camera, and centres C (V, 3) in some unit of length."""
@@ -86,12 +87,17 @@ def measure_intrinsics(reconstruction: Reconstruction, K_true: F64) -> tuple[flo
 
 def pose_pair_errors(reconstruction: Reconstruction | None, truth: TrueCameras) -> F64:
     """Errors (degrees) of the relative poses of pairs with truth; of missing cameras they are infinite."""
-    R, C = np.full_like(truth[1], np.nan), np.full_like(truth[2], np.nan)
+    return relative_pose_errors(*camera_poses(reconstruction, len(truth[1])), truth[1], truth[2])
+
+
+def camera_poses(reconstruction: Reconstruction | None, views: int) -> tuple[F64, F64]:
+    """Rotations (V, 3, 3) and centres (V, 3) of metric cameras; NaN where none is registered."""
+    R, C = np.full((views, 3, 3), np.nan), np.full((views, 3), np.nan)
     if reconstruction is not None:
-        views = np.flatnonzero(reconstruction.registered)
-        R[views], t = _rotations_translations(reconstruction)
-        C[views] = -np.einsum("vba,vb->va", R[views], t)
-    return relative_pose_errors(R, C, truth[1], truth[2])
+        there = reconstruction.registered
+        R[there], t = _rotations_translations(reconstruction)
+        C[there] = -np.einsum("vba,vb->va", R[there], t)
+    return R, C
 
 
 def relative_centre_error(errors: CameraErrors, C: F64) -> float:
@@ -154,14 +160,10 @@ def pose_scores(metric: MetricResult, R: F64, C: F64) -> F64:
     true poses R (V, 3, 3), C (V, 3) are first moved by the similarity that aligns them best.
     """
     model = metric.reconstruction
-    assert model.K is not None
     assert metric.pose_std is not None
-    views = np.flatnonzero(model.registered)
-    Rt = np.linalg.solve(model.K[views], model.P[views])
-    X = model.X[model.valid]
-    centres = -np.einsum("vba,vb->va", Rt[:, :, :3], Rt[:, :, 3])
-    found = np.asarray(Rt[:, :, :3], dtype=np.float64)
-    error = pose_errors(found, centres, R[views], C[views], X[:, :3] / X[:, 3:])
+    views, X = np.flatnonzero(model.registered), model.X[model.valid]
+    found, centres = camera_poses(model, len(R))
+    error = pose_errors(found[views], centres[views], R[views], C[views], X[:, :3] / X[:, 3:])
     z = np.full((len(model.registered), 6), np.nan)
     z[views] = error / metric.pose_std[views]
     return z
@@ -182,3 +184,61 @@ def focal_errors_pct(K: F64, K_true: F64) -> F64:
     f = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
     truth = np.sqrt(K_true[:, 0, 0] * K_true[:, 1, 1])
     return np.where(f > 0, 100.0 * np.abs(f / truth - 1.0), np.nan)
+
+
+AUC_DEG = (0.1, 0.5, 1.0, 3.0, 5.0, 10.0, 20.0)
+STEPS = 100
+"""Thresholds of a recall curve, from zero to the largest of :data:`AUC_DEG`."""
+
+
+def relative_pose_errors(R: F64, C: F64, R_true: F64, C_true: F64) -> F64:
+    """Errors (V (V - 1) / 2,) in degrees of all pairs i < j of cameras: the larger one of the angles of
+    relative rotation and direction of translation (Jin et al. 2021, IMW), as in the benchmarks of SuperGlue.
+
+    R (V, 3, 3) are world-to-camera, C (V, 3) centres. A pair of which a camera is missing (NaN) in the first
+    model has an infinite error; one that is missing in the truth is left out, and a pair with one true centre
+    is judged by its rotation.
+    """
+    known = np.isfinite(C_true).all(axis=1) & np.isfinite(R_true).all(axis=(1, 2))
+    pairs = np.array(list(combinations(np.flatnonzero(known), 2)), dtype=np.int64).reshape(-1, 2)
+    i, j = pairs.T
+    (turn, step), (turn_true, step_true) = (_relative(*given, i, j) for given in ((R, C), (R_true, C_true)))
+    errors = np.full(len(pairs), np.inf)
+    there = np.isfinite(step).all(axis=1) & np.isfinite(turn).all(axis=(1, 2))
+    between = np.swapaxes(turn_true[there], 1, 2) @ turn[there]
+    rotation = Rotation.from_matrix(between).magnitude() if there.any() else np.zeros(0)
+    lengths = np.linalg.norm(step[there], axis=1), np.linalg.norm(step_true[there], axis=1)
+    sine = np.linalg.norm(np.cross(step[there], step_true[there]), axis=1)
+    direction = np.arctan2(sine, np.sum(step[there] * step_true[there], axis=1))
+    extent = max(float(np.linalg.norm(step_true, axis=1).max(initial=0.0)), 1e-300)
+    direction = np.where(lengths[1] > 1e-9 * extent, direction, 0.0)
+    errors[there] = np.degrees(np.maximum(rotation, direction))
+    return errors
+
+
+def _relative(R: F64, C: F64, i: I64, j: I64) -> tuple[F64, F64]:
+    """Rotations from camera i to camera j and the centres of j in the frames of i."""
+    return R[j] @ np.swapaxes(R[i], 1, 2), np.einsum("kab,kb->ka", R[i], C[j] - C[i])
+
+
+def recall(errors: F64, thresholds: F64) -> F64:
+    """Share of the errors of at most each threshold."""
+    if not len(errors):
+        return np.asarray(thresholds) * np.nan
+    return np.asarray((errors[:, None] <= np.asarray(thresholds)).mean(axis=0))
+
+
+def area_under_recall(errors: F64, threshold: float) -> float:
+    """Area under the recall curve up to a threshold, over it: the mean of max(0, 1 - e / threshold)."""
+    return float(np.maximum(1.0 - errors / threshold, 0.0).mean()) if len(errors) else float("nan")
+
+
+def pose_scores_pct(errors: F64) -> dict[str, float]:
+    """AUC at every threshold and mAA(10 degrees), in percent, by the names of the ablations."""
+    areas = {f"auc{at:g}_pct": 100.0 * area_under_recall(errors, at) for at in AUC_DEG}
+    return {**areas, "maa_pct": 100.0 * mean_accuracy(errors)}
+
+
+def mean_accuracy(errors: F64, up_to: int = 10) -> float:
+    """Mean of the recalls at 1, 2, ... ``up_to`` degrees (mAA)."""
+    return float(recall(errors, np.arange(1.0, up_to + 1.0)).mean())

@@ -16,7 +16,7 @@ from thesisrecon.errors import UsageError, counted
 from thesisrecon.io._files import read_json, write_text
 from thesisrecon.io._outputs import join_claim
 from thesisrecon.results import ModelComparison, SparseModel
-from validation.metrics.poses import (
+from validation.metrics.cameras import (
     AUC_DEG,
     STEPS,
     area_under_recall,

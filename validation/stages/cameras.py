@@ -20,12 +20,12 @@ from thesisrecon.pipeline.run import FOLDERS
 from thesisrecon.records import Reconstruction
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RunDirectory
 from validation.metrics.cameras import (
+    area_under_recall,
     focal_errors_pct,
     measure_cameras,
     measure_reprojection,
     pose_pair_errors,
 )
-from validation.metrics.poses import area_under_recall
 from validation.references.colmap import (
     map_with_pycolmap,
     match_with_pycolmap,

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from validation.command import main
-from validation.metrics.poses import area_under_recall, mean_accuracy, recall, relative_pose_errors
+from validation.metrics.cameras import area_under_recall, mean_accuracy, recall, relative_pose_errors
 
 K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
 

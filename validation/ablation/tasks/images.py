@@ -24,9 +24,9 @@ from thesisrecon.records import Image, TwoView
 from thesisrecon.stereo.depth import MultiViewStereo
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.ablation.tasks.reconstruction import POSE_MEASURES, content_key, scene_or_folder
+from validation.metrics.cameras import pose_scores_pct, relative_pose_errors
 from validation.metrics.depth import bad_pixels
 from validation.metrics.fundamental_precision import RIGHT_PX, rms_epipolar_distance
-from validation.metrics.poses import pose_scores_pct, relative_pose_errors
 from validation.scenes.many_views import yard_number
 from validation.scenes.real import Scene
 from validation.scenes.real_pairs import CONSISTENT_PX, SCENES_WITH_CAMERAS, camera_pair

@@ -21,12 +21,13 @@ from thesisrecon.results import RunResult
 from thesisrecon.runtime._run_folder import key_of
 from validation.ablation.study import Measure, Place, Task, window_names, window_parts, window_slice
 from validation.metrics.cameras import (
+    AUC_DEG,
     TrueCameras,
     measure_cameras,
     measure_reprojection,
     pose_pair_errors,
+    pose_scores_pct,
 )
-from validation.metrics.poses import AUC_DEG, pose_scores_pct
 from validation.runs.records import IMAGE_SCENES, ReportOptions, load_images
 from validation.scenes.many_views import load_yard, yard_number
 from validation.scenes.real import Scene
