@@ -52,14 +52,13 @@ def _colmap(folder: Path, model: SparseModel, *, pinhole: bool) -> Path:
     return folder / "sparse" / "0"
 
 
-_DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] = {
-    "colmap": lambda folder, model: (_colmap(folder, model, pinhole=False), []),
-    "opencv": lambda folder, model: (formats.write_opencv(folder, model), []),
-    "kalibr": formats.write_kalibr,
+_DISTORTED: Mapping[str, Callable[[Path, SparseModel], Path]] = {
+    "colmap": lambda folder, model: _colmap(folder, model, pinhole=False),
+    "opencv": formats.write_opencv,
 }
 """Formats of cameras with distortion, which need no images."""
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
-_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
+_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye")}
 """Lenses that a format has; others have all, or no distortion."""
 _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
@@ -72,7 +71,6 @@ _FILES: Mapping[str, Sequence[str]] = {
     "nerfstudio": ("transforms.json", "points.ply"),
     "openmvs": ("scene.mvs",),
     "opencv": ("poses.yml", "camera_[0-9]*.yml"),
-    "kalibr": ("camchain.yaml",),
 }
 """Files of each format beside images and masks."""
 FORMATS = (*_PINHOLE, *_DISTORTED)
@@ -94,7 +92,7 @@ def export(
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
         cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
-        ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion.
+        ``"colmap"`` and ``"opencv"`` keep the distortion.
     images : path or mapping of str to path, optional
         Folder of the original images, or their files by name; None: those that the run was made from. Those
         of a COLMAP model are used as stored, without EXIF rotation.
@@ -126,9 +124,9 @@ def export(
     >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> view = SparseView("a.jpg", np.eye(3), np.zeros(3), K, (640, 480), np.array([-0.1, 0, 0]))
     >>> with TemporaryDirectory() as folder:
-    ...     report = export(SparseModel([view]), folder, to="kalibr")
+    ...     report = export(SparseModel([view]), folder, to="opencv")
     >>> report.file.name
-    'camchain.yaml'
+    'poses.yml'
     """
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
@@ -152,8 +150,7 @@ def export(
     notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
     if to in _DISTORTED:
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
-            file, more = _DISTORTED[to](folder, model)
-        return ExportReport(file, (*notes, *more))
+            return ExportReport(_DISTORTED[to](folder, model), tuple(notes))
     undistorted, pinholes = _undistorted(model)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     if divided:
