@@ -9,7 +9,7 @@ from tests.metric.metric_stage import centre_error, run, scatter, with_xy
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric import _adjustment, _model
-from thesisrecon.metric._checks import check_views, self_check, triangulable_observations
+from thesisrecon.metric._checks import check_views, self_check, triangulable_observations, weakest_join
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
@@ -83,6 +83,12 @@ def test_a_right_model_is_not_doubted_whatever_its_start_was():
     assert doubts_of(model, scene, aspect=0.04)[1] == []
     (only,) = doubts_of(model, scene, aspect=0.062)[1]
     assert only.startswith("The aspect ratio of the pixels is determined only to 6%")
+
+
+def test_images_without_common_inliers_have_no_weakest_join():
+    model = setting()[2]
+    alone = replace(model, inlier=model.tracks.view_index == 0)
+    assert weakest_join(alone, np.ones(len(model.inlier), dtype=bool)) is None
 
 
 @pytest.mark.parametrize("views", [[0], [5], [1, 6]])

@@ -211,6 +211,8 @@ def _inputs(caller: str, run: Run, old: RunResult, images: Any) -> _images.Image
         inputs = _images.ImageSet((*(order[name] for name in names), *new), more.refused)
         if run.masks_folder is not None:
             inputs, _ = _images.add_masks(inputs, run.masks_folder, map_all=run.workers.map_all)
+        if run.config.images.static == "mask":
+            inputs, _ = _images.mask_static(inputs, map_all=run.workers.map_all)
     run.images_elsewhere |= _images.files_by_name(images)
     run.finish(
         "images", counts={"read": len(inputs.decoded), "refused": len(more.refused), "added": len(new)}

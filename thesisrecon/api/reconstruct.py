@@ -168,6 +168,10 @@ def _read_inputs(run: Run, images: Any, masks: Path | None) -> _images.ImageSet:
         unused: list[str] = []
         if masks is not None:
             inputs, unused = _images.add_masks(inputs, masks, map_all=run.workers.map_all)
+        given = sum(image.mask is not None for image in inputs.images)
+        static: list[str] = []
+        if run.config.images.static == "mask":
+            inputs, static = _images.mask_static(inputs, map_all=run.workers.map_all)
     found, refused = len(inputs.decoded), len(inputs.refused)
     if found + refused == 0:
         raise UsageError("the list of images is empty")
@@ -176,8 +180,9 @@ def _read_inputs(run: Run, images: Any, masks: Path | None) -> _images.ImageSet:
     # The masks of frames that were not chosen are no mistake.
     warnings += unused if not counts else []
     warnings += _exif_warnings(run.config.intrinsics, inputs.exif_focal_px)
+    warnings += static
     masked = sum(image.mask is not None for image in inputs.images)
-    warnings += [_images.USELESS_MASKS] if masks is not None and inputs.images and not masked else []
+    warnings += [_images.USELESS_MASKS] if masks is not None and inputs.images and not given else []
     counts |= {"read": found, "refused": refused} | ({"masked": masked} if masked else {})
     run.finish("images", counts=counts, warnings=warnings)
     return inputs

@@ -277,6 +277,9 @@ class ImageOptions:
         too; 0: they determine the frame alone.
     up : {"none", "auto"}
         "auto": without GPS the model is turned until z is up, by the horizontal sides of the images.
+    static : {"mask", "keep"}
+        "mask": leave out pixels that look the same at the same place in most of at least four images while
+        others move: a text, a part of the vehicle, the room around a turntable.
     """
 
     max_size_px: int = 1600
@@ -285,6 +288,7 @@ class ImageOptions:
     gps: bool = False
     gps_std_m: float = 0.0
     up: Literal["none", "auto"] = "none"
+    static: Literal["mask", "keep"] = "mask"
 
     def __post_init__(self) -> None:
         require_range(self, max_size_px="[64, inf)", part_views="[0, inf)", gps_std_m="[0, inf)")

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, U8, eight_bit, image_levels
 from thesisrecon.errors import Notice, StageFailure, UsageError
+from thesisrecon.imaging.static import static_pixels
 from thesisrecon.io import _pixels
 from thesisrecon.io._files import (
     IMAGE_NAME_RULE,
@@ -543,6 +544,22 @@ def add_masks(
         return with_digest(replace(decoded, image=image))
 
     return replace(inputs, decoded=tuple(map_all(masked, list(inputs.decoded)))), unused
+
+
+def mask_static(inputs: ImageSet, *, map_all: MapAll = map) -> tuple[ImageSet, list[str]]:
+    """Leave the static pixels out of the masks; return also a warning if there are any."""
+    found = static_pixels(inputs.images, map_all=map_all)
+    if not found:
+        return inputs, []
+    decoded = list(inputs.decoded)
+    for n, static in found.items():
+        image = decoded[n].image
+        kept = ~static if image.mask is None else image.mask & ~static
+        # Nothing may be left of an image that has a mask of the static part.
+        if kept.any():
+            decoded[n] = with_digest(replace(decoded[n], image=replace(image, mask=kept)))
+    share = 100.0 * float(np.median([static.mean() for static in found.values()]))
+    return replace(inputs, decoded=tuple(decoded)), [Notice("static-pixels", share, len(found))]
 
 
 def read_mask(path: Path, image: Image, *, as_stored: bool = False) -> B8 | None:

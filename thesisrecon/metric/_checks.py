@@ -155,6 +155,8 @@ def weakest_join(model: _model.MetricEstimate, near: B8) -> Join | None:
     view, point, inlier = np.searchsorted(views, t.view_index[k]), t.point_index[k], model.inlier[k]
     both = scipy.sparse.csr_matrix(common_points(view, point, len(views)))
     agree = scipy.sparse.triu(common_points(view[inlier], point[inlier], len(views)), 1).tocoo()
+    if not agree.nnz:
+        return None
     weight = agree.data**2 / np.asarray(both[agree.row, agree.col]).ravel()
     # Of least distances 1 / weight, since the tree of scipy is the minimum one.
     graph = scipy.sparse.csr_matrix((1.0 / weight, (agree.row, agree.col)), both.shape)
