@@ -95,7 +95,8 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
         if run.workers.threads == 1:
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
-        colors, affine, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
+        colors, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
+        affine = made("the affine points", lambda: _affine(result), warnings, None)
         model = made("the model in report.html", for_page.result, warnings, None)
         depths = made("a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]())
         page = ReportData.of(
@@ -128,7 +129,7 @@ def save_result(result: RunResult, folder: Path, *, overwrite: bool) -> None:
                     write_atomically(folder / path.relative_to(out), path.read_bytes())
             return
         _write_records(RunDirectory(folder), result)
-        warnings = _write_exports(RunDirectory(folder), result)[2]
+        _, warnings = _write_exports(RunDirectory(folder), result)
     if lost := [text for text in warnings if text.startswith(NOT_MADE)]:
         raise UsageError("; ".join(lost))
 
@@ -176,24 +177,25 @@ def _write_records(directory: RunDirectory, result: RunResult) -> None:
 
 def _write_exports(
     directory: RunDirectory, result: RunResult, max_mb: float = SurfaceModel.max_glb_mb, threads: int = 1
-) -> tuple[U8 | None, Reconstruction | None, list[str]]:
-    """Write points and model, each file on its own; return colours, affine points, warnings."""
+) -> tuple[U8 | None, list[str]]:
+    """Write points and model, each file on its own; return colours and warnings."""
     if result.metric is None:
-        return None, None, []
+        return None, []
     warnings: list[str] = []
     metric, images = result.metric.reconstruction, result.images
-    projective, calibration = result.projective, result.calibration
     grey = np.full((len(metric.X), 3), 128, dtype=np.uint8)
     colors = made("the colours of points.ply", lambda: point_colors(metric, images), warnings, grey)
     points, shown = metric.X[metric.valid, :3] / metric.X[metric.valid, 3:], colors[metric.valid]
     path = directory.path / "points.ply"
     made(path.name, lambda: write_point_cloud(path, points, shown), warnings, None)
     _write_model(directory, result, colors, warnings)
-    affine: Reconstruction | None = None
-    if projective is not None and calibration is not None:
-        plane = calibration.plane_at_infinity
-        affine = made("the affine points", lambda: upgrade_to_affine(projective, plane), warnings, None)
-    return colors, affine, warnings + _write_surface(directory, result, max_mb, threads)
+    return colors, warnings + _write_surface(directory, result, max_mb, threads)
+
+
+def _affine(result: RunResult) -> Reconstruction | None:
+    if result.metric is None or result.projective is None or result.calibration is None:
+        return None
+    return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
 
 
 def _failure_warnings(result: RunResult) -> list[str]:
