@@ -17,6 +17,7 @@ from thesisrecon import Camera, UsageError, export, reconstruct
 from thesisrecon.api import export as export_module
 from thesisrecon.cli.commands import run_command
 from thesisrecon.io import _images
+from thesisrecon.io._models import read_model
 from thesisrecon.io._pixels import MemoryBudget
 from thesisrecon.lens import lens_row
 from thesisrecon.results import SparseModel, SparseView
@@ -207,16 +208,42 @@ def test_undistorted_exports_project_known_points(tmp_path, images, to, read, sk
         assert np.abs(error.mean(axis=0)).max() < 0.2
 
 
-@pytest.mark.parametrize("to", ["colmap-undistorted", "nerfstudio"])
-def test_wide_images_are_divided_into_pinhole_images(tmp_path, images, to):
+FISHEYE_K = np.array([[58.0, 0, 79.0], [0, 58.0, 60.0], [0, 0, 1]])
+
+
+def test_fisheye_images_keep_their_lens_in_nerfstudio(tmp_path, images):
+    k = np.array([-0.02, 0.003, 0.001, -0.0005])
+    model = make_model(BARREL, BARREL)
+    row = lens_row("fisheye", k)
+    model = replace(model, views=[replace(v, K=FISHEYE_K, distortion=row) for v in model.views])
+    export(model, tmp_path / "out", to="nerfstudio", images=images)
+    head = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
+    assert head["camera_model"] == "OPENCV_FISHEYE"
+    assert [head[name] for name in ("k1", "k2", "k3", "k4", "p1", "p2")] == [*k, 0.0, 0.0]
+    read = {view.name: view for view in read_model(tmp_path / "out" / "transforms.json").views}
+    for view in model.views:
+        found = read[Path(WRITTEN[view.name]).as_posix()]
+        for name in ("R", "t", "K", "distortion"):
+            np.testing.assert_allclose(getattr(found, name), getattr(view, name), atol=1e-12)
+        given = pixels_of(images / view.name)
+        off = np.abs(pixels_of(tmp_path / "out" / "images" / found.name).astype(int) - given)
+        assert off.max() <= (0 if WRITTEN[view.name].endswith("png") else 8)
+
+
+@pytest.mark.parametrize(("to", "lens"), [
+    ("colmap-undistorted", "fisheye"), ("nerfstudio", "thin-prism-fisheye"),
+])  # fmt: skip
+def test_wide_images_are_divided_into_pinhole_images(tmp_path, images, to, lens):
     pytest.importorskip("pycolmap")
     read = {"colmap-undistorted": read_colmap, "nerfstudio": read_nerfstudio}[to]
     model, rng = make_model(BARREL, BARREL), np.random.default_rng(5)
-    K, lens = np.array([[58.0, 0, 79.0], [0, 58.0, 60.0], [0, 0, 1]]), lens_row("fisheye", np.array([-0.02]))
+    # Nerfstudio has no decentred fisheye lens.
+    k = np.array([-0.02, 0.0, 1e-5 if lens != "fisheye" else 0.0, 0.0])
+    K, row = FISHEYE_K, lens_row(lens, k)
     X = rng.normal(size=(300, 3))
     X *= 6.0 / np.linalg.norm(X, axis=1, keepdims=True)
-    views = [replace(v, K=K, distortion=lens, t=0.1 * v.t, R=v.R) for v in model.views]
-    true = [Camera(K, v.R, v.t, SIZE, np.array([-0.02]), lens="fisheye") for v in views]
+    views = [replace(v, K=K, distortion=row, t=0.1 * v.t, R=v.R) for v in model.views]
+    true = [Camera(K, v.R, v.t, SIZE, k, lens=lens) for v in views]
     xy = np.stack([one.project(X) for one in true])
     angle = [np.arccos((X @ one.R.T + one.t)[:, 2] / np.linalg.norm(X - one.centre, axis=1)) for one in true]
     seen = (xy > 2.0).all(axis=2) & (xy < np.array(SIZE) - 3.0).all(axis=2) & (np.array(angle) < 1.9)

@@ -92,7 +92,7 @@ def export(
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
         cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
-        ``"colmap"`` and ``"opencv"`` keep the distortion.
+        ``"colmap"`` and ``"opencv"`` keep the distortion, ``"nerfstudio"`` if all lenses are ``"fisheye"``.
     images : path or mapping of str to path, optional
         Folder of the original images, or their files by name; None: those that the run was made from. Those
         of a COLMAP model are used as stored, without EXIF rotation.
@@ -151,7 +151,8 @@ def export(
     if to in _DISTORTED:
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
             return ExportReport(_DISTORTED[to](folder, model), tuple(notes))
-    undistorted, pinholes = _undistorted(model)
+    native = to == "nerfstudio" and formats.is_fisheye(model)
+    undistorted, pinholes = _undistorted(model, keep_lens=native)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     if divided:
         gave = f"the {len(model.views)} images gave {len(undistorted.views)} pinhole images"
@@ -259,10 +260,10 @@ class _Pinhole(NamedTuple):
     turn: F64 | None
 
 
-def _undistorted(model: SparseModel) -> tuple[SparseModel, list[list[_Pinhole]]]:
+def _undistorted(model: SparseModel, *, keep_lens: bool = False) -> tuple[SparseModel, list[list[_Pinhole]]]:
     """The model with pinhole views, observations in their pixels, and names of files that can be written.
 
-    Also the same views by image.
+    Also the same views by image. With ``keep_lens`` only the names differ from those of the model.
     """
     frames: dict[tuple[bytes, bytes, object], tuple[F64, tuple[int, int]]] = {}
     views, xy, view_index = list[SparseView](), model.xy.copy(), model.view_index.copy()
@@ -270,6 +271,10 @@ def _undistorted(model: SparseModel) -> tuple[SparseModel, list[list[_Pinhole]]]
     rows = rows_of_views(model.view_index, len(model.views))
     for i, view in enumerate(model.views):
         K, size, distortion = view.intrinsics
+        if keep_lens:
+            views.append(replace(view, name=_file_name(view.name)))
+            pinholes.append([_Pinhole(views[-1], None)])
+            continue
         if is_wide(K, size, distortion):
             faces = _faces(view)
             xy[rows[i]], number = _in_faces(view, faces, xy[rows[i]])
@@ -397,8 +402,9 @@ def _write_images(
                 mask = _images.read_mask(file, image, as_stored=model.as_stored)
             for pinhole in pinholes[i]:
                 rgb, used = image.rgb, mask
-                pinhole_K, pinhole_size, _ = pinhole.view.intrinsics
-                if distortion.any() or size != pinhole_size or not np.array_equal(K, pinhole_K):
+                pinhole_K, pinhole_size, lens = pinhole.view.intrinsics
+                bent = distortion.any() and not np.array_equal(distortion, lens)
+                if bent or size != pinhole_size or not np.array_equal(K, pinhole_K):
                     frames = K, distortion, pinhole_K, pinhole_size
                     rgb, seen = undistort_image(rgb, *frames, turn=pinhole.turn)
                     used = seen if pinhole.turn is not None else None

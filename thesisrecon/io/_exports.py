@@ -20,7 +20,7 @@ import PIL.Image
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import POSE_STDS, Camera
 from thesisrecon.errors import UsageError
-from thesisrecon.io._colmap import PIXEL_CENTRE
+from thesisrecon.io._colmap import PIXEL_CENTRE, has_skew
 from thesisrecon.io._files import write_atomically, write_json, write_text
 from thesisrecon.io._models import LOOKS_BACK
 from thesisrecon.lens import named_lens
@@ -33,13 +33,14 @@ def mask_name(to: str, image: str) -> str:
 
 
 def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
-    """Write ``transforms.json`` (camera-to-world with OpenGL axes) and ``points.ply`` of pinhole views."""
-    cameras = []
+    """Write ``transforms.json`` (camera-to-world, OpenGL axes) and ``points.ply``; lenses may be fisheye."""
+    cameras, fisheye = [], is_fisheye(model)
     for view in model.views:
-        K, (width, height), _ = view.intrinsics
+        K, (width, height), lens = view.intrinsics
         cx, cy = (K[:2, 2] + PIXEL_CENTRE).tolist()
         known = {"w": width, "h": height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": cx, "cy": cy}
-        cameras.append(known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0))
+        k = dict(zip(("k1", "k2", "k3", "k4"), named_lens(lens)[1].tolist(), strict=True)) if fisheye else {}
+        cameras.append(known | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0) | k)
     shared = all(camera == cameras[0] for camera in cameras)
     frames = []
     for view, camera in zip(model.views, cameras, strict=True):
@@ -49,10 +50,17 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
         if masked:
             own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
         frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
-    head = {"camera_model": "OPENCV", **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
+    kind = "OPENCV_FISHEYE" if fisheye else "OPENCV"
+    head = {"camera_model": kind, **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
     write_point_cloud(folder / "points.ply", model.X, model.point_colors)
     write_json(folder / "transforms.json", {**head, "frames": frames})
     return folder / "transforms.json"
+
+
+def is_fisheye(model: SparseModel) -> bool:
+    """Whether all lenses of a model are those of nerfstudio's fisheye cameras."""
+    every = (view.intrinsics for view in model.views)
+    return all(named_lens(lens)[0] == "fisheye" and not has_skew(K) for K, _, lens in every)
 
 
 def write_openmvs(folder: Path, model: SparseModel) -> Path:
