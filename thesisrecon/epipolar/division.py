@@ -38,7 +38,8 @@ MAX_MAGNIFICATION = 5.0
 """Points beyond this magnification, 60 degrees or more off the axis, wait for the metric stage."""
 LEAST = 0.1
 """Smaller lenses are found in the metric stage: two deviations of the prior of k1 at 90 degrees."""
-MIN_MATCHES, MAX_MATCHES, MAX_PAIRS, FEW_PAIRS, MIN_PAIRS = 40, 600, 12, 4, 3
+MIN_MATCHES, FEW_MATCHES, MAX_MATCHES = 40, 300, 600
+MAX_PAIRS, FEW_PAIRS, MIN_PAIRS = 12, 4, 3
 MAX_ROUNDS = 8  # estimates of the noise, which falls while the lens is refined
 TABLE = 4096  # radii at which the inverse of the straightening is tabulated
 
@@ -120,8 +121,8 @@ def estimate_division(matches: Sequence[Matches], sizes: I64, rng: Generator) ->
 
 
 def is_nearly_straight(matches: Sequence[Matches], sizes: I64, rng: Generator) -> bool:
-    """Whether a few pairs of images of one camera show that its lens bends little."""
-    pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, FEW_PAIRS)]
+    """Whether a few matches of few pairs of images of one camera show that its lens bends little."""
+    pairs = [_sampled(m, sizes, rng, FEW_MATCHES) for m in _chosen_pairs(matches, FEW_PAIRS)]
     return _small_lens(pairs, rng) is not None
 
 
@@ -150,8 +151,8 @@ def _chosen_pairs(matches: Sequence[Matches], wanted: int) -> list[Matches]:
     return chosen
 
 
-def _sampled(m: Matches, sizes: I64, rng: Generator) -> _Pair:
-    some, ends = rng.permutation(len(m.xy1))[:MAX_MATCHES], sizes[[m.i, m.j]]
+def _sampled(m: Matches, sizes: I64, rng: Generator, most: int = MAX_MATCHES) -> _Pair:
+    some, ends = rng.permutation(len(m.xy1))[:most], sizes[[m.i, m.j]]
     half = _half_diagonal(ends)
     return _Pair(
         (np.stack([m.xy1[some], m.xy2[some]]) - (ends[:, None] - 1.0) / 2.0) / half[:, None], half[:, 0]

@@ -7,7 +7,7 @@ predicts held-out observations far better.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -255,6 +255,18 @@ def predicts_better(
         return False
     gain = costs[0] - costs[1]
     return bool(gain.mean() > 3.0 * gain.std() / np.sqrt(len(gain)))
+
+
+def best_predictor(models: Sequence[MetricEstimate], adjustment: MetricAdjustment) -> MetricEstimate:
+    """The model that predicts held-out observations best: some of the inliers of any of the models.
+
+    Models that image less of the scene do not choose the observations by which they are judged.
+    """
+    unit = min(models, key=lambda model: model.sigma_px)
+    if len(models) == 1:
+        return unit
+    held = held_out_observations(replace(unit, inlier=np.any([m.inlier for m in models], axis=0)))
+    return min(models, key=lambda m: float(_held_out_cost(m, adjustment, held, unit).sum()))
 
 
 def _held_out_costs(

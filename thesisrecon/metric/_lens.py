@@ -11,7 +11,7 @@ from thesisrecon.arrays import B8
 from thesisrecon.errors import Notice
 from thesisrecon.lens import ANGLE, DIVISION, directions_of_image
 from thesisrecon.metric import _model
-from thesisrecon.metric._adjustment import MetricAdjustment, predicts_better
+from thesisrecon.metric._adjustment import MetricAdjustment, best_predictor, predicts_better
 from thesisrecon.metric._model import BASES, FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
 from thesisrecon.optimize.bundle.identifiability import TOLERANCES
 from thesisrecon.optimize.bundle.projection import LENS
@@ -26,7 +26,7 @@ FORWARD = float(np.cos(np.radians(10.0)))  # cosine of the angle of a forward mo
 def with_best_lens(
     model: MetricEstimate, adjustment: MetricAdjustment
 ) -> tuple[MetricEstimate, MetricAdjustment]:
-    """The model with the lens that the user sets, or of least cost; radial if images are nearly straight.
+    """The model with the lens that the user sets, or that predicts best; radial if images hardly bend lines.
 
     A lens that is not given is decentred if that predicts held-out observations better.
     """
@@ -37,8 +37,7 @@ def with_best_lens(
     if given != "auto":
         bends = np.ones_like(bends)
     models = [_settled(with_lens(start, bends, base), adjustment) for base in BASES[given]]
-    gate = LATE_SIGMAS * min(m.gate_px for m in models)
-    best = min(models, key=lambda m: _model.truncated_cost(m, gate))
+    best = best_predictor(models, adjustment)
     if given not in ("auto", "brown") or (best.cameras.intrinsics[:, LENS] == DIVISION).any():
         return best, adjustment
     free = replace(adjustment, decentred=True)
