@@ -13,12 +13,15 @@ from scipy.spatial.transform import Rotation
 from thesisrecon import Camera, reconstruct, reconstruct_from_tracks
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.division import bend, estimate_division, is_nearly_straight, is_straight, straighten
+from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.imaging.resampling import resampled
 from thesisrecon.io._images import read_image
 from thesisrecon.io._models import read_model
 from thesisrecon.lens import DIVISION, PERSPECTIVE, image_of_directions, lens_row
 from thesisrecon.pipeline.inputs import given_tracks, views_of
+from thesisrecon.pipeline.lens import StraightFrame
+from thesisrecon.records import Image
 
 FIXTURES = Path(__file__).parents[2] / "fixtures"
 SIZE = (1000, 750)
@@ -28,6 +31,7 @@ LENSES: dict[str, tuple[Any, list[float], float]] = {
     "slight": ("radial", [-0.05], 800.0),
     "radial": ("radial", [-0.2, 0.04], 520.0),
     "fisheye": ("fisheye", [-0.02, 0.001], 380.0),
+    "division": ("division", [-0.25], 420.0),
     "decentred": ("thin-prism-fisheye", [-0.02, 0.001, 0.002, -0.0015], 380.0),
     "slight-decentred": ("brown", [-0.05, 0.01, -0.0015, 0.002], 700.0),
 }
@@ -122,8 +126,17 @@ def test_straight_positions_have_an_inverse(k: list[float]) -> None:
     np.testing.assert_allclose(magnification[near], slope, rtol=1e-5)
 
 
+def test_a_straight_image_has_corners_of_the_scales_of_its_image() -> None:
+    rgb = np.random.default_rng(3).integers(0, 256, (240, 320, 3)).astype(np.uint8).repeat(2, 0).repeat(2, 1)
+    image = Image("a.png", rgb, (1280, 960))
+    straight = StraightFrame.of(image.size, np.array([-0.6, -0.1, DIVISION])).image(image)
+    assert max(straight.size) > 1000 > max(image.size)
+    scales = [np.unique(MultiScaleCorners().detect(one).scale) for one in (image, straight)]
+    np.testing.assert_array_equal(*scales)
+
+
 @pytest.mark.parametrize(("lens", "views", "given"), [
-    ("radial", 18, "auto"), ("fisheye", 12, "auto"), ("decentred", 12, "auto"),
+    ("radial", 18, "auto"), ("division", 12, "auto"), ("fisheye", 12, "auto"), ("decentred", 12, "auto"),
     ("slight-decentred", 24, "brown"), ("slight", 24, "fisheye"),
 ])  # fmt: skip
 def test_cameras_of_a_room_without_a_prior(lens: str, views: int, given: str) -> None:

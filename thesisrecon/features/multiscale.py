@@ -116,7 +116,7 @@ class MultiScaleCorners:
 
     # Number of seeds at the finest level; each further level has 1/sqrt(2) as many.
     seeds_per_level = 1400
-    # Long side below which the image is doubled.
+    # Long side below which the image, or that which was enlarged to it, is doubled.
     upsample_below_px = 1000
     # Compressions of the simulated views that give seeds for pairs with a wide baseline (ASIFT).
     oblique_tilts: ClassVar[tuple[float, ...]] = (1.414, 2.828)
@@ -153,7 +153,7 @@ class MultiScaleCorners:
         return np.arange(min(count, len(xy)), dtype=np.int64)
 
     def _pyramid(self, image: Image) -> list[_PyramidLevel]:
-        doubled = max(image.size) < self.upsample_below_px
+        doubled = self._is_small(image)
         grays, scales = _image_pyramid(image.gray, self.levels, doubled=doubled)
         colours = [grays]
         if self.measure.colour:
@@ -161,6 +161,9 @@ class MultiScaleCorners:
             colours = [_image_pyramid(plane, self.levels, doubled=doubled)[0] for plane in planes]
         channels = [np.stack(size) for size in zip(*colours, strict=True)]
         return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]
+
+    def _is_small(self, image: Image) -> bool:
+        return max(image.size) < self.upsample_below_px * max(image.scale, 1.0)
 
     def _seeds(self, levels: list[_PyramidLevel], found: list[tuple[F64, F32]]) -> Seeds:
         upright, turned = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
@@ -176,7 +179,7 @@ class MultiScaleCorners:
 
     def oblique_seeds(self, image: Image) -> Seeds:
         """Seeds of simulated oblique views, in the orientation of the image and rotated to their gradient."""
-        enlargement = 2.0 if max(image.size) < self.upsample_below_px else 1.0
+        enlargement = 2.0 if self._is_small(image) else 1.0
         views = oblique_views(image.gray, self.oblique_tilts, enlargement)
         parts = [self._seeds_of_view(view, image.size) for view in views]
         none = np.empty(0, np.float32)

@@ -109,7 +109,7 @@ class StraightFrame:
         return bend(xy - self.shift, np.array(self.of_image), self.lens)
 
     def image(self, image: Image) -> Image:
-        """The straight image, with a mask of what it sees."""
+        """The straight image, with a mask of what it sees; it has more pixels, not more detail."""
         width = float(self.size[0])
 
         def lookup(rows: range) -> F64:
@@ -117,7 +117,7 @@ class StraightFrame:
             return self.bent(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(*x.shape, 2)
 
         rgb, seen = resampled(image.levels, lookup, self.size)
-        return Image(image.name, rgb, self.size, seen)
+        return Image(image.name, rgb, self.of_image, seen)
 
     def features(self, features: Features, *, straight: bool) -> Features:
         """Features of the image with positions in straight pixels, or the inverse."""
