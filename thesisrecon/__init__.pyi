@@ -15,7 +15,7 @@ from thesisrecon.config import PipelineConfig as PipelineConfig
 from thesisrecon.results import RunResult as RunResult
 
 # Two and three images
-from thesisrecon.api.features import detect_corners as detect_corners
+from thesisrecon.api.pairs import detect_corners as detect_corners
 from thesisrecon.api.pairs import match_pair as match_pair
 from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
 from thesisrecon.api.pairs import estimate_homography as estimate_homography

@@ -1,7 +1,7 @@
-"""Two and three images: matches, fundamental matrix, homography, trifocal tensor and epipolar lines."""
+"""One to three images: corners, matches, fundamental matrix, homography, trifocal tensor, epipolar lines."""
 
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.random import Generator
@@ -11,7 +11,8 @@ from PIL import ImageDraw
 
 from thesisrecon import arrays
 from thesisrecon.api.cameras import require_threshold, search_budget
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import F64, U8, number, whole_number
+from thesisrecon.config import Detector
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate, Method
@@ -20,11 +21,12 @@ from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.refinement import wrong_match_covariance
 from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, TrifocalFit, fit_trifocal
 from thesisrecon.errors import Notice, StageFailure, require_word
+from thesisrecon.features.harris import CornerMeasure, HarrisCorners
 from thesisrecon.geometry.homogeneous import unit_norm
 from thesisrecon.geometry.two_view import clip_line, lines_of_points
-from thesisrecon.io._images import eight_bit_images, read_image, read_pixels
+from thesisrecon.io._images import eight_bit_images, full_image, read_image, read_pixels
 from thesisrecon.pipeline.matching import ImageInput, match_images
-from thesisrecon.records import Image, TwoView
+from thesisrecon.records import Features, Image, TwoView
 
 
 def match_pair(
@@ -383,3 +385,57 @@ def _drawn(image: U8, lines: F64, xy: F64) -> U8:
         low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
         draw.ellipse((*low, *high), outline=colour, width=2 * thick)
     return np.asarray(picture.reduce(2))
+
+
+Formula = Literal["noble", "harris"]
+
+
+def detect_corners(
+    image: ImageInput, *, max_corners: int = 2000, threshold_rel: float = 0.002,
+    formula: Formula = "noble", detector: Detector | None = None,
+) -> Features:  # fmt: skip
+    """Detect the corners of Harris and Stephens in an image at full size (4.2.1).
+
+    Maxima of det M / trace M (Noble 1988) or det M - 0.04 (trace M)^2 (Harris and Stephens 1988) with M the
+    smoothed products of the grey gradient, refined to subpixels by a quadratic surface.
+
+    Parameters
+    ----------
+    image : path, ndarray (H, W), (H, W, 3) or (H, W, 4), or Image
+        The image.
+    max_corners : int
+        Largest number of corners; weaker ones within 0.4 % of the long side of a stronger one are left out.
+    threshold_rel : float
+        Smallest response relative to the largest.
+    formula : {"noble", "harris"}
+        Corner response.
+    detector : Detector, optional
+        Another detector, such as that of ``config.features.detector``; the other options are not used then.
+
+    Returns
+    -------
+    Features
+        Corners ``xy`` (N, 2) in pixels, strongest first, with ``response`` (N,) and ``scale`` (N,).
+
+    Raises
+    ------
+    ValueError
+        If the image or an option is invalid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import detect_corners
+    >>> image = np.zeros((60, 80), np.uint8)
+    >>> image[20:40, 30:60] = 200
+    >>> sorted(map(tuple, detect_corners(image).xy.round().astype(int).tolist()))  # by smoothing inside
+    [(31, 21), (31, 38), (58, 21), (58, 38)]
+    """
+    if detector is None:
+        whole_number("detect_corners", "max_corners", max_corners, 1)
+        number("detect_corners", "threshold_rel", threshold_rel)
+        require_word("formula", formula, get_args(Formula))
+        detector = HarrisCorners(max_corners, threshold_rel, measure=CornerMeasure(formula))
+    elif not callable(getattr(detector, "detect", None)):
+        raise ValueError(f"detect_corners needs a Detector or None as detector; got {detector!r}")
+    return detector.detect(full_image(*eight_bit_images(image)))
