@@ -279,7 +279,7 @@ def _width(prior: IntrinsicsPrior) -> int:
 def upgraded_model(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> MetricEstimate | None:
-    """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras remain.
+    """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras (of two: both) fit.
 
     Cameras C = K^-1 P H further than 0.3 from a scaled rotation (3 C C' / tr(C C') - I) are left out.
     """
@@ -288,7 +288,7 @@ def upgraded_model(
     rotations, translations, S = upgrade_cameras(reconstruction.P[views], upgrade.K[views], H)
     off = np.sqrt(np.sum((3.0 * S**2 / np.sum(S**2, axis=1, keepdims=True) - 1.0) ** 2, axis=1))
     good = off < 0.3
-    if good.sum() < 3:
+    if good.sum() < min(3, len(views)):
         return None
     n = len(reconstruction.P)
     R, t = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))

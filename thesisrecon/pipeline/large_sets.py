@@ -37,6 +37,7 @@ from thesisrecon.records import (
     Upgrade,
     common_points,
 )
+from thesisrecon.selfcalibration._upgrade import calibration_of_two_views
 
 CORE_VIEWS, MAX_CORES = 5, 8  # views of a core, and number of cores that are tried
 MAX_CUT, MIN_SIDE = 0.1, 0.3
@@ -54,6 +55,8 @@ def calibrate_with_core(
     method: SelfCalibrator, projective: Reconstruction, *, prior: IntrinsicsPrior, rng: np.random.Generator
 ) -> SelfCalibration:
     """Calibrate all views, else the first core of them that determines the calibration; other K are zero."""
+    if (known := calibration_of_two_views(projective, prior)) is not None:
+        return known
     found, failures = list[SelfCalibration](), list[StageFailure]()
     for part in chain([projective], (restrict_views(projective, views) for views in _cores(projective))):
         try:

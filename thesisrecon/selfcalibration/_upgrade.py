@@ -12,8 +12,11 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.geometry.relative_pose import pose_in_front
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
+from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.optimize.bundle import identifiability
 from thesisrecon.optimize.bundle.identifiability import CalibrationProblem
 from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
@@ -79,6 +82,32 @@ def identifiability_without_calibration(
         motion, evidence, identifiable=False, focal_std=given
     )
     return IdentifiabilityReport(False, motion, distance < 1.0, evidence, sentences)
+
+
+def calibration_of_two_views(
+    reconstruction: Reconstruction, prior: IntrinsicsPrior
+) -> SelfCalibration | None:
+    """The upgrade of two views of known focal length by their essential matrix (HZ 9.6); None: others."""
+    views = np.flatnonzero(reconstruction.registered)
+    if len(views) != 2 or not prior.focal_known[views].all():
+        return None
+    K = np.zeros((len(prior.mean), 3, 3))
+    K[views] = [
+        calibration_matrix(f, aspect * f, x, y, skew=skew) for f, aspect, skew, x, y, *_ in prior.mean[views]
+    ]
+    P = np.linalg.solve(K[views], reconstruction.P[views])
+    x1, x2 = (reconstruction.X[reconstruction.valid] @ camera.T for camera in P)
+    R, t, _ = pose_in_front(fundamental_from_cameras(*P), *(x / x[:, 2:] for x in (x1, x2)))
+    # [I 0] H = P1 and [R t] H = s P2, linear in H and s.
+    system = np.zeros((24, 17))
+    system[:12, :12] = np.eye(12)
+    system[12:, :16] = np.kron(np.column_stack([R, t]), np.eye(4))
+    system[12:, 16] = -P[1].ravel()
+    H = np.linalg.lstsq(system, np.concatenate([P[0].ravel(), np.zeros(12)]), rcond=None)[0][:16].reshape(
+        4, 4
+    )
+    only = Upgrade(H, K, 0.0, "known focal length of two views")
+    return SelfCalibration(H, K, np.full_like(K, np.nan), True, (), (only,))
 
 
 def _with_virtual_points(reconstruction: Reconstruction, upgrade: Upgrade) -> Reconstruction:

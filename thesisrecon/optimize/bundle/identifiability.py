@@ -320,7 +320,7 @@ def identifiability_report(
         and evidence["infinity_shift_beyond_roll"] >= MIN_INFINITY_SHIFT
     )
     determined = (
-        len(views) - len(undetermined) >= max(3, (len(views) + 1) // 2)
+        len(views) - len(undetermined) >= max(2 if known_focal else 3, (len(views) + 1) // 2)
         and excess >= 0
         and (has_rotated or known_focal)
     )
