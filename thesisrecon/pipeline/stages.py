@@ -234,6 +234,8 @@ def estimate_depth_maps(job: Job, r: Reconstruction) -> tuple[Sequence[DepthMap]
 
     # Cameras that did not move keep the depth maps of the run to which images were added.
     unmoved = run.directory.continues and job.given is not None and not job.given.refine
+    # Numbers of several views of one image change with the number of images.
+    unmoved &= max(order, default=0) < len(images)
     kept = run.directory.stage(FOLDERS["dense"]).keys() if unmoved else {}
     keys = {(item := f"{i:05d}"): kept.get(item) or run.key("dense", key, i) for i in order}
     maps = run.map_cached("dense", keys, _depths, estimated, max_bytes=MAP_BYTES)
