@@ -11,7 +11,7 @@ from tests.synthetic import disparity, one_by_one, photograph, sideways_fundamen
 from thesisrecon.features.harris import HarrisCorners
 from thesisrecon.features.multiscale import MultiScaleCorners
 from thesisrecon.matching._prepared import _corner_patches, prepare_image
-from thesisrecon.matching.growth import SeedsAndGrowth, _fit_local_affines, _match_guided
+from thesisrecon.matching.growth import SeedsAndGrowth, _fit_local_affines, match_guided
 from thesisrecon.matching.strength import (
     _displacement_weight,
     _relative_difference_weight,
@@ -102,7 +102,7 @@ def test_guided_matches_are_the_most_alike_of_all_that_are_allowed():
     xy1, xy2 = one.features.xy, two.features.xy
     predicted = np.tile(np.eye(2), (len(xy1), 1, 1)), xy1 - (14.0, 0.0), np.full(len(xy1), 12.0)
     F = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    index, score, second_best = _match_guided(
+    index, score, second_best = match_guided(
         one.pyramid, (xy1, one.features.scale), predicted, (xy2, two.features.scale, two.patches),
         two.cells, (F, np.full(len(xy1), 1.5), 0.7),
     )  # fmt: skip

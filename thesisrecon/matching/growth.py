@@ -129,7 +129,7 @@ def _solve_correction(
 
 
 @kernel
-def _match_guided(
+def match_guided(
     view1: tuple[F32, I64, float], corners1: tuple[F64, F32], predicted: tuple[F64, F64, F64],
     corners2: tuple[F64, F32, F32], grid2: tuple[float, I64, I64, I64], gate: tuple[F64, F64, float],
 ) -> tuple[I64, F32, F32]:  # fmt: skip
@@ -379,7 +379,7 @@ class SeedsAndGrowth:
         radius = np.clip(3.0 * spread, 0.004 * long_side, 0.025 * long_side)
         std = epipolar_distance_std(fit.F, fit.covariance, xy1, position)
         band = np.fmax(self.band_rel * long_side, 3.0 * std)  # HZ 11.11; NaN: a method without covariance
-        index, score, second_best = _match_guided(
+        index, score, second_best = match_guided(
             view1.pyramid, (xy1, scale1), (affine, position, radius),
             (view2.features.xy, view2.features.scale, view2.patches), view2.cells,
             (fit.F, band, MIN_CORRELATION),
@@ -396,7 +396,7 @@ def _unique_share(view1: PreparedImage, view2: PreparedImage, matches: Matches) 
     some = select_found(matches, np.arange(0, len(matches.xy1), 1 + len(matches.xy1) // UNIQUE_SAMPLE))
     n, (xy2, scale2) = len(some.xy1), (view2.features.xy, view2.features.scale)
     whole_image = np.full(n, 2.0 * view2.long_side)
-    best = _match_guided(
+    best = match_guided(
         view1.pyramid, (some.xy1, view1.features.scale[some.index1]), (some.affine, some.xy2, whole_image),
         (xy2, scale2, view2.patches), view2.cells, (np.zeros((3, 3)), np.zeros(n), MIN_CORRELATION),
     )[0]  # fmt: skip

@@ -116,7 +116,7 @@ def metric_cameras(
     if best.metric is None or best.calibration is None:
         raise failures[0]
     chosen = next(k for k, other in enumerate(tried) if other is best)
-    metric = stages.register_more(job, views, pairs, best.calibration, best.metric, chosen)
+    metric = stages.register_more(job, result.features, views, pairs, best.calibration, best.metric, chosen)
     job.run.cameras = job.known or stages.known_cameras(job.prior, metric)
     metric = join_left_over(job, replace(best, metric=metric), chosen)
     metric = stages.metric_in_world(job, metric, chosen)
@@ -128,7 +128,7 @@ def metric_cameras(
 
 def join_left_over(job: Job, result: RunResult, attempt: int) -> MetricResult:
     """Reconstruct groups left over, join those that share points and adjust; else the old model."""
-    run, metric, calibration = job.run, result.metric, result.calibration
+    run, metric, calibration, features = job.run, result.metric, result.calibration, result.features
     assert metric is not None
     assert calibration is not None
     model, item = metric.reconstruction, f"attempt-{attempt}"
@@ -147,7 +147,11 @@ def join_left_over(job: Job, result: RunResult, attempt: int) -> MetricResult:
                 others.append(stages.model_among(model, views, found.metric.reconstruction))
         rng = stream(run.seed, "metric", attempt, 2)
         joined = join_all(model, others, rng)
-        return metric if joined is model else stages.better_model(job, metric, joined, calibration, rng)
+        return (
+            metric
+            if joined is model
+            else stages.better_model(job, features, metric, joined, calibration, rng)
+        )
 
     keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(item)]
     variants = [run.variant_key(stage) for stage in ("projective", "selfcalibration", "metric")]
@@ -174,7 +178,7 @@ def attempt_cameras(
         start, known = as_imaged(part, tracks, job.prior), calibration
     else:
         start, known = aligned, from_metric(aligned, calibration)
-    yield replace(result, metric=stages.refine_metric(job, start, known, attempt, keys))
+    yield replace(result, metric=stages.refine_metric(job, result.features, start, known, attempt, keys))
 
 
 def last_result(stages: Iterator[RunResult], result: RunResult) -> tuple[RunResult, StageFailure | None]:

@@ -21,6 +21,7 @@ from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.triangulation import triangulate_observations
 from thesisrecon.imaging.on_demand import OnDemand
 from thesisrecon.io._models import east_north_up
+from thesisrecon.matching.look_alikes import swapped_pairs, swapped_sentence
 from thesisrecon.matching.pair_selection import reject_repeated_structure
 from thesisrecon.metric.given_cameras import metric_from_given
 from thesisrecon.metric.refinement import MetricRefinement
@@ -31,6 +32,7 @@ from thesisrecon.pipeline.matching import build_tracks
 from thesisrecon.pipeline.run import FOLDERS, Batch, Job, name_images, stream
 from thesisrecon.records import (
     DepthMap,
+    Features,
     HeldOut,
     IdentifiabilityReport,
     IntrinsicsPrior,
@@ -89,14 +91,32 @@ def self_calibrate(job: Job, projective: Reconstruction, attempt: int) -> SelfCa
 
 
 def refine_metric(
-    job: Job, start: Reconstruction, calibration: SelfCalibration, attempt: int, upstream: Sequence[str]
-) -> MetricResult:
+    job: Job, features: Sequence[Features], start: Reconstruction, calibration: SelfCalibration, attempt: int,
+    upstream: Sequence[str],
+) -> MetricResult:  # fmt: skip
     """Upgrade and refine a reconstruction, register the other views, and test the result (chapter 7)."""
-    prior, threads = job.prior, job.run.workers.threads
+    upstream = [
+        job.run.logs["selfcalibration"].keys[f"attempt-{attempt}"],
+        *upstream,
+        code_digest(swapped_pairs),
+    ]
     return _cached(
-        job, "metric", attempt, [job.run.logs["selfcalibration"].keys[f"attempt-{attempt}"], upstream],
-        lambda rng: job.config.metric.refine(start, calibration, prior=prior, rng=rng, threads=threads),
-    )  # fmt: skip
+        job, "metric", attempt, upstream, lambda rng: _refined(job, features, start, calibration, rng)
+    )
+
+
+def _refined(
+    job: Job, features: Sequence[Features], start: Reconstruction, calibration: SelfCalibration,
+    rng: np.random.Generator,
+) -> MetricResult:  # fmt: skip
+    """Refine; near images whose surroundings differ, of places that look alike, fail the self-check."""
+    threads = job.run.workers.threads
+    metric = job.config.metric.refine(start, calibration, prior=job.prior, rng=rng, threads=threads)
+    # The corners of images with a strong lens do not lie on the lines of pinhole cameras.
+    pairs = [] if job.prior.lens is not None else swapped_pairs(metric.reconstruction, job.images, features)
+    if not pairs:
+        return metric
+    return replace(metric, trusted=False, failed_checks=(*metric.failed_checks, swapped_sentence(pairs)))
 
 
 def metric_of_given(job: Job, tracks: Tracks, pairs: Sequence[TwoView]) -> MetricResult:
@@ -317,8 +337,8 @@ NAMES = ("focal_px", "aspect", "skew_px", "principal_x_px", "principal_y_px", "k
 
 
 def register_more(
-    job: Job, views: Sequence[Any], pairs: Sequence[TwoView], calibration: SelfCalibration,
-    metric: MetricResult, attempt: int,
+    job: Job, features: Sequence[Features], views: Sequence[Any], pairs: Sequence[TwoView],
+    calibration: SelfCalibration, metric: MetricResult, attempt: int,
 ) -> MetricResult:  # fmt: skip
     """Register missing images; return the old model if none is added or the new one is not trusted."""
     run, old = job.run, metric.reconstruction
@@ -329,7 +349,7 @@ def register_more(
     def register() -> MetricResult:
         rng = stream(run.seed, "metric", attempt, 1)
         tracks = build_tracks(job, views, more, rng)
-        return better_model(job, metric, cameras_on_tracks(old, tracks), calibration, rng)
+        return better_model(job, features, metric, cameras_on_tracks(old, tracks), calibration, rng)
 
     upstream = run.logs["metric"].keys[f"attempt-{attempt}"]
     key = run.key("metric", upstream, run.variant_key("tracks"), run.seed)
@@ -349,12 +369,12 @@ def pairs_of_missing(pairs: Sequence[TwoView], missing: B8) -> list[TwoView]:
 
 
 def better_model(
-    job: Job, old: MetricResult, start: Reconstruction, calibration: SelfCalibration, rng: np.random.Generator
-) -> MetricResult:
+    job: Job, features: Sequence[Features], old: MetricResult, start: Reconstruction,
+    calibration: SelfCalibration, rng: np.random.Generator,
+) -> MetricResult:  # fmt: skip
     """Refine ``start``: if it then has more images, all of the old ones, and is as trusted; else ``old``."""
-    known, threads = from_metric(start, calibration), job.run.workers.threads
     try:
-        new = job.config.metric.refine(start, known, prior=job.prior, rng=rng, threads=threads)
+        new = _refined(job, features, start, from_metric(start, calibration), rng)
     except StageFailure:
         return old
     before, after = old.reconstruction.registered, new.reconstruction.registered

@@ -1,0 +1,147 @@
+"""Images that a model places side by side although they show different sides, rooms or houses.
+
+Matches of places that look alike agree with one geometry, since nothing else of the images is matched. But
+two images from nearly the same direction show the same everywhere: corners of every textured part of one have
+a similar corner on their epipolar line in the other. If not, more often than on lines beside it, the places
+differ (missing correspondences: Zach, Irschara and Bischof, CVPR 2008).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import scipy
+
+from thesisrecon.arrays import B8, F64
+from thesisrecon.errors import Notice
+from thesisrecon.geometry.camera_matrix import camera_centre
+from thesisrecon.geometry.homogeneous import dehomogenize
+from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.matching._prepared import PreparedImage, prepare_image
+from thesisrecon.matching._seeds import nearest_neighbours
+from thesisrecon.matching.growth import match_guided
+from thesisrecon.records import Features, Image, Reconstruction, common_points
+
+MAX_TURN, MAX_ZOOM, MIN_COMMON = np.radians(12.0), 1.25, 40
+"""Images are near if the medians of the angles at their common points, of at least this number, and of the
+ratios of distances are at most these."""
+NEIGHBOURS, MOST = 4, 60  # images of most common points that each is compared with; pairs in all
+MIN_SIMILAR, MIN_CONTRAST = 0.8, 8.0  # correlation of a counterpart; standard deviation of textured windows
+GRID, MIN_CORNERS, MIN_SHARE = (6, 5), 15, 0.1
+"""Parts of an image along its sides, textured corners from which one counts, and the share of them that must
+have a counterpart, beyond the share on the lines beside."""
+MAX_DIFFERENT = 0.25
+"""Largest share of the parts without counterparts, of one of both images: at most 0.12 if right, of images
+of equal sides 0.33 and more."""
+MAX_NAMED = 6  # pairs that a sentence names
+
+
+def swapped_pairs(
+    model: Reconstruction, images: Sequence[Image], features: Sequence[Features]
+) -> list[tuple[int, int]]:
+    """Pairs of near images with different surroundings, for images most of whose near pairs are like that."""
+
+    @lru_cache(maxsize=8)
+    def view(v: int) -> PreparedImage:
+        return prepare_image(images[v], features[v])
+
+    near, found = _near_pairs(model), list[tuple[int, int]]()
+    for i, j, xy1, xy2 in near:
+        if len(features[i].xy) and len(features[j].xy):
+            one, two = view(i), view(j)
+            if _different(model, i, j, (one, two), (images[i], xy1, xy2)) and _different(
+                model, j, i, (two, one), (images[j], xy2, xy1)
+            ):
+                found.append((i, j))
+    counts = (
+        np.bincount([v for p in pairs for v in p[:2]], minlength=len(images)) for pairs in (near, found)
+    )
+    compared, different = counts
+    wrong = 2 * different > compared
+    return [(i, j) for i, j in found if wrong[i] or wrong[j]]
+
+
+def swapped_sentence(pairs: Sequence[tuple[int, int]]) -> Notice:
+    """The failed check of such pairs."""
+    named = "; ".join(f"#{i} and #{j}" for i, j in pairs[:MAX_NAMED])
+    more = f"; and {len(pairs) - MAX_NAMED} more pairs" if len(pairs) > MAX_NAMED else ""
+    return Notice("swapped-images", named + more)
+
+
+def _near_pairs(model: Reconstruction) -> list[tuple[int, int, F64, F64]]:
+    """Pairs of views that see their common points from nearly the same place, and these points in both."""
+    t, here = model.tracks, np.flatnonzero(model.registered)
+    k = np.flatnonzero(model.inlier & (model.registered[t.view_index] & model.valid[t.point_index]))
+    k = k[np.lexsort((t.point_index[k], t.view_index[k]))]
+    common = scipy.sparse.coo_array(common_points(t.view_index[k], t.point_index[k], t.n_views))
+    upper = (common.row < common.col) & (common.data >= MIN_COMMON)
+    i, j, count = common.row[upper], common.col[upper], common.data[upper]
+    rank = np.full(len(i), NEIGHBOURS)
+    for v in here:
+        own = np.flatnonzero((i == v) | (j == v))
+        order = own[np.argsort(-count[own], kind="stable")]
+        rank[order] = np.minimum(rank[order], np.arange(len(own)))
+    chosen = np.flatnonzero(rank < NEIGHBOURS)
+    chosen = chosen[np.lexsort((j[chosen], i[chosen]))]
+    C, X = np.zeros((t.n_views, 3)), dehomogenize(model.X)
+    C[here] = dehomogenize(camera_centre(model.P[here]))
+    rows = [k[t.view_index[k] == v] for v in range(t.n_views)]
+    found = []
+    for a, b in zip(i[chosen].tolist(), j[chosen].tolist(), strict=True):
+        point, one, two = np.intersect1d(t.point_index[rows[a]], t.point_index[rows[b]], return_indices=True)
+        rays = [X[point] - C[v] for v in (a, b)]
+        length = [np.linalg.norm(ray, axis=1) for ray in rays]
+        cosine = np.median(np.sum(rays[0] * rays[1], axis=1) / np.maximum(length[0] * length[1], 1e-300))
+        zoom = np.exp(abs(np.median(np.log(length[0] / length[1]))))
+        if cosine > np.cos(MAX_TURN) and zoom < MAX_ZOOM:
+            found.append((a, b, t.xy[rows[a][one]], t.xy[rows[b][two]]))
+    return found[:: 1 + len(found) // MOST]
+
+
+def _different(
+    model: Reconstruction, a: int, b: int, views: tuple[PreparedImage, PreparedImage],
+    common: tuple[Image, F64, F64],
+) -> bool:  # fmt: skip
+    """Whether textured parts of image a have no counterparts in image b."""
+    (one, two), (image, xy1, xy2) = views, common
+    xy, size, long_side = one.features.xy, np.array(one.size), two.long_side
+    # The common points predict where a corner is, to a tenth of the image.
+    design = np.column_stack([xy1, np.ones(len(xy1))])
+    plane = np.linalg.lstsq(design, xy2, rcond=None)[0]
+    rest = xy2 - design @ plane
+    place = xy @ plane[:2] + plane[2] + rest[nearest_neighbours(xy1, xy, 5)].mean(axis=1)
+    F = fundamental_from_cameras(model.P[a], model.P[b])
+    normal = np.column_stack([xy, np.ones(len(xy))]) @ F[:2].T
+    aside = np.median(normal * np.sign(normal @ np.median(normal, axis=0))[:, None], axis=0)
+    aside *= 0.05 * long_side / max(float(np.linalg.norm(aside)), 1e-300)
+    affine = np.tile(plane[:2].T, (len(xy), 1, 1))
+    limits = np.full(len(xy), 0.1 * long_side), np.full(len(xy), 0.006 * long_side)
+    similar = list[B8]()
+    for shift in (np.zeros(2), aside, -aside):
+        moved = F.copy()
+        moved[2] -= shift @ F[:2]
+        index = match_guided(
+            one.pyramid, (xy, one.features.scale), (affine, place + shift, limits[0]),
+            (two.features.xy, two.features.scale, two.patches), two.cells, (moved, limits[1], MIN_SIMILAR),
+        )[0]  # fmt: skip
+        similar.append(index >= 0)
+    inside = ((xy > 0.06 * size) & (xy < 0.94 * size)).all(axis=1)
+    inside &= ((place > 0.06 * np.array(two.size)) & (place < 0.94 * np.array(two.size))).all(axis=1)
+    use = inside & (_contrast(image, xy) > MIN_CONTRAST)
+    part = np.minimum((xy / size * GRID).astype(np.int64), np.array(GRID) - 1) @ [1, GRID[0]]
+    count, here, *beside = (
+        np.bincount(part[use & s], minlength=GRID[0] * GRID[1]) for s in (inside, *similar)
+    )
+    dense = count >= MIN_CORNERS
+    share = (here - np.maximum(*beside))[dense] / count[dense]
+    return bool((share < MIN_SHARE).sum() > MAX_DIFFERENT * len(share))
+
+
+def _contrast(image: Image, xy: F64) -> F64:
+    """Standard deviation (N,) of the grey levels around corners."""
+    gray = image.gray.astype(np.float64)
+    mean, square = (scipy.ndimage.uniform_filter(g, 9) for g in (gray, gray**2))
+    x, y = (np.clip(np.rint(xy[:, k]).astype(np.int64), 0, gray.shape[1 - k] - 1) for k in (0, 1))
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0))[y, x])
