@@ -51,14 +51,12 @@ def swapped_pairs(
     for i, j, xy1, xy2 in near:
         if len(features[i].xy) and len(features[j].xy):
             one, two = view(i), view(j)
-            if _different(model, i, j, (one, two), (images[i], xy1, xy2)) and _different(
-                model, j, i, (two, one), (images[j], xy2, xy1)
-            ):
+            there = _different(model, i, j, (one, two), (images[i], xy1, xy2))
+            if min(there, _different(model, j, i, (two, one), (images[j], xy2, xy1))) > MAX_DIFFERENT:
                 found.append((i, j))
-    counts = (
+    compared, different = (
         np.bincount([v for p in pairs for v in p[:2]], minlength=len(images)) for pairs in (near, found)
     )
-    compared, different = counts
     wrong = 2 * different > compared
     return [(i, j) for i, j in found if wrong[i] or wrong[j]]
 
@@ -103,8 +101,8 @@ def _near_pairs(model: Reconstruction) -> list[tuple[int, int, F64, F64]]:
 def _different(
     model: Reconstruction, a: int, b: int, views: tuple[PreparedImage, PreparedImage],
     common: tuple[Image, F64, F64],
-) -> bool:  # fmt: skip
-    """Whether textured parts of image a have no counterparts in image b."""
+) -> float:  # fmt: skip
+    """Share of the textured parts of image a that have no counterparts in image b."""
     (one, two), (image, xy1, xy2) = views, common
     xy, size, long_side = one.features.xy, np.array(one.size), two.long_side
     # The common points predict where a corner is, to a tenth of the image.
@@ -136,7 +134,7 @@ def _different(
     )
     dense = count >= MIN_CORNERS
     share = (here - np.maximum(*beside))[dense] / count[dense]
-    return bool((share < MIN_SHARE).sum() > MAX_DIFFERENT * len(share))
+    return float((share < MIN_SHARE).mean()) if len(share) else 0.0
 
 
 def _contrast(image: Image, xy: F64) -> F64:
