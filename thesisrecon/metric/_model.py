@@ -279,9 +279,10 @@ def _width(prior: IntrinsicsPrior) -> int:
 def upgraded_model(
     reconstruction: Reconstruction, upgrade: Upgrade, prior: IntrinsicsPrior
 ) -> MetricEstimate | None:
-    """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras (of two: both) fit.
+    """Upgrade a projective reconstruction to a metric model; None if fewer than three cameras fit.
 
-    Cameras C = K^-1 P H further than 0.3 from a scaled rotation (3 C C' / tr(C C') - I) are left out.
+    Of two cameras both must fit. Cameras C = K^-1 P H further than 0.3 from a scaled rotation
+    (3 C C' / tr(C C') - I) are left out.
     """
     views = np.flatnonzero(reconstruction.registered)
     H = upgrade.metric_from_projective
