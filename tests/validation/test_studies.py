@@ -26,7 +26,7 @@ from validation.runs.study import MODULES, OF_PAGES, load_study, run_studies, ru
 from validation.runs.tables import Metric
 from validation.scenes.real import load_fixture_scene
 from validation.stages import views as views_stage
-from validation.studies import benchmarks, subsets
+from validation.studies import benchmarks, look_alikes, subsets
 from validation.studies import growth_of_cost as growth
 from validation.studies.growth_of_cost import Meter, exponent
 from validation.studies.robustness import different, outputs
@@ -336,3 +336,10 @@ def test_an_image_is_left_out(tmp_path):
     bright = level[2].rgb, views[2].rgb
     seen = bright[1] > 40
     assert np.median(bright[0][seen] / bright[1][seen]) == pytest.approx(np.sqrt(0.9 / 1.1), abs=0.03)
+
+
+def test_look_alikes_are_counted_by_their_verdicts(monkeypatch):
+    monkeypatch.setattr(look_alikes, "verdict", lambda *scene: look_alikes.VERDICTS[scene[1]])
+    (table,) = look_alikes.look_alikes_study(kinds=["rooms"])
+    assert "| two equal rooms | 2 | 2 | 2 | 0 | 0 |" in table
+    assert len(look_alikes.SCENES) == 60
