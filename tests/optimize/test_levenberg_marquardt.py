@@ -142,3 +142,10 @@ def test_states_outside_the_domain_and_singular_systems_are_refused_not_raised(m
     monkeypatch.setattr(optimizer, "_MANY", 2)
     np.testing.assert_allclose(least_squares.invert_information(information), small[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(least_squares.invert_information(flat), small[1])
+
+
+@pytest.mark.parametrize("unit", [0.1, 1.0, 30.0])
+def test_the_trimmed_noise_is_that_of_the_normal_residuals_in_any_unit(unit):
+    residuals = np.abs(np.random.default_rng(0).normal(size=4000))
+    residuals[:200] = 50.0
+    assert least_squares.trimmed_noise_scale(unit * residuals, 3.0 * unit) == pytest.approx(unit, rel=0.05)
