@@ -85,6 +85,16 @@ class Kernel(CPUDispatcher):
 
     _cache: Any
 
+    def __call__(self, *args: Any) -> Any:
+        try:
+            return super().__call__(*args)
+        except SystemError as error:
+            # A signal that arrives in machine code raises when numba makes the result, which does not look.
+            first: BaseException = error
+            while first.__cause__ is not None:
+                first = first.__cause__
+            raise first from None
+
     def get_call_template(self, args: Any, kws: Any) -> Any:
         # For a kernel that calls this one; numba would compile a version for each literal argument.
         plain = {name: types.unliteral(kind) for name, kind in kws.items()}

@@ -1,11 +1,15 @@
 """Compiled kernels: a cache that is keyed by all their code, and no effect on what else numba compiles."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from thesisrecon._numba import kernel
 
 CALLEE = """
 from thesisrecon._numba import kernel
@@ -119,3 +123,29 @@ def test_an_entry_of_a_record_that_has_moved_is_compiled_again(package):
     assert run_in(package, code.replace("sys,", "sys, records_here as records,")) == ["4.0", "0"]
     (package / "records_here.py").rename(package / "records_there.py")
     assert run_in(package, code.replace("sys,", "sys, records_there as records,")) == ["4.0", "0"]
+
+
+@kernel
+def running_sums(x, steps):
+    out = np.zeros(len(x))
+    for _ in range(steps):
+        for k in range(len(x)):
+            out[k] = 0.5 * out[k] + x[k]
+    return out, out + 1.0
+
+
+def test_a_signal_during_a_kernel_arrives_as_itself():
+    x = np.ones(1000)
+    running_sums(x, 1)
+
+    def interrupt(*_):
+        raise KeyboardInterrupt("once")
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        with pytest.raises(KeyboardInterrupt, match="once"):
+            running_sums(x, 3_000_000)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

@@ -25,6 +25,7 @@ from thesisrecon.pipeline.matching import FromImages, ImageInput
 from thesisrecon.pipeline.outputs import CONFIG
 from thesisrecon.pipeline.run import Job, Progress, Run, RunOptions, start_run
 from thesisrecon.results import RunResult
+from thesisrecon.runtime._blas import one_blas_thread
 
 
 def reconstruct_with_cameras(
@@ -120,6 +121,7 @@ def add_images(
         return run_adopted(job, overwrite=False, source=source)
 
 
+@one_blas_thread()
 def localize(run: RunResult | str | Path, image: ImageInput, **options: Unpack[RunOptions]) -> Camera:
     """Find the camera of one image in the model of a finished run, which does not change.
 

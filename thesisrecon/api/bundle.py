@@ -54,6 +54,7 @@ from thesisrecon.optimize.bundle.projection import (
 from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Tracks
 from thesisrecon.results import RunResult
+from thesisrecon.runtime._blas import one_blas_thread
 
 Chosen = I64 | B8 | Sequence[int]  # Numbers of cameras or points, or a mask
 COLUMNS: Mapping[str, tuple[int, ...]] = {
@@ -105,6 +106,7 @@ class BundleAdjustment(Record):
         return np.asarray(np.where(seen, moved, np.diag([np.inf] * 3)))
 
 
+@one_blas_thread()
 def bundle_adjust(
     cameras: CameraInput, X: F64 | None = None, xy: F64 | Tracks | Observations | None = None, *,
     sizes: I64 | None = None, shared: bool | I64 = True, free: Sequence[str] = ("focal", "k1"),

@@ -14,6 +14,7 @@ from thesisrecon.errors import StageFailure, UsageError, require_word, unknown_w
 from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Reconstruction, SelfCalibration
+from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.selfcalibration.cheirality import CheiralitySearch, ModulusConstraint
 from thesisrecon.selfcalibration.kruppa import calibrate_from_fundamentals
 from thesisrecon.selfcalibration.stratified import Stratified, plane_from_vanishing_points, upgrade_to_affine
@@ -26,6 +27,7 @@ METHODS: Mapping[str, Callable[[], SelfCalibrator]] = {
 """Methods by name; the last two are "stratified" with different methods for the plane at infinity."""
 
 
+@one_blas_thread()
 def self_calibrate(
     reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
     xy: F64 | None = None, method: str | SelfCalibrator | None = None, config: Config | None = None,

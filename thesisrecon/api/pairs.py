@@ -27,8 +27,10 @@ from thesisrecon.geometry.two_view import clip_line, lines_of_points
 from thesisrecon.io._images import eight_bit_images, full_image, read_image, read_pixels
 from thesisrecon.pipeline.matching import ImageInput, match_images
 from thesisrecon.records import Features, Image, TwoView
+from thesisrecon.runtime._blas import one_blas_thread
 
 
+@one_blas_thread()
 def match_pair(
     image1: ImageInput, image2: ImageInput, *, config: Config | None = None, seed: int = 0
 ) -> TwoView:
@@ -188,6 +190,7 @@ def estimate_homography(
     return fit_homography(xy1, xy2, threshold_px, budget, arrays.generator("estimate_homography", seed))
 
 
+@one_blas_thread()
 def estimate_trifocal(
     xy1: F64 = NO_POINTS, xy2: F64 = NO_POINTS, xy3: F64 = NO_POINTS, *, segments: F64 = NO_SEGMENTS,
     threshold_px: float | None = 1.0, loss_px: float = 1.0, confidence: float = 0.9999,
@@ -260,6 +263,7 @@ def _search(threshold_px: float | None, confidence: float, max_samples: int) -> 
     return None if threshold_px is None else LocallyOptimisedRansac(threshold_px, *budget)
 
 
+@one_blas_thread()
 def estimate_fundamental(
     xy1: NDArray[np.float64], xy2: NDArray[np.float64], *, method: Method = "locally-optimised",
     threshold_px: float | None = 1.0, confidence: float = 0.9999, max_samples: int = 60_000,

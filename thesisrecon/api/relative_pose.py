@@ -12,6 +12,7 @@ from thesisrecon.camera import Camera
 from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.relative_pose import pose_in_front, poses_from_homography
+from thesisrecon.runtime._blas import one_blas_thread
 
 Calibration = F64 | Camera  # K (3, 3), or a camera, whose lens counts too and whose pose does not
 
@@ -40,6 +41,7 @@ class PlanePoses(NamedTuple):
     in_front: F64
 
 
+@one_blas_thread()
 def estimate_essential(
     xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | None = None, *,
     threshold_px: float | None = 1.0, confidence: float = 0.9999, max_samples: int = 100_000,

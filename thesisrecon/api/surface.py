@@ -18,6 +18,7 @@ from thesisrecon.imaging.pinholes import pinhole_numbers, pinhole_view
 from thesisrecon.io import _images
 from thesisrecon.lens import stacked_rows
 from thesisrecon.pipeline.matching import ImageInput
+from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.stereo._epipolar_pair import pair_of_fundamental
 from thesisrecon.stereo.depth import MultiViewScene, keep_depths
 from thesisrecon.stereo.rectification import METHODS, PLANAR, RectifiedImages, disparity_range
@@ -73,6 +74,7 @@ def rectify(
     return RectifiedImages.of(frame, (images[0], images[1]), disparity_range(frame, xy1, xy2))
 
 
+@one_blas_thread()
 def match_rectified(
     left: ImageInput, right: ImageInput, *, max_disparity_px: float, min_disparity_px: float = 0.0,
     config: Config | None = None,
@@ -136,6 +138,7 @@ def _shifted(image: U8 | F32, columns: int, more: int) -> F32:
     return out
 
 
+@one_blas_thread()
 def depth_maps(
     images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
     depth_range: F64 | tuple[float, float] | None = None, max_size: int | None = None,
@@ -225,6 +228,7 @@ def confirmed_depth_maps(
         return dict(zip(order, pool.map(lambda i: dense.confirm(scene, found, i), order), strict=True))
 
 
+@one_blas_thread()
 def fuse_depth_maps(
     depth_maps: Sequence[records.DepthMap] | Sequence[F32 | F64], cameras: CameraInput | None = None, *,
     sizes: I64 | None = None, config: Config | None = None, threads: int = 1,
@@ -278,6 +282,7 @@ def fuse_depth_maps(
     return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)
 
 
+@one_blas_thread()
 def texture(
     mesh: records.TexturedMesh, images: ImagesInput, cameras: CameraInput, *, sizes: I64 | None = None,
     max_size: int | None = None, config: Config | None = None, threads: int = 1,

@@ -19,6 +19,7 @@ from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.two_view import epipoles, require_parallax_of_matches
 from thesisrecon.io._images import eight_bit_images, read_image, read_levels, read_pixels
 from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, as_mesh
+from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.rectification import PlanarRectification
@@ -29,6 +30,7 @@ from thesisrecon.views.render import render_mesh
 _COARSE = 4  # Reduction at which the largest disparity of a rectified pair is searched, up to half its width
 
 
+@one_blas_thread()
 def interpolate_view(
     left: Any, right: Any, s: float, *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
@@ -234,6 +236,7 @@ def prepare_trilinear_views(
     return tensor.prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=found.dense.gain)
 
 
+@one_blas_thread()
 def synthesize_view(
     image1: Any, image2: Any, rotation: ArrayLike, translation: ArrayLike, *, K: ArrayLike | None = None,
     config: Config | None = None, seed: int = 0,

@@ -22,6 +22,7 @@ from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepte
 from thesisrecon.pipeline.run import Job, Run, name_images, stream
 from thesisrecon.records import MetricResult, Reconstruction, TwoView
 from thesisrecon.results import RunResult
+from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run_folder import RunDirectory
 
@@ -326,7 +327,7 @@ def claimed(run: Run, *, overwrite: bool, source: Source | None = None) -> Itera
     claim = run.directory.claim(
         _settings_identity(run, source), overwrite=overwrite, results=outputs.WRITTEN_FILES
     )
-    with run.workers, claim, run.resumable():
+    with run.workers, one_blas_thread(), claim, run.resumable():
         yield
 
 

@@ -324,7 +324,11 @@ def _answer(key: str, task: bytes) -> bytes:
         function, given = pickle.loads(task)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"a worker cannot load its task: {error}; install the module there too") from None
-    return pickle.dumps(function(*given), 5)
+    # Imported here: `thesisrecon --help` needs no NumPy.
+    from thesisrecon.runtime._blas import one_blas_thread
+
+    with one_blas_thread():
+        return pickle.dumps(function(*given), 5)
 
 
 class ProcessPool(futures.ProcessPoolExecutor):
