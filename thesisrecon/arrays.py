@@ -23,8 +23,16 @@ Stratum = Literal["projective", "affine", "metric"]
 class Record:
     """Base of frozen dataclasses with arrays: ``==`` compares all fields by value, NaN equal to NaN.
 
-    Records have no hash, as lists and arrays have none.
+    Records have no hash, as lists and arrays have none. ``repr`` is one line of at most 200 characters.
     """
+
+    def __init_subclass__(cls) -> None:
+        # A dataclass makes no repr, of pages of numbers, for a class that has its own.
+        cls.__repr__ = cls.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        shown = [f"{f.name}={_short(getattr(self, f.name))}" for f in fields(self) if f.repr]  # type: ignore[arg-type]
+        return cut_text(f"{type(self).__name__}({', '.join(shown)})")
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -33,6 +41,23 @@ class Record:
         return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     __hash__ = None  # type: ignore[assignment]
+
+
+def _short(value: Any) -> str:
+    """A value in a few words: the shape of an array, the length of a sequence or mapping."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, tuple | list | Mapping) and value:
+        numbers = len(value) < 5 and all(isinstance(one, int | float) for one in value)
+        return f"{value}" if numbers else f"<{len(value)} of {type(next(iter(value))).__name__}>"
+    if isinstance(value, float | np.floating):
+        return f"{value:.6g}"
+    return type(value).__name__ if isinstance(value, Record) else cut_text(repr(value), 60)
+
+
+def cut_text(text: str, most: int = 200) -> str:
+    """Cut a text to a number of characters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from thesisrecon import records
-from thesisrecon.arrays import F64, I64, U8, Record, number, rows_of_views
+from thesisrecon.arrays import F64, I64, U8, Record, cut_text, number, rows_of_views
 from thesisrecon.camera import POSE_STDS, Camera, camera_of_row
 
 SUMMARY = "summary.json"
@@ -85,7 +85,7 @@ class Cameras(Mapping[str, Camera]):
         return int(self._metric.reconstruction.registered.sum())
 
     def __repr__(self) -> str:
-        return f"Cameras({list(self)})"
+        return cut_text(f"Cameras({list(self)})")
 
 
 @dataclass(frozen=True, eq=False)
