@@ -291,7 +291,11 @@ def _is_library(package: str) -> bool:
     # Functions defined at a prompt belong to __main__, whose file may be that of an installed command.
     if package == "__main__" or not file:
         return False
-    return any(Path(file).resolve().is_relative_to(folder) for folder in _LIBRARIES)
+    place = Path(file).resolve()
+    # An environment may see the packages of another, as of the system.
+    return bool({"site-packages", "dist-packages"} & set(place.parts)) or any(
+        place.is_relative_to(folder) for folder in _LIBRARIES
+    )
 
 
 class _Pickler(pickle.Pickler):

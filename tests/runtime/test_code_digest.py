@@ -140,3 +140,17 @@ def test_an_object_counts_with_its_state_and_one_that_cannot_be_pickled_never_tw
     assert one != two
     lock = threading.Lock()
     assert code_digest(Outer(lock)) != code_digest(Outer(lock))
+
+
+def test_a_package_of_another_environment_counts_by_its_name(tmp_path, monkeypatch):
+    home = tmp_path / "site-packages"
+    home.mkdir()
+    monkeypatch.syspath_prepend(home)
+    text = "def chosen(x):\n    import installed_elsewhere\n    return installed_elsewhere.{}(x)"
+    digests = set()
+    for offset in (1, 2):
+        (home / "installed_elsewhere.py").write_text(f"def shift(x): return x + {offset}\n", encoding="utf-8")
+        sys.modules.pop("installed_elsewhere", None)
+        importlib.invalidate_caches()
+        digests.add(code_digest(defined(text.format("shift"))))
+    assert len(digests) == 1
