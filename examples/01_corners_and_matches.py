@@ -13,8 +13,6 @@ window :math:`w`, the change of a patch under a small shift :math:`d` is about :
 :math:`R` is large only if both eigenvalues of :math:`M` are large, that is at corners.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
@@ -22,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 
 import thesisrecon
 
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard" / "images"
+folder = thesisrecon.sample("courtyard") / "images"
 paths = [folder / "0000.jpg", folder / "0001.jpg"]
 left, right = (np.asarray(Image.open(path)) for path in paths)
 crop = np.s_[300:440, 180:360]

@@ -14,14 +14,12 @@ scale and rank 2: seven degrees of freedom. Seven matches determine it up to thr
 it unique and precise. No calibration is needed.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
 
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
+folder = thesisrecon.sample("courtyard")
 paths = [folder / "images" / name for name in ("0000.jpg", "0001.jpg")]
 pair = thesisrecon.match_pair(*paths)
 fit = thesisrecon.estimate_fundamental(pair.xy1, pair.xy2)
@@ -38,7 +36,7 @@ for axis, image in zip(axes, images, strict=True):
 # distance of exact points below about :math:`\sigma\sqrt{14/n}` (:term:`bound`; for many matches). The
 # eight-point method (5.1) is linear; the :term:`gold standard` minimises distances in the images (HZ 11.4.1).
 
-cube = np.load(folder.parent / "cube" / "cube.npz")
+cube = np.load(thesisrecon.sample("cube") / "cube.npz")
 exact = cube["xy"][[13, 22]][:, np.isfinite(cube["xy"][[13, 22]]).all(axis=(0, 2))]
 rng, sigma, counts = np.random.default_rng(1), 1.0, [20, 40, 80, 160, 320]
 figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")

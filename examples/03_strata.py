@@ -14,14 +14,12 @@ and :term:`cross-ratios <cross-ratio>` are the same in all three, the two halves
 affine and the metric frame, and angles are right in the metric frame.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
 
-cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
+cube = np.load(thesisrecon.sample("cube") / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
 noisy = cube["xy"][views] + np.random.default_rng(0).normal(0, 0.5, (len(views), 360, 2))
 sizes = [(800, 600)] * len(views)

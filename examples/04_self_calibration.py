@@ -15,14 +15,12 @@ with the focal length :math:`f` and the :term:`principal point` :math:`(u, v)`. 
 same knowledge: one camera, square pixels, a principal point near the centre.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
 
-cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
+cube = np.load(thesisrecon.sample("cube") / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
 noisy = cube["xy"][views] + np.random.default_rng(0).normal(0, 0.5, (len(views), 360, 2))
 run = thesisrecon.reconstruct_from_tracks(noisy, [(800, 600)] * len(views))

@@ -17,14 +17,12 @@ seven: -7 in the code) the RMS residual should be :math:`\sigma\sqrt{1 - d/N}`, 
 principal points and the ellipse predicted for 95 % of them (mean covariance, :math:`\chi^2 = 5.99`).
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
 
-cube = np.load(Path(thesisrecon.__file__).parents[1] / "fixtures" / "cube" / "cube.npz")
+cube = np.load(thesisrecon.sample("cube") / "cube.npz")
 views = np.flatnonzero(np.isfinite(cube["xy"][..., 0]).sum(axis=1) > 200)[::2]
 exact, K = cube["xy"][views], cube["K"]
 R, C, sigma = cube["R"][views], cube["C"][views], 0.5

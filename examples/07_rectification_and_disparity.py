@@ -8,15 +8,13 @@ remaining shift :math:`d = x_l - x_r` is the :term:`disparity`; for parallel cam
 :math:`d = f b / Z`: near points move more. Only :math:`F` and the matches are needed, no calibration.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
 import thesisrecon
 
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
+folder = thesisrecon.sample("courtyard")
 names = ["0010.jpg", "0011.jpg"]
 images = [np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names]
 pair = thesisrecon.match_pair(*images)

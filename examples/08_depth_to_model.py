@@ -10,15 +10,13 @@ view confirms are removed. The cameras here are the true ones of the courtyard, 
 of the depths; ``thesisrecon.load(out).cameras`` gives estimated ones.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
 import thesisrecon
 
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
+folder = thesisrecon.sample("courtyard")
 paths = [folder / "images" / f"{i:04d}.jpg" for i in range(3, 7)]
 all_cameras = thesisrecon.read_cameras(folder / "cameras.json")
 cameras = [all_cameras[path.name] for path in paths]

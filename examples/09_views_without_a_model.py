@@ -8,8 +8,6 @@ Two images and their dense matches are enough for new views; no surface is built
 the camera :math:`P_s = (1 - s) P_0 + s P_1` on the :term:`baseline`. Finally the rectification is undone.
 """
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
@@ -18,7 +16,7 @@ import thesisrecon
 from thesisrecon.api.views import match_images, prepare_pair, prepare_trilinear_views
 from thesisrecon.views.tensor import VirtualCamera
 
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
+folder = thesisrecon.sample("courtyard")
 names = ["0005.jpg", "0007.jpg", "0006.jpg"]
 images = [np.asarray(Image.open(folder / "images" / name).reduce(2)) for name in names]
 first, second, real = images

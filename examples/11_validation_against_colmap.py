@@ -22,7 +22,7 @@ try:
 except ImportError:
     pycolmap = None
     print("pycolmap is not installed (extra docs): no comparison with COLMAP")
-folder = Path(thesisrecon.__file__).parents[1] / "fixtures" / "courtyard"
+folder = thesisrecon.sample("courtyard")
 images = sorted((folder / "images").glob("*.jpg"))[:6]
 with TemporaryDirectory() as temporary:
     out = Path(temporary)

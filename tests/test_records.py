@@ -10,7 +10,7 @@ from tests.conftest import refuses
 from thesisrecon.camera import Camera
 from thesisrecon.errors import counted
 from thesisrecon.imaging.raster import rasterize
-from thesisrecon.records import DisparityMap
+from thesisrecon.records import DisparityMap, Tracks
 
 K = np.array([[800.0, 2.0, 310.0], [0.0, 790.0, 245.0], [0.0, 0.0, 1.0]])
 
@@ -107,3 +107,15 @@ def test_counted_nouns_have_the_right_number():
     assert [counted(n, "photograph") for n in (0, 1, 2)] == ["0 photographs", "1 photograph", "2 photographs"]
     assert [counted(n, "verified match") for n in (1, 7)] == ["1 verified match", "7 verified matches"]
     assert counted(1200, "face", "1 200") == "1 200 faces"
+
+
+def test_one_point_is_projected_to_one_pixel_and_records_print_as_one_line(camera):
+    np.testing.assert_array_equal(camera.project([1.0, 2, 4]), camera.project([[1.0, 2, 4]])[0])
+    assert camera.project([1.0, 2, 4]).shape == (2,)
+    with pytest.raises(ValueError, match=r"\(N, 3\)"):
+        camera.project([1.0, 2, 4, 1])
+    tracks = Tracks(np.arange(9000), np.arange(9000), np.ones((9000, 2)), 9000, 9000)
+    assert repr(tracks).startswith(
+        "Tracks(view_index=int64[9000], point_index=int64[9000], xy=float64[9000, 2],"
+    )
+    assert len(repr(replace(camera, std={f"k{i}": 0.1 for i in range(90)}))) <= 200

@@ -23,17 +23,29 @@ from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
 from thesisrecon.api.relative_pose import estimate_essential as estimate_essential
 from thesisrecon.api.relative_pose import recover_pose as recover_pose
 from thesisrecon.api.relative_pose import decompose_homography as decompose_homography
+from thesisrecon.api.decompositions import essential_from_fundamental as essential_from_fundamental
+from thesisrecon.api.decompositions import decompose_essential as decompose_essential
+from thesisrecon.api.decompositions import seven_point as seven_point
 from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
 from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate as FundamentalEstimate
 from thesisrecon.records import FundamentalFit as FundamentalFit
 from thesisrecon.records import TwoView as TwoView
 
+# One image, and panoramas
+from thesisrecon.api.single_view import vanishing_points as vanishing_points
+from thesisrecon.api.single_view import rectify_plane as rectify_plane
+from thesisrecon.api.single_view import single_view_heights as single_view_heights
+from thesisrecon.api.single_view import calibrate_from_homographies as calibrate_from_homographies
+from thesisrecon.api.panorama import stitch as stitch
+
 # Points and cameras
 from thesisrecon.camera import Camera as Camera
 from thesisrecon.api.cameras import triangulate as triangulate
 from thesisrecon.api.cameras import resect as resect
 from thesisrecon.api.cameras import cheirality as cheirality
+from thesisrecon.api.decompositions import decompose_camera as decompose_camera
+from thesisrecon.api.decompositions import factorize_affine as factorize_affine
 from thesisrecon.api.bundle import bundle_adjust as bundle_adjust
 from thesisrecon.api.bundle import BundleAdjustment as BundleAdjustment
 from thesisrecon.records import Reconstruction as Reconstruction
@@ -69,6 +81,7 @@ from thesisrecon.api.views import synthesize_view as synthesize_view
 
 # Models and files
 from thesisrecon.api.models import read_cameras as read_cameras
+from thesisrecon.io._images import sample as sample
 from thesisrecon.api.export import export as export
 from thesisrecon.api.export import write_mesh as write_mesh
 from thesisrecon.api.export import read_mesh as read_mesh

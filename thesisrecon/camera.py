@@ -160,16 +160,18 @@ class Camera(Record):
 
         Parameters
         ----------
-        X : ndarray (N, 3)
-            Points in the world frame. Points behind the camera are projected, too.
+        X : ndarray (N, 3) or (3,)
+            Points in the world frame, or one. Points behind the camera are projected, too.
 
         Returns
         -------
-        ndarray (N, 2)
+        ndarray (N, 2) or (2,)
             Pixels xy.
         """
-        (X,) = arrays.checked("Camera.project", missing=("X",), X=(X, ("N", 3)))
-        return project_camera(self.K, self.R, self.t, X, distortion=self.lens_row)
+        (X,) = arrays.numbers("Camera.project", missing=("X",), X=X)
+        arrays.require_shapes("Camera.project", X=(np.atleast_2d(X), ("N", 3)))
+        xy = project_camera(self.K, self.R, self.t, X.reshape(-1, 3), distortion=self.lens_row)
+        return xy.reshape(*X.shape[:-1], 2)
 
     def unproject(self, xy: F64, depth: F64 | None = None) -> F64:
         """Return the points or viewing directions of pixels.

@@ -52,6 +52,17 @@ LISTED = {"view_index": np.tile(np.arange(6), 40), "point_index": np.repeat(np.a
 LISTED["xy"] = XY[LISTED["view_index"], LISTED["point_index"]]
 PAIR = [tr.Camera(K, R[3], np.array([x, 0.0, 0.0]), SIZE) for x in (0.0, 1.0)]
 ROWS, SIZES = tuple((k, k) for k in range(40)), np.array([SIZE] * 6)
+E = K.T @ F @ K
+SQUARE = np.array([[[0, 0], [0, 1]], [[1, 0], [1, 1]], [[0, 0], [1, 0]], [[0, 1], [1, 1]]])
+DIAGONALS = np.array([[[0, 0], [1, 1]], [[1, 0], [0, 1]]])
+SEGMENTS = np.stack([XY[0, :9], XY[0, :9] + 0.2 * (np.array([900.0, 50]) - XY[0, :9])], axis=1)
+BOARD = X[:, :2].copy()
+BOARD_H = np.stack([camera.P[:, [0, 1, 3]] for camera in CAMERAS])
+GROUPS, ANGLES = (
+    CAMERAS[0].project(np.pad(a.reshape(-1, 2), ((0, 0), (0, 1)))).reshape(2, 2, 2, 2)
+    for a in (SQUARE, np.stack([SQUARE[[0, 2]], DIAGONALS]))
+)
+BOARD_XY = np.stack([camera.project(X * [1, 1, 0]) for camera in CAMERAS])
 SEARCH = {"confidence": 0.99, "max_samples": 100, "seed": 0}
 RETURNED = {
     "RunResult", "FundamentalEstimate", "FundamentalFit", "TwoView", "BundleAdjustment", "Reconstruction",
@@ -99,6 +110,40 @@ CALLS = {
     "Camera.scaled": (CAMERAS[0].scaled, {"factor": 0.5}),
     "triangulate": (tr.triangulate, {"P": P, "xy": XY, "method": "linear"}),
     "resect": (tr.resect, {"X": X, "xy": XY[0], "K": K, "threshold_px": 1.0, "confidence": 0.99, "seed": 0}),
+    "sample": (tr.sample, {"name": "cube"}),
+    "decompose_camera": (tr.decompose_camera, {"P": P[0], "covariance": np.eye(12)}),
+    "essential_from_fundamental": (
+        tr.essential_from_fundamental,
+        {"F": E, "K1": K, "K2": K, "covariance": np.eye(9)},
+    ),
+    "decompose_essential": (tr.decompose_essential, {"E": E, "xy1": XY[0], "xy2": XY[1], "K1": K, "K2": K}),
+    "seven_point": (tr.seven_point, {"xy1": XY[0, :7], "xy2": XY[1, :7]}),
+    "factorize_affine": (tr.factorize_affine, {"xy": XY, "orthographic": False}),
+    "vanishing_points": (
+        tr.vanishing_points,
+        {"segments": SEGMENTS, "count": 1, "threshold_px": 3.0, "seed": 0},
+    ),
+    "rectify_plane": (
+        tr.rectify_plane,
+        {"parallel": GROUPS, "orthogonal": ANGLES},
+    ),
+    "single_view_heights": (
+        tr.single_view_heights,
+        {
+            "vertical": np.array([10.0, -3000, 1]),
+            "horizon": np.array([0.0, 1, -200]),
+            "base": XY[0],
+            "top": XY[0] - np.array([0, 30.0]),
+            "reference": SEGMENTS[0],
+            "height": 1.0,
+            "sigma_px": 1.0,
+        },
+    ),
+    "calibrate_from_homographies": (
+        tr.calibrate_from_homographies,
+        {"H": BOARD_H, "size": SIZE, "board": BOARD, "xy": BOARD_XY},
+    ),
+    "stitch": (tr.stitch, {"images": [LEFT, RIGHT]}),
     "cheirality": (tr.cheirality, {"P": P[0], "X": np.column_stack([X, np.ones(40)])}),
     "bundle_adjust": (
         lambda **given: tr.bundle_adjust(free=(), **given),

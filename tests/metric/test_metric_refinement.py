@@ -125,6 +125,8 @@ def test_a_fixed_principal_point_is_reported_as_assumed_and_a_known_calibration_
     np.testing.assert_array_equal(result.reconstruction.K[:, 0, 0], 1500.0)
     assert result.intrinsics[0]["focal_px"].std == 0.0
     assert centre_error(result, scene) < 2e-3
+    result = run(scene, options=IntrinsicsOptions(focal="known", focal_px=1500.0))
+    np.testing.assert_array_equal(result.reconstruction.K[:, 0, 0], 1500.0)
 
 
 def test_a_lens_of_three_coefficients_is_found_and_the_focal_with_it():

@@ -65,7 +65,7 @@ def reconstruct(
         Random seed, at least 0. The same images, settings and seed give the same bytes for any number of
         workers.
     progress : callable, optional
-        Called with (stage, done, total).
+        Called with (stage, done, total). By default a notebook prints one line per stage.
     **options
         ``until``: last stage, "features", "matches", "projective", "metric", "dense" or "model" (by default
         "model", where a surface that fails is only a warning); ``threads``: number of workers;

@@ -143,7 +143,7 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     x1, x2 = checked(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
     if not len(x1):
         raise ValueError("recover_pose needs at least one match, which decides between four poses; got none")
-    rays1, rays2 = _rays(caller, K1, x1), _rays(caller, K1 if K2 is None else K2, x2)
+    rays1, rays2 = calibrated_rays(caller, K1, x1), calibrated_rays(caller, K1 if K2 is None else K2, x2)
     return RelativePose(*pose_in_front(E, rays1, rays2))
 
 
@@ -200,7 +200,7 @@ def decompose_homography(
     R, t, normal = poses_from_homography(G)
     if xy1 is None:
         return PlanePoses(R, t, normal, np.ones(len(R)))
-    x1 = _rays(caller, K1, *checked(caller, xy1=(xy1, ("N", 2))))
+    x1 = calibrated_rays(caller, K1, *checked(caller, xy1=(xy1, ("N", 2))))
     toward = normal @ x1.T
     # X = x1 d / (n' x1), of which the depth in the second camera is that of R X + t.
     after = x1 @ np.swapaxes(R, 1, 2) + t[:, None] * toward[:, :, None]
@@ -221,7 +221,7 @@ def _pinhole(caller: str, calibration: Calibration, xy: F64) -> tuple[F64, F64]:
     return K, xy
 
 
-def _rays(caller: str, calibration: Calibration, xy: F64) -> F64:
+def calibrated_rays(caller: str, calibration: Calibration, xy: F64) -> F64:
     """Rays (N, 3) of pixels, with z = 1."""
     K, xy = _pinhole(caller, calibration, xy)
     return np.asarray(homogenize(xy) @ np.linalg.inv(K).T)

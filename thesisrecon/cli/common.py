@@ -18,16 +18,11 @@ import typer
 from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
 from thesisrecon.io._files import printable, shorten_middle, shortened
 from thesisrecon.runtime._executors import available_threads
+from thesisrecon.runtime._progress import STAGE_LABELS, print_stages
 from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice
 
 DONE, INTERNAL, USAGE, IMPOSSIBLE = 0, 1, 2, 3
 DEBUG_VARIABLE = "THESISRECON_DEBUG"
-_STAGE_LABELS = {
-    "frames": "frames of the video", "kernels": "compiling (first run)", "features": "corners",
-    "pairs": "pair selection", "matches": "image pairs", "projective": "projective cameras",
-    "selfcalibration": "self-calibration", "metric": "metric refinement", "dense": "depth maps",
-    "model": "surface and texture", "correspondence": "dense correspondence", "views": "views",
-}  # fmt: skip
 
 
 def parse_folder(text: str | Path) -> Path:
@@ -70,9 +65,9 @@ def cap_threads(threads: int) -> None:
 
 @contextmanager
 def progress_bars() -> Iterator[Any]:
-    """Show one progress bar per stage on a terminal, nothing elsewhere; yields the ``progress`` callable."""
+    """Show one progress bar per stage on a terminal, lines elsewhere; yields the ``progress`` callable."""
     if not sys.stderr.isatty():
-        yield None
+        yield print_stages(lambda line: typer.echo(line, err=True, nl=False))
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -90,7 +85,7 @@ def progress_bars() -> Iterator[Any]:
 
         def update(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
-                tasks[stage] = bars.add_task(_STAGE_LABELS.get(stage, stage), total=total)
+                tasks[stage] = bars.add_task(STAGE_LABELS.get(stage, stage), total=total)
             bars.update(tasks[stage], completed=done, total=total, refresh=alone)
 
         yield update

@@ -171,6 +171,22 @@ def whitened_frame(X: F64) -> SpaceFrame:
     return SpaceFrame(N, whitening_transform(X @ N.T))
 
 
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def products(a: F64, b: F64) -> F64:
+    """Rows (N, 6) with a' S b = row . s for the entries s of a symmetric S (3, 3), as in `symmetric`."""
+    return np.column_stack([a[:, p] * b[:, q] + (p != q) * a[:, q] * b[:, p] for p, q in _ENTRIES])
+
+
+def symmetric(s: F64) -> F64:
+    """The symmetric matrix (3, 3) of its entries 11, 12, 13, 22, 23, 33."""
+    S = np.zeros((3, 3))
+    for value, (p, q) in zip(s, _ENTRIES, strict=True):
+        S[p, q] = S[q, p] = value
+    return S
+
+
 def unit_norm(F: F64) -> F64:
     """Scale matrices (..., m, n) to unit Frobenius norm; zeros stay zeros."""
     norm = np.sqrt(np.sum(F**2, axis=(-2, -1), keepdims=True))

@@ -23,7 +23,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F32, F64, U8, eight_bit, image_levels
-from thesisrecon.errors import Notice, StageFailure, UsageError
+from thesisrecon.errors import Notice, StageFailure, UsageError, require_word
 from thesisrecon.imaging.static import static_pixels
 from thesisrecon.io import _pixels
 from thesisrecon.io._files import (
@@ -106,14 +106,36 @@ class ImageSet:
         return np.array([d.place for d in self.decoded]).reshape(-1, 3)
 
 
+def sample(name: str = "courtyard") -> Path:
+    """Return the folder of a data set that is installed with the package.
+
+    Parameters
+    ----------
+    name : {"courtyard", "cube"}
+        "courtyard": 14 rendered images of 1024 px in ``images``, their true ``cameras.json`` and ``depth``;
+        "cube": ``cube.npz`` with K, R, C, the points X and their exact pixels xy (V, N, 2), NaN = not seen.
+
+    Returns
+    -------
+    Path
+
+    Examples
+    --------
+    >>> from thesisrecon import sample
+    >>> sorted(path.name for path in sample("courtyard").iterdir())
+    ['cameras.json', 'depth', 'images']
+    """
+    homes = [home / "fixtures" for home in Path(__file__).parents[1:3]]
+    require_word("sample", name, ("courtyard", "cube"))
+    for home in homes:
+        if (home / name).is_dir():
+            return home / name
+    raise UsageError(Notice("no-demo-images", homes[0]))
+
+
 def demo_images() -> list[Path]:
-    """Locate the demo images, sorted by name, in the installed package or in the source tree around it."""
-    package = Path(__file__).parents[1]
-    for home in (package, package.parent / "fixtures"):
-        # The first six: enough neighbouring views for self-calibration, few enough for a small wheel.
-        if found := sorted((home / "courtyard" / "images").glob("*.jpg"))[:6]:
-            return found
-    raise UsageError(Notice("no-demo-images", package / "courtyard"))
+    """The images of the demo: enough neighbouring views for self-calibration, few enough for a minute."""
+    return sorted((sample() / "images").glob("*.jpg"))[:6]
 
 
 def image_without_pixels(name: str, size: Sequence[int], original: tuple[int, int]) -> Image:

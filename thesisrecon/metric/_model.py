@@ -324,6 +324,10 @@ def _intrinsics(K: F64, registered: B8, sizes: I64, prior: IntrinsicsPrior) -> F
             half = float(np.linalg.norm(sizes[view])) / 2.0
             straight = straight_places(np.column_stack([p, 0.0 * p]), prior.lens[view])[0][:, 0]
             rows[view] = refitted_lens(rows[view], ANGLE, half * p, half * straight / rows[view, FOCAL])
+    # Self-calibration allows known values a tolerance, and values that do not move keep their start.
+    for column in (FOCAL, *CENTRE):
+        exact = prior.std[:, column] == 0.0
+        rows[exact, column] = prior.mean[exact, column]
     return rows
 
 

@@ -35,7 +35,10 @@ def algorithm1(job: Job) -> Iterator[RunResult]:
     """Yield the result of the largest group of images after each stage; ``StageFailure`` ends it."""
     run, front, until = job.run, job.front, job.until
     job.require_images()
-    precompile(until, run.workers.threads, run.progress)
+    with run.clock("kernels"):
+        compiled = precompile(until, run.workers.threads, run.progress)
+    if compiled:
+        run.finish("kernels", counts={"compiled": compiled})
     result = empty_result(run, job.inputs)
 
     # Before everything: lenses that bend lines much, seen in pairs of images (Fitzgibbon 2001).

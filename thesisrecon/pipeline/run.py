@@ -28,6 +28,7 @@ from thesisrecon.metric.given_cameras import GivenCameras
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
 from thesisrecon.runtime import _run_folder
 from thesisrecon.runtime._executors import Workers, available_threads
+from thesisrecon.runtime._progress import default_progress
 
 Progress = Callable[[str, int, int], None]
 """Called with (stage, done, total) in the caller's thread when a part of a stage is done."""
@@ -350,7 +351,7 @@ def start_run(
     workers = Workers(threads or available_threads(), options.get("executor", "local"))
     shared = options.get("shared")
     directory = _run_folder.RunDirectory(folder, None if shared is None else Path(shared))
-    report = progress or (lambda *_: None)
+    report = progress or default_progress()
     run = Run(config, seed, workers, directory, report, directory.path.absolute().name)
     return until, run, flag("a run", "overwrite", options.get("overwrite", False))
 

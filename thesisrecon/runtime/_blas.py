@@ -10,9 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 
-import numpy.linalg._umath_linalg
-import scipy.linalg.cython_blas
-
 _NAMES = [(f"{p}openblas_%s_num_threads{s}", "get", "set") for p in ("scipy_", "") for s in ("64_", "")]
 _NAMES += [("MKL_%s_Threads", "Get_Max", "Set_Num")]
 _lock, _before = threading.Lock(), list[int]()
@@ -22,6 +19,10 @@ _blocks = 0
 @cache
 def _libraries() -> list[tuple[Callable[[], int], Callable[[int], object]]]:
     """Functions that get and set the number of threads of the BLAS of NumPy and of SciPy, if it has them."""
+    # Imported on use: other modules of SciPy come with it.
+    import numpy.linalg._umath_linalg
+    import scipy.linalg.cython_blas
+
     found = []
     for module in (numpy.linalg._umath_linalg, scipy.linalg.cython_blas):
         # A symbol is also looked up in the libraries that an extension module is linked to.

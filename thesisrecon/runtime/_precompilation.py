@@ -62,21 +62,22 @@ def _named(name: str) -> Any:
     return getattr(importlib.import_module(f"{PACKAGE.name}.{module}"), attribute)
 
 
-def precompile(until: str, workers: int, progress: Callable[[str, int, int], None]) -> None:
-    """Compile the kernels of the stages up to one with several processes, unless that was done before."""
+def precompile(until: str, workers: int, progress: Callable[[str, int, int], None]) -> int:
+    """Compile the kernels of the stages up to one in several processes, unless done before; their number."""
     lines = listed_kernels(until)
     dispatcher: Any = copy_to
     processor = dispatcher.targetctx.codegen().magic_tuple()
     key = key_of(lines, processor, node(), sys.version, numba.__version__, package_key())
     done = cache_folder() / f"complete-{key}"
     if done.exists() or not lines or vars(numba.config)["DISABLE_JIT"]:
-        return
+        return 0
     progress("kernels", 0, len(lines))
     finished = _compile_in_processes(lines, workers, progress)
     # An unwritable folder or a failing worker costs time only: each kernel is compiled when it is called.
     if finished == len(lines):
         with suppress(OSError):
             done.touch()
+    return finished
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as PillowImage
 
-import thesisrecon
+from thesisrecon import sample
 from thesisrecon.api.models import paired_cameras
 from thesisrecon.arrays import B8, F64, U8
 from thesisrecon.errors import UsageError
@@ -174,15 +174,9 @@ def real_folder(name: str) -> Path | None:
     return folder if folder is not None and folder.is_dir() else None
 
 
-def fixture_folder(name: str) -> Path:
-    """A folder of fixtures/; an installed package brings six of the images of the courtyard."""
-    homes = (ROOT / "fixtures", Path(thesisrecon.__file__).parent)
-    return next((home / name for home in homes if (home / name).is_dir()), homes[0] / name)
-
-
 def load_fixture_scene(name: str = "courtyard") -> Scene:
     """A scene of fixtures/, always there. Raises ``ValueError`` for a name that does not exist."""
-    return read_scene(fixture_folder(name), name)
+    return read_scene(sample(name), name)
 
 
 def load_scene(name: str) -> Scene | None:
@@ -214,7 +208,7 @@ def load_fixture_depth(view: int, name: str = "courtyard") -> tuple[F64, int]:
     """True depth (H / stride, W / stride) of one view in metres, NaN where nothing was hit, and the stride.
     Sample (r, c) is the depth (z in the camera frame) at pixel (x, y) = (stride c, stride r).
     """
-    folder = fixture_folder(name)
+    folder = sample(name)
     record = json.loads((folder / "cameras.json").read_text(encoding="utf-8"))["depth"]
     with PillowImage.open(folder / "depth" / f"{view:04d}.png") as image:
         steps = np.asarray(image, dtype=np.float64)
