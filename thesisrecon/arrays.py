@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
+from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
@@ -41,6 +42,11 @@ class Record:
         return all(_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     __hash__ = None  # type: ignore[assignment]
+
+    def _repr_html_(self) -> str | None:
+        # Pictures are above the records, and notebooks load them.
+        found: str | None = import_module("thesisrecon.plot").html(self)
+        return found
 
 
 def _short(value: Any) -> str:

@@ -196,9 +196,9 @@ def test_help_and_version(capsys):
         assert f"--{option}" in printed
 
 
-def test_the_demo_without_images_states_the_searched_folders(monkeypatch, tmp_path, refused):
+def test_the_demo_without_images_states_the_searched_folder(monkeypatch, tmp_path, refused):
     monkeypatch.setattr(_images, "__file__", str(tmp_path / "thesisrecon" / "io" / "_images.py"))
-    assert str(tmp_path / "thesisrecon" / "courtyard") in refused(["demo", "-o", tmp_path / "out"])
+    assert str(tmp_path / "thesisrecon" / "fixtures") in refused(["demo", "-o", tmp_path / "out"])
 
 
 def test_a_list_of_pairs_is_read_matched_and_reported(photographs, tmp_path, capsys, refused):

@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from thesisrecon.api.bundle import bundle_adjust
 from thesisrecon.api.given import checked_sizes
-from thesisrecon.arrays import F64, I64, Record, checked, generator, number, whole_number
+from thesisrecon.arrays import F64, I64, Record, checked, generator, number, numbers, whole_number
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import (
@@ -180,7 +180,7 @@ def rectify_plane(parallel: Sequence[F64], orthogonal: F64 | None = None) -> Rec
     True
     """
     caller = "rectify_plane"
-    given = list(parallel) if np.iterable(parallel) else []
+    given = parallel if np.iterable(parallel) else np.atleast_1d(*numbers(caller, parallel=parallel))
     groups = [checked(caller, parallel=(group, ("N", 2, 2)))[0] for group in given]
     if len(groups) < 2 or min(map(len, groups)) < 2:
         raise ValueError(f"{caller} needs two groups of two parallel segments or more")
@@ -277,13 +277,13 @@ def single_view_heights(
     Raises
     ------
     ValueError
-        If a shape is wrong, a number is not finite, or the reference has no height.
+        If a shape is wrong, a number is not finite, or the reference determines no scale.
 
     Examples
     --------
     >>> import numpy as np
     >>> from thesisrecon import single_view_heights
-    >>> P = np.array([[800.0, 320, 0, 1000], [0, 240, -800, 1200], [0, 1, 0, 5]])  # z is up
+    >>> P = np.array([[800.0, 320, 0, 1000], [0, 240, -800, 2400], [0, 1, 0, 5]])  # z is up
     >>> X = np.array([[0.0, 0, 0, 1], [0, 0, 1.5, 1], [1, 2, 0, 1], [1, 2, 1.8, 1]]) @ P.T
     >>> xy = X[:, :2] / X[:, 2:]
     >>> horizon = np.cross(P[:, 0], P[:, 1])
@@ -302,11 +302,12 @@ def single_view_heights(
         """-|b x t| / ((l . b) |v x t|) of points (..., 4), with the sign of t - b towards v."""
         b, t = homogenize(xy[..., :2]), homogenize(xy[..., 2:])
         up, cross = np.cross(v, t), np.cross(b, t)
-        return np.asarray(np.sum(cross * up, axis=-1) / (np.sum(up * up, axis=-1) * (b @ l)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.sum(cross * up, axis=-1) / (np.sum(up * up, axis=-1) * (b @ l)))
 
     unit = ratio(known.reshape(-1))
-    if not np.abs(unit) > 0.0:
-        raise ValueError(f"{caller} needs a reference with two different ends")
+    if not 0.0 < np.abs(unit) < np.inf:
+        raise ValueError(f"{caller} needs a reference with two different ends and its base off the horizon")
     z = height * ratio(np.hstack([base, top])) / unit
     J = height * central_differences(lambda x: ratio(x) / unit, np.hstack([base, top]))
     of_known = central_differences(lambda x: unit / ratio(x), known.reshape(1, 4))
@@ -353,7 +354,7 @@ def calibrate_from_homographies(
     >>> K = np.array([[800.0, 0, 320], [0, 810, 240], [0, 0, 1]])
     >>> R = Rotation.from_euler("xy", [[0.5, 0.1], [-0.3, 0.5], [0.2, -0.6]]).as_matrix()
     >>> H = K @ np.dstack([R[:, :, :2], np.tile([[[0.0], [0], [5]]], (3, 1, 1))])
-    >>> calibrate_from_homographies(H, (640, 480))[0].K.round(3).tolist()
+    >>> (calibrate_from_homographies(H, (640, 480))[0].K.round(3) + 0.0).tolist()
     [[800.0, 0.0, 320.0], [0.0, 810.0, 240.0], [0.0, 0.0, 1.0]]
     """
     caller = "calibrate_from_homographies"
