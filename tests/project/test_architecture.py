@@ -17,7 +17,7 @@ CHAPTERS = {
     "metric", "stereo", "surface", "views",
 }  # fmt: skip
 CORE = {"numpy", "scipy", "numba", "PIL", "trimesh", "jinja2", "plotly", "rich", "typer"}
-OPTIONAL = {"runtime": {"dask", "distributed"}, "testing": {"pytest"}}
+OPTIONAL = {"thesisrecon": {"matplotlib"}, "runtime": {"dask", "distributed"}, "testing": {"pytest"}}
 """Optional dependencies by folder, imported only on request."""
 
 
