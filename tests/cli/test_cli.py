@@ -1,6 +1,7 @@
 """The command line on the project's own photographs: one whole run, killed once, and what it prints."""
 
 import ast
+import json
 import os
 import re
 import shlex
@@ -71,6 +72,8 @@ def test_a_killed_run_goes_on_and_reconstructs_the_courtyard(killed_and_resumed,
     out, kept = killed_and_resumed
     assert kept >= 2
     summary = read(out / "summary.json")
+    assert run_command(["inspect", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == summary
     assert summary["registered"] == VIEWS
     assert summary["trusted"]
     truth = read(COURTYARD / "cameras.json")
@@ -189,7 +192,7 @@ def test_an_error_in_the_program_is_a_sentence_too(photographs, tmp_path, monkey
 
 
 def test_help_and_version(capsys):
-    for arguments in (["--version"], [], ["reconstruct", "--help"]):
+    for arguments in (["--version"], [], ["reconstruct", "-h"]):
         assert run_command(arguments) == 0
     printed = capsys.readouterr().out
     for option in ("preset", "cameras", "config", "set", "seed", "threads", "max-size", "until", "executor"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
 import math
 import os
@@ -135,7 +136,10 @@ def _run(call: str, given: tuple[Any, Any], out: Path, options: Mapping[str, Any
     typer.echo(summary_text(result.summary, out))
 
 
-def inspect(out: Annotated[Path, common.folder_argument("OUT", "Output folder of a run.")]) -> None:
+def inspect(
+    out: Annotated[Path, common.folder_argument("OUT", "Output folder of a run.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print summary.json.")] = False,
+) -> None:
     """Print the summary of a run, or where it stands if it has not finished."""
     from thesisrecon.pipeline.run import run_position
     from thesisrecon.runtime._run_folder import is_running
@@ -151,7 +155,7 @@ def inspect(out: Annotated[Path, common.folder_argument("OUT", "Output folder of
         text = summary_text(summary, out)
     except (LookupError, TypeError, AttributeError, ValueError, OverflowError, RecursionError):
         raise UsageError(f"{out / 'summary.json'} is not a summary written by thesisrecon") from None
-    typer.echo(text)
+    typer.echo(json.dumps(summary, indent=1) if as_json else text)
 
 
 def summary_text(summary: Mapping[str, Any], out: Path) -> str:
@@ -418,7 +422,8 @@ def interpolate(
 
 app = typer.Typer(
     name="thesisrecon", help="From uncalibrated images to metric cameras, points and a textured model.",
-    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]}, rich_markup_mode=None,
+    pretty_exceptions_enable=False,
 )  # fmt: skip
 for _command in (reconstruct, demo, inspect, compare, render, interpolate, export):
     app.command()(_command)
