@@ -7,7 +7,9 @@ import importlib
 import logging
 import re
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -400,3 +402,67 @@ def test_a_lightglue_style_matcher_fits_with_a_class(tmp_path):
     assert result.settings["matching"] == table
     tracks = AlignedTracks().build([None] * 3, result.pairs, map_all=one_by_one, rng=np.random.default_rng(0))
     assert tracks.n_points >= result.pairs[0].inliers
+
+
+class Tensor:
+    """What the blocks of the page use of a tensor."""
+
+    def __init__(self, array):
+        self.array = np.asarray(array)
+
+    def __getitem__(self, key):
+        return Tensor(self.array[key])
+
+    def cpu(self):
+        return self
+
+    def numpy(self):
+        return self.array
+
+
+class Network:
+    """Stub of the networks: an evaluated module that finds a grid shifted by 5 pixels."""
+
+    def __init__(self, **options):
+        assert options in ({"max_num_keypoints": 2048}, {"features": "superpoint"}, {"pretrained": "outdoor"})
+
+    def eval(self):
+        return self
+
+    def extract(self, tensor):
+        assert tensor.array.shape[0] == 3
+        return {"keypoints": Tensor([[[10.0, 10], [20, 30], [40, 50]]])}
+
+    def __call__(self, data):
+        if isinstance(data["image0"], dict):
+            return {"matches": Tensor([[[0, 0], [2, 1]]]), "scores": Tensor([[0.9, 0.8]])}
+        assert data["image1"].array.shape == (1, 1, 60, 80)
+        assert data["image1"].array.max() <= 1.0
+        found = {"keypoints0": [[1.0, 2]], "keypoints1": [[6.0, 2]], "confidence": [0.7]}
+        return {name: Tensor(value) for name, value in found.items()}
+
+
+def test_lightglue_and_loftr_fit_by_their_documented_calls(monkeypatch):
+    rgb = np.full((60, 80, 3), 200, np.uint8)
+
+    def unbatched(data):
+        return {name: value[0] for name, value in data.items()}
+
+    utils = SimpleNamespace(
+        numpy_image_to_torch=lambda i: Tensor(np.moveaxis(i, 2, 0) / 255.0), rbd=unbatched
+    )
+    feature = SimpleNamespace(LoFTR=Network)
+    stubs = {
+        "torch": SimpleNamespace(inference_mode=nullcontext, from_numpy=Tensor),
+        "lightglue": SimpleNamespace(LightGlue=Network, SuperPoint=Network), "lightglue.utils": utils,
+        "kornia": SimpleNamespace(feature=feature), "kornia.feature": feature,
+    }  # fmt: skip
+    for name, module in stubs.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    expected = {"lightglue": ([[10, 10], [40, 50]], [[10, 10], [20, 30]], [0.9, 0.8]),
+                "loftr": ([[1, 2]], [[6, 2]], [0.7])}  # fmt: skip
+    for block, (name, values) in zip(BLOCKS[3:5], expected.items(), strict=True):
+        scope = {"__name__": "__main__"}
+        exec(block, scope)
+        for found, value in zip(scope[name](rgb, rgb), values, strict=True):
+            np.testing.assert_array_equal(found, value)
