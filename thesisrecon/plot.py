@@ -149,7 +149,7 @@ def cameras(
 ) -> Any:  # fmt: skip
     """Draw cameras and points in space, with ellipsoids of the points if covariances (N, 3, 3) are given.
 
-    ``cameras`` is a sequence or mapping of :class:`Camera`, a run, or P (V, 3, 4).
+    ``cameras`` is a sequence or mapping of :class:`thesisrecon.Camera`, a run, or P (V, 3, 4).
     """
     ax = _axis(ax, high=4.2, depth=True)
     if isinstance(cameras, RunResult):

@@ -36,7 +36,7 @@ def decompose_camera(P: F64, *, covariance: F64 | None = None) -> CameraParts:
     P : array_like (3, 4)
         Camera matrix of any scale and sign.
     covariance : array_like (12, 12), optional
-        Covariance of its entries, row by row, such as that of :func:`resect`.
+        Covariance of its entries, row by row, such as that of :func:`thesisrecon.resect`.
 
     Returns
     -------
@@ -156,8 +156,8 @@ def decompose_essential(
 ) -> EssentialPoses:  # fmt: skip
     """Return the four poses of an essential matrix, and how many matches each has in front (HZ 9.6.2, 9.6.3).
 
-    With E = U diag(1, 1, 0) V', R is U W V' or U W' V' and t is u3 or -u3. :func:`recover_pose` returns the
-    one of most matches.
+    With E = U diag(1, 1, 0) V', R is U W V' or U W' V' and t is u3 or -u3.
+    :func:`thesisrecon.recover_pose` returns the one of most matches.
 
     Parameters
     ----------

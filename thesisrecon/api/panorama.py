@@ -38,7 +38,7 @@ def stitch(images: Sequence[ImageInput], *, config: Config | None = None, seed: 
     images : sequence of path, ndarray or Image
         Two images or more, each overlapping the next.
     config, seed : PipelineConfig, str or path, int
-        As for :func:`match_pair`.
+        As for :func:`thesisrecon.match_pair`.
 
     Returns
     -------
