@@ -7,7 +7,7 @@ def test_a_stage_is_one_line_and_a_long_one_says_where_it_is(monkeypatch):
     now, lines = [0.0], list[str]()
     monkeypatch.setattr(_progress.time, "monotonic", lambda: now[0])
     update = _progress.print_stages(lines.append)
-    for done in range(11):
+    for done in [*range(11), 10]:
         update("features", done, 10)
         now[0] += 0.1
     for done in range(3):

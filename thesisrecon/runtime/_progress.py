@@ -15,14 +15,16 @@ SILENT_S = 30.0  # a line stands for a part of a stage if this time has passed
 
 def print_stages(write: Callable[[str], object]) -> Callable[[str, int, int], None]:
     """Return a progress function that writes a line when a stage is done, and one each ``SILENT_S``."""
-    started, said = dict[str, float](), time.monotonic()
+    started, ended, said = dict[str, float](), dict[str, int](), time.monotonic()
 
     def update(stage: str, done: int, total: int) -> None:
         nonlocal said
         now = time.monotonic()
         started.setdefault(stage, now)
+        if done >= total == ended.get(stage):
+            return  # said twice by the stage
         if done >= total or now - said > SILENT_S:
-            said = now
+            said, ended[stage] = now, done
             write(f"{STAGE_LABELS.get(stage, stage)}: {done} of {total}, {now - started[stage]:.0f} s\n")
 
     return update
