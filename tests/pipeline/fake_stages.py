@@ -16,7 +16,7 @@ import PIL.Image
 from tests.synthetic import reconstruction_of
 from thesisrecon import records
 from thesisrecon.camera import compose_camera
-from thesisrecon.config import ImageOptions, PipelineConfig
+from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import project
 from thesisrecon.stereo.depth import MultiViewScene, SparsePoints
@@ -219,7 +219,6 @@ def fake_config(**changes):
         features=FakeDetector(), matching=FakeMatcher(), epipolar=FakeEstimator(),
         verification=FakeVerifier(), tracks=FakeTracks(), projective=FakeProjective(),
         selfcalibration=FakeCalibrator(), metric=FakeMetric(), dense=FakeDense(),
-        images=ImageOptions(static="keep"),
     )  # fmt: skip
     return replace(config, **changes)
 

@@ -16,7 +16,8 @@ FEWEST = 4  # images of one size
 SAMPLES = 9  # images whose median is the static image
 LONG_SIDE = 640  # pixels of the images that are compared
 RADIUS = 3  # of the windows that are compared
-CORRELATION, SHIFT_PX, CONTRAST = 0.9, 0.5, 3.0  # of a window with the static image; levels
+CORRELATION, SHIFT_PX = 0.9, 0.5  # of a window with the static image
+CONTRAST, SLOPE = 3.0, 1.0  # of a window in levels, and in its flattest direction in levels per pixel
 LEAST = 1e-3  # share of the pixels below which agreement is chance
 STANDING = 0.95  # share of the textured pixels from which the camera itself stands still
 
@@ -93,5 +94,6 @@ def _agreement(template: F32, image: Image) -> tuple[B8, B8]:
         xx, xy, yy, xd, yd = (mean(p) for p in (x * x, x * y, y * y, x * d, y * d))
         det = np.maximum(xx * yy - xy * xy, 1e-12)
         shift = np.hypot(yy * xd - xy * yd, xx * yd - xy * xd) / det
-        same &= shift < SHIFT_PX
+        # An edge or a ramp shows no shift along it; windows beside a corner are taken with it.
+        same &= (shift < SHIFT_PX) & (det > SLOPE**2 * (xx + yy))
     return same, textured
