@@ -368,6 +368,39 @@ def test_exports_with_distortion_project_known_points(tmp_path, to, read):
         np.testing.assert_allclose(project(model.X), camera(view).project(model.X), atol=1e-6, rtol=0)
 
 
+def kalibr_cameras(file):
+    cameras = []
+    for line in file.read_text().splitlines():
+        key, value = line.strip().split(": ") if ": " in line else (line.strip(" :"), None)
+        if value is None:
+            assert key == f"cam{len(cameras)}"
+            cameras.append({})
+        else:
+            cameras[-1][key] = json.loads(value) if value[0] == "[" else value
+    return cameras
+
+
+def test_kalibr_cameras_project_known_points(tmp_path):
+    model = make_model(np.array([-0.1, 0.02, 0.0]), BARREL)
+    report = export(model, tmp_path, to="kalibr")
+    cameras = kalibr_cameras(report.file)
+    assert len(cameras) == 2
+    assert len(report.notes) == 1
+    limit_px = float(report.notes[0].split()[-5])
+    for view, given, tolerance in zip(model.views, cameras, (1e-6, limit_px), strict=False):
+        assert (given["camera_model"], given["distortion_model"]) == ("pinhole", "radtan")
+        assert given["resolution"] == [*SIZE]
+        fu, fv, pu, pv = given["intrinsics"]
+        k1, k2, p1, p2 = given["distortion_coeffs"]
+        assert (p1, p2) == (0.0, 0.0)
+        x = model.X @ view.R.T + view.t
+        x = x[:, :2] / x[:, 2:]
+        r2 = np.sum(x**2, axis=1, keepdims=True)
+        xy = x * (1 + k1 * r2 + k2 * r2**2) * [fu, fv] + [pu, pv]
+        assert np.abs(xy - camera(view).project(model.X)).max() <= tolerance
+    assert limit_px < 0.1
+
+
 def test_a_colmap_model_is_an_input_and_equal_cameras_are_shared(tmp_path, images):
     """Intrinsics of one camera stand at the top of transforms.json; a pinhole image is not resampled."""
     model = make_model(np.zeros(3), np.zeros(3))

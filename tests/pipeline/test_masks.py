@@ -62,11 +62,15 @@ def marked(tmp_path_factory):
     return place / "images", place / "masks", mask > 0
 
 
-def test_a_watermark_spoils_only_the_run_without_masks(marked, tmp_path):
+def test_a_watermark_spoils_only_the_run_that_keeps_it(marked, tmp_path):
     images, masks, mask = marked
+    options = {"until": "metric", "max_size": 320, "threads": 2}
     with suppress(StageFailure):
-        spoiled = reconstruct(images, tmp_path / "spoiled", until="metric", max_size=320, threads=2)
+        spoiled = reconstruct(images, tmp_path / "spoiled", set={"images.static": "keep"}, **options)
         assert not spoiled.metric.trusted
+    found = reconstruct(images, tmp_path / "found", **options)
+    assert found.metric.trusted
+    assert found.summary["cameras"][0]["focal_px"]["value"] == pytest.approx(FOCAL_PX, rel=5e-3)
     # Working images of 320 px: the masks are larger, as are the files.
     sizes = {"images.max_size_px": 320, "dense.max_side": 320, "dense.match_side": 320}
     result = reconstruct(images, tmp_path / "out", masks=masks, set=sizes, threads=2)

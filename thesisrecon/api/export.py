@@ -52,13 +52,14 @@ def _colmap(folder: Path, model: SparseModel, *, pinhole: bool) -> Path:
     return folder / "sparse" / "0"
 
 
-_DISTORTED: Mapping[str, Callable[[Path, SparseModel], Path]] = {
-    "colmap": lambda folder, model: _colmap(folder, model, pinhole=False),
-    "opencv": formats.write_opencv,
+_DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] = {
+    "colmap": lambda folder, model: (_colmap(folder, model, pinhole=False), []),
+    "opencv": lambda folder, model: (formats.write_opencv(folder, model), []),
+    "kalibr": formats.write_kalibr,
 }
 """Formats of cameras with distortion, which need no images."""
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
-_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye")}
+_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
 """Lenses that a format has; others have all, or no distortion."""
 _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
@@ -71,6 +72,7 @@ _FILES: Mapping[str, Sequence[str]] = {
     "nerfstudio": ("transforms.json", "points.ply"),
     "openmvs": ("scene.mvs",),
     "opencv": ("poses.yml", "camera_[0-9]*.yml"),
+    "kalibr": ("camchain.yaml",),
 }
 """Files of each format beside images and masks."""
 FORMATS = (*_PINHOLE, *_DISTORTED)
@@ -92,7 +94,8 @@ def export(
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
         cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
-        ``"colmap"`` and ``"opencv"`` keep the distortion, ``"nerfstudio"`` if all lenses are ``"fisheye"``.
+        ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion, ``"nerfstudio"`` if all lenses are
+        ``"fisheye"``.
     images : path or mapping of str to path, optional
         Folder of the original images, or their files by name; None: those that the run was made from. Those
         of a COLMAP model are used as stored, without EXIF rotation.
@@ -124,9 +127,9 @@ def export(
     >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> view = SparseView("a.jpg", np.eye(3), np.zeros(3), K, (640, 480), np.array([-0.1, 0, 0]))
     >>> with TemporaryDirectory() as folder:
-    ...     report = export(SparseModel([view]), folder, to="opencv")
+    ...     report = export(SparseModel([view]), folder, to="kalibr")
     >>> report.file.name
-    'poses.yml'
+    'camchain.yaml'
     """
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
@@ -150,7 +153,8 @@ def export(
     notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
     if to in _DISTORTED:
         with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
-            return ExportReport(_DISTORTED[to](folder, model), tuple(notes))
+            file, more = _DISTORTED[to](folder, model)
+        return ExportReport(file, (*notes, *more))
     native = to == "nerfstudio" and formats.is_fisheye(model)
     undistorted, pinholes = _undistorted(model, keep_lens=native)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)

@@ -28,7 +28,8 @@ def static_pixels(
     """Pixels (H, W) of each image that look the same at the same place in most images of its size.
 
     A window is static if it correlates with the median of the images and is not shifted against it. So are
-    distant points if the camera does not turn at all; images that are static everywhere are left alone.
+    distant points if the camera does not turn at all; images that are static everywhere, or have a mask, are
+    left alone.
 
     Returns
     -------
@@ -37,7 +38,9 @@ def static_pixels(
     """
     groups = defaultdict(list)
     for n, image in enumerate(images):
-        groups[image.size].append(n)
+        # A mask that is given decides what is left out.
+        if image.mask is None:
+            groups[image.size].append(n)
     found: dict[int, B8] = {}
     for group in groups.values():
         if len(group) >= FEWEST:

@@ -569,17 +569,14 @@ def add_masks(
 
 
 def mask_static(inputs: ImageSet, *, map_all: MapAll = map) -> tuple[ImageSet, list[str]]:
-    """Leave the static pixels out of the masks; return also a warning if there are any."""
+    """Mask the static pixels of images without a mask; return also a warning if there are any."""
     found = static_pixels(inputs.images, map_all=map_all)
     if not found:
         return inputs, []
     decoded = list(inputs.decoded)
     for n, static in found.items():
-        image = decoded[n].image
-        kept = ~static if image.mask is None else image.mask & ~static
-        # Nothing may be left of an image that has a mask of the static part.
-        if kept.any():
-            decoded[n] = with_digest(replace(decoded[n], image=replace(image, mask=kept)))
+        image = replace(decoded[n].image, mask=~static)
+        decoded[n] = with_digest(replace(decoded[n], image=image))
     share = 100.0 * float(np.median([static.mean() for static in found.values()]))
     return replace(inputs, decoded=tuple(decoded)), [Notice("static-pixels", share, len(found))]
 
