@@ -11,7 +11,8 @@ import pytest
 
 from tests.report import synthetic
 from thesisrecon.errors import StageFailure
-from thesisrecon.records import IntrinsicInterval, TexturedMesh
+from thesisrecon.lens import angles_from_axis, image_of_directions, lens_row
+from thesisrecon.records import IntrinsicInterval, Reconstruction, TexturedMesh, Tracks
 from thesisrecon.report import _assessment
 from thesisrecon.report._data import ResidualSummary, reprojection_distances, summarize_distances
 from thesisrecon.report._page import render_report
@@ -197,6 +198,28 @@ def test_the_residuals_are_the_noise_that_was_added():
     # Without the distortion the residuals grow by what it moved.
     without = reprojection_distances(synthetic.projective_run().projective)
     assert summarize_distances(np.concatenate(without)).rms_px > 2 * synthetic.NOISE_PX
+
+
+def test_points_beyond_90_degrees_of_a_fisheye_camera_have_their_residuals():
+    rng = np.random.default_rng(0)
+    row = lens_row("fisheye", np.array([0.02, -0.003]))
+    K = np.array([[200.0, 0.0, 400.0], [0.0, 200.0, 400.0], [0.0, 0.0, 1.0]])
+    X = rng.normal(size=(400, 3))
+    X = X[angles_from_axis(X) < np.radians(115.0)]
+    assert (X[:, 2] < 0.0).sum() > 50
+    n, moved = len(X), X + [0.3, 0.0, 0.0]
+    cameras = [np.column_stack([K, np.zeros(3)]), K @ np.column_stack([np.eye(3), [0.3, 0.0, 0.0]])]
+    xy = [image_of_directions(x, row) @ K[:2, :2].T + K[:2, 2] for x in (X, moved)]
+    view, point = np.repeat([0, 1], n), np.tile(np.arange(n), 2)
+    # The sign of a homogeneous point is arbitrary.
+    Xh = np.column_stack([X, np.ones(n)]) * rng.choice([-1.0, 1.0], (n, 1))
+    every = np.ones(n, dtype=bool)
+    found = Reconstruction(
+        "metric", np.array(cameras), Xh, np.ones(2, dtype=bool), every, np.ones(2 * n, dtype=bool),
+        Tracks(view, point, np.concatenate(xy), 2, n), np.full((2, 2), 800), 0.0, ("", ""),
+        K=np.array([K, K]), distortion=np.array([row, row]),
+    )  # fmt: skip
+    assert max(part.max() for part in reprojection_distances(found)) < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from thesisrecon.arrays import F32, F64, U8, rows_of_views
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry.homogeneous import dehomogenize
-from thesisrecon.lens import distort
+from thesisrecon.lens import image_of_directions
 from thesisrecon.results import RunResult, in_original_pixels, pose_deviations
 
 MAX_PICTURED = 100
@@ -94,13 +94,18 @@ def reprojection_distances(reconstruction: records.Reconstruction) -> list[F64]:
     view, X = r.tracks.view_index[used], r.X[r.tracks.point_index[used]]
     if r.K is not None:
         poses[r.registered] = np.linalg.solve(r.K[r.registered], poses[r.registered])
-    xy = dehomogenize(np.einsum("kij,kj->ki", poses[view], X))
-    if r.K is not None:
-        lens: float | F64 = 0.0 if r.distortion is None else r.distortion[view]
-        xy = np.einsum("kij,kj->ki", r.K[view, :2, :2], distort(xy, lens)) + r.K[view, :2, 2]
-    distance = np.linalg.norm(r.tracks.xy[used] - xy, axis=1)
-    parts = (distance[rows] for rows in rows_of_views(view, len(r.P)))
-    return [part[np.isfinite(part)] for part in parts]
+    # The weight of a point is positive, so that directions beyond 90 degrees keep their side.
+    x = np.einsum("kij,kj->ki", poses[view], X * np.where(X[:, 3:] < 0.0, -1.0, 1.0))
+    distances = []
+    for v, rows in enumerate(rows_of_views(view, len(r.P))):
+        if r.K is None:
+            xy = dehomogenize(x[rows])
+        else:
+            xy = image_of_directions(x[rows], 0.0 if r.distortion is None else r.distortion[v])
+            xy = xy @ r.K[v, :2, :2].T + r.K[v, :2, 2]
+        part = np.linalg.norm(r.tracks.xy[used[rows]] - xy, axis=1)
+        distances.append(part[np.isfinite(part)])
+    return distances
 
 
 def summarize_distances(distances: F64) -> ResidualSummary | None:
