@@ -207,7 +207,7 @@ def test_points_beyond_90_degrees_of_a_fisheye_camera_have_their_residuals():
     X = rng.normal(size=(400, 3))
     X = X[angles_from_axis(X) < np.radians(115.0)]
     assert (X[:, 2] < 0.0).sum() > 50
-    n, moved = len(X), [*X, 0.3, 0.0, 0.0]
+    n, moved = len(X), X + np.array([0.3, 0.0, 0.0])
     cameras = [np.column_stack([K, np.zeros(3)]), K @ np.column_stack([np.eye(3), [0.3, 0.0, 0.0]])]
     xy = [image_of_directions(x, row) @ K[:2, :2].T + K[:2, 2] for x in (X, moved)]
     view, point = np.repeat([0, 1], n), np.tile(np.arange(n), 2)
