@@ -4,6 +4,7 @@ import gc
 import importlib
 import logging
 import os
+import re
 import sys
 
 import pytest
@@ -52,6 +53,11 @@ def dask_cluster():
 def address(running):
     """What the command line calls it."""
     return str(running.scheduler_address).replace("tcp://", "dask://")
+
+
+def without_progress(text):
+    """What a command says on standard error beside the lines of its stages."""
+    return re.sub(r"^[^:\n]+: \d+ of \d+, \d+ s\n", "", text, flags=re.MULTILINE)
 
 
 def refuses(error, words, call, *arguments, **options):

@@ -252,7 +252,8 @@ def test_undistorted_and_smaller_views_have_the_camera_of_their_pixels(walled):
 
 
 def test_neighbours_are_on_both_sides_with_a_baseline_and_points_at_any_scale(walled):
-    views, points = views_of(walled), _sparse_points(walled.reconstruction)
+    views = views_of(walled)
+    points = _sparse_points(walled.reconstruction, views)
     assert set(_select_neighbours(points, views, 1, 2)) == {0, 2}
     assert set(_select_neighbours(points, views, 2, 2)) == {1, 3}
     S = np.diag([1e3, 1e3, 1e3, 1.0])
@@ -319,7 +320,8 @@ def test_disparities_are_interpolated_on_a_surface_and_not_across_its_edge():
 
 
 def test_brightness_is_made_alike(walled):
-    views, points = views_of(walled), _sparse_points(walled.reconstruction)
+    views = views_of(walled)
+    points = _sparse_points(walled.reconstruction, views)
     darker = np.rint(views[1].rgb * np.array([0.8, 0.7, 0.9])).astype(np.uint8)
     xy = _shared_projections(points, views[0], views[1])
     gain = _brightness_gain(views[0].rgb, darker, *xy) / _brightness_gain(views[0].rgb, views[1].rgb, *xy)
