@@ -31,8 +31,8 @@ def command_page() -> str:
         "# Command line",
         "",
         "This page is made from the code. `thesisrecon COMMAND --help` prints the same. Exit codes: 0 done,",
-        "2 wrong command or settings, 3 the images cannot be reconstructed, 4 a limit of `compare` exceeded,",
-        "130 and 143 interrupted, 1 internal error.",
+        "2 wrong command or settings, 3 the images cannot be reconstructed, 4 a limit of `compare` exceeded",
+        "or an exercise not solved, 130 and 143 interrupted, 1 internal error.",
         "",
     ]
     for info in command_line.registered_commands:

@@ -420,12 +420,58 @@ def interpolate(
     typer.echo(written)
 
 
+_ACTION = typer.Argument(
+    metavar="list|show|check", help="List all, print one with its skeleton, or grade a file."
+)
+_NAME = typer.Argument(metavar="NAME", help="An exercise of the list.")
+_FILE = typer.Argument(metavar="FILE", help="Your solution: a Python file with the function NAME.")
+_SECONDS = typer.Option("--seconds", min=1, help="Time limit of check.")
+
+
+def exercises(
+    action: Annotated[Literal["list", "show", "check"], _ACTION] = "list",
+    name: Annotated[str, _NAME] = "",
+    file: Annotated[Path | None, _FILE] = None,
+    seconds: Annotated[int, _SECONDS] = 60,
+) -> None:
+    """Exercises on multiple-view geometry: check prints the accuracy or the mistake (exit code 4)."""
+    common.cap_threads(1)
+    import runpy
+    import subprocess
+
+    home = next((h / "exercises" for h in Path(__file__).parents[1:3] if (h / "exercises").is_dir()), None)
+    if home is None:
+        raise UsageError("the exercises are not installed with this copy of the package; install it again")
+    titles = runpy.run_path(str(home / "grader.py"))["titles"]()
+    if action == "list":
+        typer.echo("\n".join(f"{one:20}{title}" for one, title in titles.items()))
+        return
+    if name not in titles:
+        raise UsageError(f"there is no exercise {name!r}; the exercises are {', '.join(titles)}")
+    if action == "show":
+        typer.echo((home / f"{name}.py").read_text("utf-8"), nl=False)
+        return
+    if file is None or not file.is_file():
+        raise UsageError(
+            f"exercises check takes your file, as: thesisrecon exercises check {name} my.py; got {file}"
+        )
+    # A process of its own: an endless loop can be ended.
+    command = [sys.executable, str(home / "grader.py"), name, str(file)]
+    try:
+        code = subprocess.run(command, timeout=seconds, check=False).returncode
+    except subprocess.TimeoutExpired:
+        typer.echo(f"{name}: not solved\nit did not end within {seconds} s: is there an endless loop?")
+        code = BEYOND_LIMIT
+    if code:
+        raise typer.Exit(code)
+
+
 app = typer.Typer(
     name="thesisrecon", help="From uncalibrated images to metric cameras, points and a textured model.",
     context_settings={"help_option_names": ["-h", "--help"]}, rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )  # fmt: skip
-for _command in (reconstruct, demo, inspect, compare, render, interpolate, export):
+for _command in (reconstruct, demo, inspect, compare, render, interpolate, export, exercises):
     app.command()(_command)
 
 

@@ -1,0 +1,1 @@
+"""Data, errors and usual mistakes of the exercises, a file each."""
