@@ -1,11 +1,13 @@
 """3. Camera calibration by the DLT
 
 A camera P (3, 4) sees X = (X, Y, Z, 1)' at x ~ P X. Each known point gives two linear equations in the
-twelve entries of P, as for a homography; six points or more determine it. Normalise pixels and points first.
-Then P ~ K [R t]: the RQ decomposition of the first three columns (scipy.linalg.rq) gives K, upper triangular
-with a positive diagonal, and the rotation R, det R = 1. With this K, t = inv(K) P[:, 3]; at last K is divided
-by K[2, 2] (Hartley and Zisserman, 7.1).
+twelve entries of P, as for a homography; six points or more determine it. Normalise pixels and points
+first. Then P ~ K [R t]: the RQ decomposition of the first three columns (scipy.linalg.rq) gives K, upper
+triangular with a positive diagonal, and the rotation R, det R = 1. With this K, t = inv(K) P[:, 3]; at last
+K is divided by K[2, 2] (Hartley and Zisserman, 7.1).
 """
+
+import numpy as np
 
 
 def camera_from_points(X, xy):

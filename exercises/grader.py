@@ -15,6 +15,7 @@ A wrong result is compared with those of all mistakes: the nearest, if it is nea
 """
 
 import ast
+import copy
 import importlib
 import importlib.util
 import inspect
@@ -81,7 +82,7 @@ def _raised(error, path=None):
 
 def _called(name, function, inputs, path):
     """The result of a solution; its arguments are copies."""
-    given = [one.copy() if isinstance(one, np.ndarray) else one for one in inputs]
+    given = copy.deepcopy(inputs)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -172,7 +173,7 @@ def _mistake(check, outputs, right, cases):
         for output, good, case in zip(outputs, right, cases, strict=True):
             try:
                 with np.errstate(all="ignore"):
-                    wrong = change(check.solve, *case.inputs)
+                    wrong = change(check.solve, *copy.deepcopy(case.inputs))
                 wrong, good, own = (_vector(check, one, case) for one in (wrong, good, output))
                 # A result of zeros is near all small results.
                 scale = min(_distance(good, wrong), _distance(0 * wrong, wrong))
@@ -190,7 +191,7 @@ def grade(name, function, path=None):
     check = importlib.import_module(f"checks.{name}")
     check.solve = solution(name)
     cases = [check.data(np.random.default_rng(seed)) for seed in range(getattr(check, "CASES", 5))]
-    right = [checked(name, check.solve(*case.inputs), check.RETURNS) for case in cases]
+    right = [checked(name, check.solve(*copy.deepcopy(case.inputs)), check.RETURNS) for case in cases]
     unit = check.UNIT
     reference = _rms([check.error(one, case) for one, case in zip(right, cases, strict=True)])
     try:
@@ -208,7 +209,8 @@ def grade(name, function, path=None):
         beside.append(f"bound {_rms([check.bound(case) for case in cases]):.3g}")
     lines = [f"error {error:.3g} {unit}, RMS over {len(cases)} data sets ({', '.join(beside)})"]
     with np.errstate(all="ignore"):
-        faults = check.faults(outputs[0], cases[0]) if hasattr(check, "faults") else []
+        of = getattr(check, "faults", lambda *_: [])
+        faults = next(filter(None, map(of, outputs, cases)), [])
     allowed = max(getattr(check, "LIMIT", 1.25) * reference, getattr(check, "FLOOR", 1e-6))
     if error <= allowed and not faults:
         return True, lines

@@ -6,10 +6,12 @@ nine entries of H, the first two rows of x2 x (H x1) = 0:
     [ 0'      -x1'    y2 x1' ]
     [ x1'      0'    -x2 x1' ] h = 0,    h = the rows of H.
 
-With N >= 4 matches, h is the right singular vector of the least singular value. Normalise first: T1, T2 bring
-the points of each image to mean 0 and mean distance sqrt 2. Afterwards H = inv(T2) Hn T1 (Hartley and
+With N >= 4 matches, h is the right singular vector of the least singular value. Normalise first: T1, T2
+bring the points of each image to mean 0 and mean distance sqrt 2. Afterwards H = inv(T2) Hn T1 (Hartley and
 Zisserman, algorithm 4.2).
 """
+
+import numpy as np
 
 
 def homography(xy1, xy2):

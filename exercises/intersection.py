@@ -1,8 +1,10 @@
 """1. Points and lines in homogeneous coordinates
 
-A pixel (x, y) is the vector (x, y, 1)', a line the vector l with l' x = 0. The line through two points is
-l = x1 x x2 (cross product), and two lines meet in x = l x m, which is divided by its third coordinate.
+A pixel (x, y) is the vector (x, y, 1)', a line the vector l with l' x = 0. The line through two points is l
+= x1 x x2 (cross product), and two lines meet in x = l x m, which is divided by its third coordinate.
 """
+
+import numpy as np
 
 
 def intersection(a, b, c, d):

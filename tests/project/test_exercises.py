@@ -60,6 +60,64 @@ WRONG = {
         ("best, pose = front, (R, t)", "best, pose = front, (R.T, -R.T @ t)", "inverse pose"),
         ("best, pose = front, (R, t)", "best, pose = front, (R, -t)", "t has the wrong sign"),
     ],
+    "seven_point": [
+        (
+            "T2.T @ (k * F1 + (1 - k) * F2) @ T1 for",
+            "(T2.T @ (k * F1 + (1 - k) * F2) @ T1).T for",
+            "transposed",
+        ),
+        ("np.polyfit(a, values, 3)", "np.polyfit(a, values, 3)[::-1]", "reverse order"),
+        ("T2.T @ (k * F1 + (1 - k) * F2)", "T2.T @ (k * F2 + (1 - k) * F1)", "swapped"),
+        ("np.abs(roots.imag) < 1e-6", "roots.real == roots.real", "complex"),
+    ],
+    "pose_from_points": [
+        ("return U @ Vt,", "return P[:, :3] / s.mean(),", "not a rotation"),
+        ("P[:, 3] / s.mean()", "P[:, 3]", "not divided"),
+        ("np.linalg.inv(K) @ dlt", "dlt", "K is not used"),
+        ("return U @ Vt,", "return (U @ Vt).T,", "transposed"),
+    ],
+    "height": [
+        (
+            "np.linalg.norm(np.cross(v, t), axis=1)",
+            "np.linalg.norm(np.cross(v, b), axis=1)",
+            "crossed with b",
+        ),
+        ("np.abs(b @ l)", "np.abs(t @ l)", "multiplied with t"),
+        ("ratio(v, l, base, top) / known", "known / ratio(v, l, base, top)", "inverted"),
+        ("return known_height * ratio", "return ratio", "known height is not used"),
+    ],
+    "factorisation": [
+        ("(xy - t[:, None])", "xy", "not subtracted"),
+        ("s[:3]", "np.sqrt(s[:3])", "square root"),
+        ("* s[:3]", "", "not used"),
+        ("xy.mean(axis=1)", "np.tile(xy.mean(axis=(0, 1)), (len(xy), 1))", "each image has its own"),
+    ],
+    "horizon": [
+        (
+            "return np.array([[1, 0, 0], [0, 1, 0], l / l[2]])",
+            "return np.linalg.inv([[1, 0, 0], [0, 1, 0], l / l[2]])",
+            "inverted",
+        ),
+        ("l = np.cross(v1, v2) / [1000, 1000, 1]", "l = np.cross(v1, v2)", "not undone"),
+        ("[0, 1, 0], l / l[2]])", "[0, 1, 0], l / l[2]]).T", "transposed"),
+        ("np.cross(ends[:, 0], ends[:, 1])", "np.cross(ends[:2, 0], ends[:2, 1])", "first two segments"),
+    ],
+    "dual_quadric": [
+        ("np.sqrt(w[:, 0, 0] / w[:, 2, 2])", "w[:, 0, 0] / w[:, 2, 2]", "root is missing"),
+        ("w[:, 0, 0] / w[:, 2, 2]", "w[:, 2, 2] / w[:, 0, 0]", "inverted"),
+        ("return np", "return -np", "sign"),
+        ("return np", "return 1000 * np", "pixels"),
+    ],
+    "ransac": [
+        ("return best", "return ~best", "inverted"),
+        (" < threshold", " < np.inf", "all matches"),
+        (
+            "inliers = sampson(eight_point(xy1[some], xy2[some])",
+            "inliers = sampson(eight_point(xy1, xy2)",
+            "without samples",
+        ),
+        ("eight_point(xy1[some], xy2[some])", "eight_point(xy2[some], xy1[some])", "transposed"),
+    ],
 }
 
 
