@@ -158,6 +158,8 @@ class UsageError(ValueError):
 class WorkersLost(UsageError):
     """The workers of a run were killed or cannot be reached; finished work is kept."""
 
+    task: int | None = None  #: number of the task on which they died
+
 
 class OutputError(UsageError):
     """A file or folder that cannot be written, for example for a full disk or missing permission.

@@ -23,6 +23,7 @@ from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._meshes import read_mesh
 from thesisrecon.matching.pair_selection import SequenceWindow
 from thesisrecon.pipeline import algorithm1, matching, stages
+from thesisrecon.pipeline import run as pipeline_run
 from thesisrecon.pipeline.run import name_images, stream
 from thesisrecon.records import Image
 from thesisrecon.surface import fusion
@@ -100,6 +101,19 @@ def test_cameras_with_skew_are_written_where_they_can_be(tmp_path):
     assert not (tmp_path / "sparse").exists()
     assert (tmp_path / "points.ply").is_file()
     assert [view["K"][0][1] for view in read(tmp_path / "cameras.json")["cameras"]] == [2.0] * 4
+
+
+def test_a_run_of_other_library_versions_is_not_resumed_in_silence(tmp_path, monkeypatch):
+    run(tmp_path / "out", shared=tmp_path / "shared")
+    other = algorithm1.library_versions() | {"numpy": "1.0"}
+    for module in (algorithm1, pipeline_run):
+        monkeypatch.setattr(module, "library_versions", lambda: other)
+    words = rf'holds another run \(versions.numpy was "{np.__version__}" and is now "1.0"\); choose another'
+    refuses(UsageError, words, run, tmp_path / "out")
+    for given in ({"out": tmp_path / "out", "overwrite": True}, {"out": tmp_path / "b"}):
+        CALLS.clear()
+        run(shared=tmp_path / "shared", **given)
+        assert ("detect 00.png" in CALLS) == ("overwrite" in given), "results of the same versions are shared"
 
 
 def test_a_second_run_computes_only_what_is_damaged_or_new(tmp_path):

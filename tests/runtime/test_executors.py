@@ -4,8 +4,11 @@ import concurrent.futures as futures
 import hashlib
 import multiprocessing
 import os
+import re
+import shutil
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -114,11 +117,12 @@ def undisturbed(tmp_path):
     return results(tmp_path / "whole")
 
 
-def test_a_worker_of_a_cluster_that_is_killed_loses_nothing(dask_cluster, tmp_path):
+def test_a_worker_of_a_cluster_that_is_killed_is_named_and_loses_nothing(dask_cluster, tmp_path, caplog):
     whole = undisturbed(tmp_path)
     executor, config = address(dask_cluster), deadly(tmp_path)
     reconstruct(photographs(4), tmp_path / "out", config=config, until="metric", executor=executor)
     assert (tmp_path / "killed").exists()
+    assert re.search(r"1 of \d Dask workers were lost: others do their tasks", caplog.text)
     assert results(tmp_path / "out") == whole
 
 
@@ -131,6 +135,69 @@ def test_a_killed_worker_process_is_reported_and_the_run_continues(tmp_path):
         reconstruct(photographs(4), tmp_path / "out", **given)
     reconstruct(photographs(4), tmp_path / "out", **given)
     assert results(tmp_path / "out") == whole
+
+
+@dataclass(frozen=True)
+class AlwaysDeadlyMatcher(fakes.FakeMatcher):
+    """Kills its process at one pair, as a task does that needs too much memory."""
+
+    def match(self, view1, view2, *, pair, **given):
+        if tuple(pair) == (1, 2) and multiprocessing.parent_process() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().match(view1, view2, pair=pair, **given)
+
+
+def test_a_task_that_kills_every_worker_names_its_images_and_what_to_do(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    given = {"config": fake_config(matching=AlwaysDeadlyMatcher()), "until": "metric"}
+    images = photographs(4)
+    words = (
+        r"2 Dask workers died .* more memory than their 1 GiB: start workers .*; it was for "
+        rf"{images[1].name}, {images[2].name} \(in the stage matches\).* repeat the command to resume"
+    )
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(n_workers=1, memory_limit="1GiB", **LOCAL) as running,
+    ):
+        refuses(WorkersLost, words, reconstruct, images, tmp_path, executor=address(running), **given)
+    assert reconstruct(images, tmp_path, **given).metric is not None
+
+
+def test_workers_that_start_late_are_awaited_as_long_as_the_address_says(monkeypatch, caplog):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(workers, "ANSWER_S", 3.0)
+    found = []
+    with distributed.LocalCluster(n_workers=0, processes=False, protocol="tcp://", **LOCAL) as running:
+        place = address(running)
+        soon, later = (Workers(1, f"{place}?wait={seconds}") for seconds in (1, 60))
+        refuses(UsageError, r"no workers after 1 s; .* \?wait=SECONDS", soon.run, abs, [(-1,)], found.append)
+        threading.Timer(4.0, running.scale, [1]).start()
+        later.run(abs, [(-1,)], lambda _, result: found.append(result))
+    assert found == [1]
+    assert "has no workers yet: waiting 60 s" in caplog.text
+
+
+def test_a_cluster_with_certificates_is_used_and_missing_ones_are_named(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    if (openssl := shutil.which("openssl")) is None:
+        pytest.skip("openssl is not installed")
+    key, certificate = str(tmp_path / "key.pem"), str(tmp_path / "certificate.pem")
+    command = [openssl, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=test", "-days", "2"]
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    found, place = [], "distributed.comm.tls"
+    tls = {f"{place}.{role}.key": key for role in ("scheduler", "worker", "client")}
+    tls |= {name.replace(".key", ".cert"): certificate for name in tls} | {f"{place}.ca-file": certificate}
+    with dask.config.set(tls):
+        security = distributed.Security()
+    cluster = {"n_workers": 1, "processes": False, "security": security, "protocol": "tls://", **LOCAL}
+    with distributed.LocalCluster(**cluster) as running:
+        one = Workers(1, running.scheduler_address)
+        refuses(UsageError, "needs certificates in the configuration of Dask", one.run, abs, [(-1,)], None)
+        with dask.config.set(tls):
+            one.run(abs, [(-1,)], lambda _, result: found.append(result))
+    assert found == [1]
 
 
 @pytest.fixture
@@ -191,11 +258,15 @@ def test_an_unreachable_scheduler_is_reported_on_the_command_line(monkeypatch, t
     assert not (tmp_path / "out").exists()
 
 
-def test_workers_of_other_code_unknown_tasks_and_invalid_executors_are_refused():
-    refuses(UsageError, "another version of thesisrecon", workers._answer, "another", b"")
+def test_workers_of_other_versions_unknown_tasks_and_invalid_executors_are_refused():
+    words = r"has thesisrecon 0.* \(\w{12}\), python .*, this program thesisrecon None"
+    refuses(UsageError, words, workers._answer, {}, b"")
+    other = workers._environment() | {"numpy": "1.0"}
+    words = rf"has numpy {np.__version__}, this program numpy 1\.0; install"
+    refuses(UsageError, words, workers._answer, other, b"")
     missing = b"cno_such_module\nfunction\n."
     with pytest.raises(UsageError, match="cannot load its task: No module named 'no_such_module'"):
-        workers._answer(workers.package_key(), missing)
+        workers._answer(workers._environment(), missing)
     refuses(UsageError, "or a concurrent", Workers, 1, 3)
 
 

@@ -2,8 +2,10 @@
 
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from tests.pipeline.fake_stages import fake_config, kept_bytes, photographs
@@ -14,7 +16,7 @@ from validation.metrics.cameras import holding_std
 from validation.scenes.dinosaur import load_dinosaur
 from validation.scenes.rigs import cube_rig, make_cloud, noisy_tracks, projective_from_truth
 from validation.scenes.stereo import StereoPair, seen_by_both
-from validation.studies import subsets
+from validation.studies import cluster_efficiency, subsets
 from validation.studies.cluster_efficiency import TaskMeter, efficiency_table
 from validation.studies.dinosaur import compare, to_metrics
 
@@ -104,3 +106,13 @@ def test_a_toy_run_is_measured_task_by_task_and_its_result_is_the_same(tmp_path)
     assert received == pytest.approx(sum(len(pickle.dumps([p], 5)) for p in plain.pairs), rel=0.02)
     table = efficiency_table(1.0, {workers: meter.tasks(workers) for workers in (1, 2)})
     assert table.count("| whole run |") == 2
+
+
+def test_the_cluster_study_counts_the_first_matches_of_many_images(tmp_path, monkeypatch):
+    for path in sorted((Path(__file__).parents[2] / "fixtures" / "courtyard" / "images").iterdir())[4:7]:
+        PIL.Image.open(path).resize((160, 120)).save(tmp_path / f"{path.stem}.png")
+    monkeypatch.setattr(cluster_efficiency, "write_scene", lambda *_, **__: str(tmp_path))
+    study = cluster_efficiency.cluster_efficiency_study
+    (table,) = study(tmp_path, sizes=[3], until="matches", set_=["matching.many_images=2"])
+    assert table.startswith("3 images")
+    assert [table.count(f"\n| {stage} | ") for stage in ("first matches", "whole run")] == [5, 5]

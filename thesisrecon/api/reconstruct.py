@@ -69,9 +69,9 @@ def reconstruct(
     **options
         ``until``: last stage, "features", "matches", "projective", "metric", "dense" or "model" (by default
         "model", where a surface that fails is only a warning); ``threads``: number of workers;
-        ``executor``: "local" (threads), "processes", "dask://HOST:PORT" (needs the extra ``distributed``) or
-        a :class:`concurrent.futures.Executor`; ``overwrite``: replace another run in the output folder;
-        ``shared``: folder in which runs share cached results of stages.
+        ``executor``: "local" (threads), "processes", "dask://HOST:PORT" or "tls://HOST:PORT" (both need the
+        extra ``distributed``) or a :class:`concurrent.futures.Executor`; ``overwrite``: replace another run
+        in the output folder; ``shared``: folder in which runs share cached results of stages.
 
     Returns
     -------

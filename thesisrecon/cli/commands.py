@@ -59,7 +59,7 @@ Pairs = Annotated[str | None, typer.Option("--pairs", metavar=_PAIRS, help=_PAIR
 _UNTIL_HELP = "Last stage to run: features, matches, projective, metric, dense or model (the default)."
 Until = Annotated[str | None, typer.Option("--until", help=_UNTIL_HELP)]
 _EXECUTOR_HELP = "Run workers as threads (local), as processes, or on a Dask cluster."
-_EXECUTORS = "local|processes|dask://HOST:PORT"
+_EXECUTORS = "local|processes|dask://HOST:PORT|tls://HOST:PORT"
 Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
 _GPS_HELP = "Move the model to the GPS positions of the images: metres east, north, up."
 Gps = Annotated[bool, typer.Option("--gps", help=_GPS_HELP)]

@@ -12,7 +12,7 @@ import numpy as np
 from thesisrecon._numba import code_digest
 from thesisrecon.config.intrinsics import camera_numbers
 from thesisrecon.config.text import tables_from_config
-from thesisrecon.errors import Notice, StageFailure, counted
+from thesisrecon.errors import Notice, StageFailure, WorkersLost, counted
 from thesisrecon.io._images import ImageSet
 from thesisrecon.metric._joined_models import join_all, join_models, joinable
 from thesisrecon.pipeline import outputs, stages
@@ -23,6 +23,7 @@ from thesisrecon.pipeline.run import Job, Run, name_images, stream
 from thesisrecon.records import MetricResult, Reconstruction, TwoView
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._blas import one_blas_thread
+from thesisrecon.runtime._executors import library_versions
 from thesisrecon.runtime._precompilation import precompile
 from thesisrecon.runtime._run_folder import RunDirectory
 
@@ -225,7 +226,10 @@ def run_job(job: Job) -> RunResult:
 
 def _last_named(job: Job) -> tuple[RunResult, StageFailure | None]:
     """The last result of a job; the failure that ended it names images by their files."""
-    result, failure = last_result(algorithm1(job), empty_result(job.run, job.inputs))
+    try:
+        result, failure = last_result(algorithm1(job), empty_result(job.run, job.inputs))
+    except WorkersLost as lost:
+        raise WorkersLost(name_images(str(lost), job.names)) from None
     if failure is not None:
         parts = (failure.reason, failure.evidence, failure.advice)
         failure = StageFailure(*(name_images(part, job.names) for part in parts))
@@ -344,7 +348,8 @@ def run_adopted(job: Job, *, overwrite: bool, source: Source | None = None) -> R
 def _settings_identity(run: Run, source: Source | None) -> dict[str, Any]:
     """The part of a run's identity that is known before its images are read."""
     given = {} if source is None else {"source": source}
-    return {"version": 1, **given, "seed": run.seed, "settings": tables_from_config(run.config)}
+    settings = tables_from_config(run.config)
+    return {"version": 1, **given, "seed": run.seed, "settings": settings, "versions": library_versions()}
 
 
 def identity_of(run: Run, inputs: ImageSet, source: Source | None = None) -> dict[str, Any]:

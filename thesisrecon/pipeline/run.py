@@ -27,7 +27,7 @@ from thesisrecon.io._images import ImageSet
 from thesisrecon.metric.given_cameras import GivenCameras
 from thesisrecon.records import Features, Image, IntrinsicsPrior, PairChoice, StageReport, Tracks, TwoView
 from thesisrecon.runtime import _run_folder
-from thesisrecon.runtime._executors import Workers, available_threads
+from thesisrecon.runtime._executors import Workers, available_threads, library_versions
 from thesisrecon.runtime._progress import default_progress
 
 Progress = Callable[[str, int, int], None]
@@ -194,7 +194,16 @@ class Run:
                 progress(stage, done, len(names))
 
             local = self.workers if self.workers.in_process or not here else Workers(self.workers.threads)
-            local.run(function, tasks(), finished)
+            try:
+                local.run(function, tasks(), finished)
+            except errors.WorkersLost as lost:
+                if lost.task is None:
+                    raise
+                items = [names[n] for n in submitted[lost.task]]
+                images = dict.fromkeys(f"#{int(n)}" for item in items for n in re.findall(r"\d{5}", item))
+                shown = ", ".join(list(images or items)[:4])
+                more = f" and {len(images) - 4} more" if len(images) > 4 else ""
+                raise errors.WorkersLost(f"{lost}; it was for {shown}{more}") from None
             return records
 
     @contextmanager
@@ -230,8 +239,8 @@ class Run:
         self.warnings.extend(w for w in warnings if w not in self.warnings)
 
     def key(self, stage: str, *parts: Any) -> str:
-        """Cache key of an item; ``parts`` are everything it depends on: settings, code and inputs."""
-        return _run_folder.key_of(FOLDERS[stage], *parts)
+        """Cache key of an item; ``parts`` are everything it depends on, but the versions of libraries."""
+        return _run_folder.key_of(FOLDERS[stage], library_versions(), *parts)
 
 
 class FrontEnd(Protocol):

@@ -12,12 +12,13 @@ import multiprocessing.connection
 import multiprocessing.resource_tracker
 import os
 import pickle
+import platform
 import re
 import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -25,6 +26,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
+from thesisrecon import __version__
 from thesisrecon.errors import Notice, UsageError, WorkersLost, unknown_word
 from thesisrecon.runtime._signals import CODES, starting_processes
 
@@ -33,24 +35,25 @@ T = TypeVar("T")
 Task = tuple[Any, ...]
 Finished = Callable[[int, Any], None]
 
-NAMES = ("local", "processes", "dask://HOST:PORT")
+NAMES = ("local", "processes", "dask://HOST:PORT", "tls://HOST:PORT")
 AHEAD = 2  # Tasks submitted per worker: enough to keep it busy, but few in memory
 CHECK_S = 5.0  # Time without results after which the workers are checked
-ANSWER_S = 10.0  # Timeout of the scheduler, and of the first worker
-WORKERLESS_S = 60.0  # Time a cluster may be without workers during a run, so that they can be restarted
+ANSWER_S = 10.0  # Timeout of the scheduler, and of the first worker unless the address has ?wait=SECONDS
+WORKERLESS_S = 60.0  # The same for a cluster that loses all workers, so that they can be restarted
 _log = logging.getLogger(__name__)
 
 
 def is_dask_address(executor: object) -> bool:
-    return isinstance(executor, str) and executor.partition(":")[0].lower() == "dask"
+    return isinstance(executor, str) and executor.partition(":")[0].lower() in ("dask", "tls")
 
 
-def _dask_place(executor: str) -> str:
-    """HOST:PORT of ``dask://HOST:PORT``."""
-    found = re.fullmatch(r"dask://((?:[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5}))", executor)
-    if found is None or not 0 < int(found[2]) < 65536:
+def _dask_place(executor: str) -> tuple[str, str, float]:
+    """Protocol, HOST:PORT and seconds of ``dask://HOST:PORT?wait=SECONDS``; 0: not given."""
+    host = r"(?:[^\s:/@?#\[\]]+|\[[0-9A-Fa-f:.]+\])"
+    found = re.fullmatch(rf"(dask|tls)://({host}:(\d{{1,5}}))(?:\?wait=(\d{{1,7}}))?", executor)
+    if found is None or not 0 < int(found[3]) < 65536:
         raise UsageError(Notice("no-scheduler-address", executor))
-    return found[1]
+    return found[1].replace("dask", "tcp"), found[2], float(found[4] or 0)
 
 
 @dataclass
@@ -60,18 +63,33 @@ class Cluster:
     address: str
     client: Any
     executor: futures.Executor
+    wait_s: float  #: time it may be without workers
     _alone_since: float = 0.0
+    _seen: set[str] = field(default_factory=set)
 
     def parallel(self) -> int:
         """Number of worker threads, at least 1: a worker may come back."""
         return max(1, sum(self._threads().values()))
 
     def check(self) -> None:
-        """Raise ``WorkersLost`` if the scheduler is gone or has had no worker for ``WORKERLESS_S``."""
+        """Raise ``WorkersLost`` if the scheduler is gone or has had no worker for ``wait_s``."""
         now = time.monotonic()
         self._alone_since = 0.0 if self._threads() else self._alone_since or now
-        if self._alone_since and now - self._alone_since > WORKERLESS_S:
-            raise WorkersLost(Notice("cluster-alone", self.address, WORKERLESS_S))
+        if self._alone_since and now - self._alone_since > self.wait_s:
+            raise WorkersLost(Notice("cluster-alone", self.address, self.wait_s))
+
+    @staticmethod
+    def require_alive(future: futures.Future[Any], task: int) -> None:
+        """Raise ``WorkersLost`` if every worker that got a task died."""
+        from distributed import KilledWorker
+
+        if not isinstance(error := future.exception(), KilledWorker):
+            return
+        limit = getattr(error.last_worker, "memory_limit", 0)
+        memory = f"their {limit / 2**30:.2g} GiB" if limit else "they have"
+        lost = WorkersLost(Notice("workers-died", error.allowed_failures + 1, memory))
+        lost.task = task
+        raise lost from None
 
     def lost(self) -> WorkersLost:
         """The error for tasks that were cancelled."""
@@ -83,6 +101,10 @@ class Cluster:
         except Exception:
             # A broken connection raises many types.
             raise self.lost() from None
+        if gone := len(self._seen - found.keys()):
+            then = "others do their tasks" if found else f"waiting {self.wait_s:.0f} s for others"
+            _log.warning("%d of %d Dask workers were lost: %s", gone, len(self._seen), then)
+        self._seen = set(found)
         return found
 
 
@@ -97,7 +119,8 @@ class _Remote(NamedTuple):
 @contextmanager
 def connect_dask(executor: str) -> Iterator[Cluster]:
     """Connect to a Dask scheduler for the duration of a block."""
-    place = _dask_place(executor)
+    protocol, place, wait_s = _dask_place(executor)
+    first_s = wait_s or ANSWER_S
     try:
         import dask
         from distributed import Client
@@ -107,19 +130,24 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
     with _quiet("distributed"), dask.config.set(settings):
         try:
-            client = Client(f"tcp://{place}", timeout=ANSWER_S, set_as_default=False)
+            client = Client(f"{protocol}://{place}", timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
             raise UsageError(Notice("no-scheduler", place, ANSWER_S)) from None
+        except TypeError as error:
+            # TLS without certificates in Dask's configuration.
+            raise UsageError(Notice("no-certificates", executor, error)) from None
         try:
+            if not client.nthreads():
+                _log.warning("the Dask scheduler at %s has no workers yet: waiting %.0f s", place, first_s)
             try:
-                client.wait_for_workers(1, timeout=ANSWER_S)
+                client.wait_for_workers(1, timeout=first_s)
             except (OSError, futures.TimeoutError):
-                raise UsageError(Notice("no-dask-workers", place)) from None
+                raise UsageError(Notice("no-dask-workers", place, first_s, protocol)) from None
             # By default results pass through the scheduler. Arguments must: scattered ones would be lost with
             # their worker.
             client.direct_to_workers = _reachable(client.nthreads())
             # pure=False: do not hash all bytes of the tasks.
-            yield Cluster(place, client, client.get_executor(pure=False))
+            yield Cluster(place, client, client.get_executor(pure=False), wait_s or WORKERLESS_S)
         finally:
             with suppress(Exception):
                 client.close(timeout=1.0)
@@ -159,6 +187,27 @@ def package_key() -> str:
         content.update(str(path.relative_to(package)).encode())
         content.update(path.read_bytes())
     return content.hexdigest()[:32]
+
+
+@cache
+def library_versions() -> dict[str, str]:
+    """Return the versions that results depend on: others give other last digits."""
+    import numba
+    import numpy
+    import scipy
+
+    libraries: tuple[Any, ...] = (numba, numpy, scipy)
+    builds = [lib.show_config(mode="dicts").get("Build Dependencies", {}) for lib in libraries[1:]]
+    blas = [build.get("blas", {}) for build in builds]
+    return {
+        "python": ".".join(platform.python_version_tuple()[:2]),  # its sums of floats changed in 3.12
+        **{lib.__name__: str(lib.__version__) for lib in libraries},
+        "blas": ", ".join(f"{found.get('name')} {found.get('version')}" for found in blas),
+    }
+
+
+def _environment() -> dict[str, str]:
+    return {"thesisrecon": f"{__version__} ({package_key()[:12]})", **library_versions()}
 
 
 def available_threads() -> int:
@@ -286,7 +335,7 @@ def _run_all(
             for n, given in islice(left, max(AHEAD * remote.parallel() - len(waiting), 0)):
                 call: Task = (function, *given)
                 if pickled:
-                    call = (_answer, package_key(), _pickled((function, given)))
+                    call = (_answer, _environment(), _pickled((function, given)))
                 waiting[remote.executor.submit(*call)] = n
             if not waiting:
                 return
@@ -294,6 +343,8 @@ def _run_all(
             if not done and remote.cluster is not None:
                 remote.cluster.check()
             for future in sorted(done, key=waiting.__getitem__):
+                if remote.cluster is not None:
+                    remote.cluster.require_alive(future, waiting[future])
                 answer = future.result()
                 finished(waiting.pop(future), pickle.loads(answer) if pickled else answer)
     except (futures.BrokenExecutor, futures.CancelledError) as error:
@@ -315,11 +366,13 @@ def _pickled(task: Any) -> bytes:
         raise UsageError(Notice("unpicklable-method", error)) from None
 
 
-def _answer(key: str, task: bytes) -> bytes:
-    """Run a pickled task in a worker; other code would give results with a wrong cache key."""
-    if package_key() != key:
+def _answer(caller: Mapping[str, str], task: bytes) -> bytes:
+    """Run a pickled task in a worker; other versions would give results with a wrong cache key."""
+    own = _environment()
+    if others := [name for name in own if own[name] != caller.get(name)]:
         worker = f"{multiprocessing.current_process().name} on {os.uname().nodename}"
-        raise UsageError(Notice("other-version", worker))
+        both = [", ".join(f"{name} {side.get(name)}" for name in others) for side in (own, caller)]
+        raise UsageError(Notice("other-version", worker, *both))
     try:
         function, given = pickle.loads(task)
     except (ImportError, AttributeError) as error:

@@ -36,7 +36,7 @@ STAGES: Mapping[Callable[..., Any], str] = {
     large_sets.reconstruct_part: "parts",
     stages._depths: "depth maps",
 }  # Function of a task -> stage
-PREPARATIONS = {"prepare": "matches", "prepare_oblique": "oblique matches"}
+PREPARATIONS = {"prepare": "matches", "_prepare_share": "first matches", "prepare_oblique": "oblique matches"}
 """Function that prepares the views of a batch -> stage."""
 LINE = 125e6  # Bytes per second of a gigabit line
 
