@@ -118,6 +118,22 @@ WRONG = {
         ),
         ("eight_point(xy1[some], xy2[some])", "eight_point(xy2[some], xy1[some])", "transposed"),
     ],
+    "bundle": [
+        ("return r_best, t_best, X_best", "return r_best, t_best, X", "adjusted points are not returned"),
+        ("return r_best, t_best, X_best", "return r, t, X_best", "adjusted cameras are not returned"),
+        ("return r_best, t_best, X_best", "return r, t_best, X_best", "rotations are not returned"),
+        ('x_scale="jac"', 'x_scale="jac", max_nfev=1', "initial values"),
+    ],
+    "disparity": [
+        ("jump = penalty * np.abs", "jump = 0 * np.abs", "no penalty"),
+        (
+            "d[:, x - 1] = came[np.arange(len(d)), x, d[:, x]]",
+            "d[:, x - 1] = S[:, x - 1].argmin(axis=1)",
+            "backward pass",
+        ),
+        ("costs(left, right, count), left", "costs(right, left, count), left", "left and right are swapped"),
+        ("    return d", "    return d + 1", "larger by 1"),
+    ],
 }
 
 

@@ -1,0 +1,92 @@
+"""Checks of the disparities."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from PIL import Image
+from solutions.disparity import costs
+
+import thesisrecon
+
+UNIT, CASES = "per cent wrong by more than 1 px", 3
+RETURNS = [("the result", ("H", "W"))]
+COUNT, PENALTY, SIGMA = 16, 8.0, 2.0
+
+
+def data(rng):
+    """A wall before another one, with the texture of an image of the courtyard."""
+    grey = Image.open(thesisrecon.sample("courtyard") / "images" / "0005.jpg").convert("L")
+    x, y = rng.integers(200, 600), rng.integers(300, 500)
+    texture = np.asarray(grey, float)[y : y + 60, x : x + 140]
+    d = np.full((60, 140), 4)
+    d[15:45, 50:100] = 10
+    left = texture[:, :140]
+    right = left.copy()
+    # Far pixels first: near ones hide them.
+    right[:, : 140 - 4] = left[:, 4:]
+    right[15:45, 40:90] = left[15:45, 50:100]
+    noisy = [one + rng.normal(0, SIGMA, one.shape) for one in (left, right)]
+    seen = np.ones(d.shape, bool)
+    seen[:, :COUNT] = False
+    # Left of the near wall, the far one is hidden in the right image.
+    seen[15:45, 44:50] = False
+    return SimpleNamespace(inputs=(*noisy, COUNT, PENALTY), d=d, seen=seen)
+
+
+def error(d, case):
+    return 100 * np.mean(np.abs(d - case.d)[case.seen] > 1)
+
+
+def ours(case):
+    left, right, count, _ = case.inputs
+    found = thesisrecon.match_rectified(left, right, max_disparity_px=count)
+    return np.nan_to_num(np.asarray(found.disparity, float), nan=-9)
+
+
+def vector(d, case):
+    return np.where(case.seen, d, 0).astype(float).ravel()
+
+
+def _forward_only(_, left, right, count, penalty):
+    S = costs(left, right, count)
+    jump = penalty * np.abs(np.arange(count)[:, None] - np.arange(count))
+    for x in range(1, left.shape[1]):
+        S[:, x] += (S[:, x - 1, None, :] + jump).min(axis=2)
+    return S.argmin(axis=2)
+
+
+def _flip(solve, left, right, count, penalty):
+    return solve(right[:, ::-1], left[:, ::-1], count, penalty)[:, ::-1]
+
+
+def _columns(left, right, count, penalty):
+    S = costs(left, right, count).transpose(1, 0, 2).copy()
+    jump = penalty * np.abs(np.arange(count)[:, None] - np.arange(count))
+    came = np.zeros(S.shape, int)
+    for y in range(1, S.shape[1]):
+        total = S[:, y - 1, None, :] + jump
+        came[:, y] = total.argmin(axis=2)
+        S[:, y] += total.min(axis=2)
+    d = np.zeros(S.shape[:2], int)
+    d[:, -1] = S[:, -1].argmin(axis=1)
+    for y in range(S.shape[1] - 1, 0, -1):
+        d[:, y - 1] = came[np.arange(len(d)), y, d[:, y]]
+    return d.T
+
+
+MISTAKES = {
+    "there is no penalty: each pixel takes its least cost": lambda solve, l, r, count, _: costs(
+        l, r, count
+    ).argmin(axis=2),
+    "the backward pass is missing: the forward costs alone do not give the path": _forward_only,
+    "left and right are swapped: the left pixel x is at x - d, not x + d": lambda solve, l, r, *rest: solve(
+        r, l, *rest
+    ),
+    "the disparities are those of the right image": _flip,
+    "the disparities are larger by 1": lambda solve, *inputs: solve(*inputs) + 1,
+    "the disparities are smaller by 1": lambda solve, *inputs: solve(*inputs) - 1,
+    "the sign of the disparities is wrong": lambda solve, *inputs: -solve(*inputs),
+    "the paths run along columns, not rows": lambda solve, l, r, count, penalty: _columns(
+        l, r, count, penalty
+    ),
+}
