@@ -218,7 +218,7 @@ def grade(name, function, path=None):
         return False, [*lines, *(f"reason: {fault}" for fault in faults)]
     if (sentence := _mistake(check, outputs, right, cases)) is not None:
         return False, [*lines, f"reason: {sentence}"]
-    unknown = f"no usual mistake explains it; it is wrong by {error:.3g} {unit}, and {allowed:.3g} pass"
+    unknown = f"no usual mistake explains the error; it must be at most {allowed:.3g}"
     return False, [*lines, *(f"reason: {fault}" for fault in faults or [unknown])]
 
 

@@ -193,7 +193,7 @@ HEAD = "import numpy as np\n\n\ndef triangulation(P1, P2, xy1, xy2):\n    "
         ("raise SystemExit", "raised SystemExit in line 5"),
         ("return np.array([P1", "line 5 is not Python"),
         ("return 0\n\n\ndel triangulation", "defines no function triangulation(P1, P2, xy1, xy2)"),
-        ("return np.zeros((len(xy1), 3))", "no usual mistake explains it; it is wrong by"),
+        ("return np.zeros((len(xy1), 3))", "no usual mistake explains the error; it must be at most 0.0"),
     ],
 )
 def test_what_cannot_be_graded_is_one_sentence(body, words, grader, tmp_path, capsys):
