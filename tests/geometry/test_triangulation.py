@@ -441,13 +441,13 @@ def test_noise_inliers_and_covariance_are_those_of_the_errors(given):
 @pytest.mark.parametrize("threshold_px", [1.0, None])
 def test_mirrored_points_equal_pixels_and_points_without_a_pose_have_no_camera(threshold_px):
     X, xy = points(30, np.random.default_rng(0))
-    same, line = np.full_like(xy, 100.0), np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.5])
+    same, line = np.tile([100.0, 200.0], (30, 1)), np.outer([0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 0.5])
     line += 1e-5 * np.random.default_rng(0).normal(size=(4, 3))
     corners = np.array([[100.0, 100.0], [700.0, 150.0], [120.0, 500.0], [650.0, 520.0]])
     for words, given in (
         ("", (X * [1.0, 1.0, -1.0], xy)),
-        ("", (X, same)),
-        ("", (X, same, GIVEN_K)),
+        ("; all 30 pixels are equal", (X, same)),
+        ("; all 30 pixels are equal", (X, same, GIVEN_K)),
         ("; 0 of 4", (line, corners, GIVEN_K)),
     ):
         message = f"no camera explains the points{words}"

@@ -153,9 +153,11 @@ def test_resection_of_a_projective_and_a_calibrated_camera(seed):
 def test_points_with_fixed_cameras(seed):
     block = make_block(points=50, seed=seed)
     xy, P = noisy(block, seed), block.cameras.P
-    start = block.Xh + np.random.default_rng(seed).normal(0.0, 0.1, block.Xh.shape) * [1.0, 1.0, 1.0, 0.0]
+    away = np.random.default_rng(seed).normal(0.0, 0.1, block.Xh.shape) * [1.0, 1.0, 1.0, 0.0]
+    start, far = block.Xh + away, block.Xh + 40.0 * away
     for loss, found in (
         (np.inf, partial.minimize_reprojection(P, start, block.view, block.point, xy)),
+        (np.inf, partial.minimize_reprojection(P, far, block.view, block.point, xy)),
         (1.0, partial.refine_points(P, start, block.view, block.point, xy, loss_px=1.0, iterations=50)),
     ):
         for j in range(len(start)):

@@ -316,8 +316,10 @@ def test_each_closed_form_contains_the_truth(monkeypatch):
     log_f = np.full((1, 1), np.log(f))
     assert rotation_cost(frame, planes, log_f)[0] < 1e-12
     other = 0 if frame.reference != 0 else 1
-    both_signs = _upgrade.gherardi_fusiello_planes(frame, other, np.array([f]), np.array([f]))
-    assert rotation_cost(frame, both_signs, np.repeat(log_f, 2, axis=0)).min() < 1e-12
+    scan = f * np.array([0.7, 1.0, 1.5])
+    both_signs = _upgrade.gherardi_fusiello_planes(frame, other, scan, scan)
+    cost = rotation_cost(frame, both_signs, np.tile(np.log(scan), 2)[:, None]).reshape(2, 3).min(axis=0)
+    assert cost[1] < 1e-12 < 1e-6 < cost[[0, 2]].min()
 
 
 def test_pure_translation_is_unidentifiable_and_a_prior_pulls_its_focal():

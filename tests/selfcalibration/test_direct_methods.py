@@ -35,6 +35,7 @@ from thesisrecon.selfcalibration.quadric import (
     LinearQuadric,
     NonlinearQuadric,
     linear_quadric,
+    minimize_quadric,
     rank_three,
 )
 from thesisrecon.selfcalibration.stratified import Stratified
@@ -342,6 +343,38 @@ def test_unknowns_are_the_free_intrinsics():
     known.mean[:, 0], known.std[:, 0] = 1500.0, 0.0
     fixed = solver_unknowns(normalized_frame(rec, known), known)
     np.testing.assert_allclose(fixed.calibrations(np.zeros((1, 0)))[0, :, 0, 0], 1500.0 / 1536.0)
+
+
+@pytest.mark.parametrize("known", [(np.nan, np.inf), (np.nan, 0.1), (1500.0, np.inf)])
+def test_a_focal_without_mean_and_deviation_is_one_of_usual_lenses(known):
+    scene = make_scene(views=4, seed=2)
+    prior = prior_for(scene)
+    prior.mean[:, 0], prior.std[:, 0] = known
+    frame = normalized_frame(projective_reconstruction(scene, seed=2), prior)
+    weak = solver_unknowns(frame, prior).with_focal_prior()
+    # Lenses of 24 and 90 mm before a sensor of 36 mm, then fisheyes and lenses of birdwatchers.
+    off = np.abs(weak.prior_residuals(np.log(np.array([[24.0], [90.0], [8.0], [300.0]]) / 36.0))[:, 0])
+    assert off[:2].max() < 1.0
+    assert off[2:].min() > 1.5
+
+
+@pytest.mark.parametrize("views", [3, 5])
+def test_the_covariance_of_the_quadric_is_that_of_least_squares_with_five_entries_per_camera(views):
+    scene = make_scene(views=views, sigma_px=0.3, seed=5)
+    frame = normalized_frame(adjusted(scene, 5), prior_for(scene))
+    unknown = solver_unknowns(frame, prior_for(scene))
+    log_f = np.full(views, np.log(scene.K[0, 0, 0] / 1536.0))
+    found = minimize_quadric(frame, unknown, kruppa._plane_for_focals(frame, log_f[:1])[0], log_f, method="")
+
+    def residuals(x):
+        K = _upgrade.square_pixel_calibrations(np.full((1, views), x[3]))
+        return dual_image_residuals(frame, K, x[None, :3]).ravel()
+
+    x = np.append(found.plane, np.log(found.K[0, 0, 0]))
+    J, r = central_differences(residuals, x), residuals(x)
+    # A conic has five entries up to scale; those of the reference camera vanish by the choice of the plane.
+    variance = r @ r / (5 * (views - 1) - 4) * np.linalg.inv(J.T @ J)[3, 3]
+    assert found.K_std[0, 0, 0] / found.K[0, 0, 0] == pytest.approx(np.sqrt(variance), rel=1e-3)
 
 
 def test_a_known_focal_counts_for_its_own_camera_only():

@@ -246,5 +246,5 @@ def calibration_from_image(image: F64, *, is_dual: bool = False) -> F64:
         lower = np.linalg.cholesky((symmetric / symmetric[2, 2])[::-1, ::-1])
     except np.linalg.LinAlgError as error:
         raise ValueError("calibration_from_image needs a definite conic") from error
-    K = lower[::-1, ::-1]
-    return np.asarray(K / K[2, 2])
+    # K[2, 2] is 1, the root of symmetric[2, 2] over itself.
+    return np.ascontiguousarray(lower[::-1, ::-1])

@@ -85,11 +85,11 @@ def minimize_quadric(
     one uses the previous estimate until it no longer falls. Huber's loss is linear beyond ``loss_scale``.
     """
     # The residuals also vanish as all focal lengths go to 0: the weak prior makes this cost more than noise.
-    unknown = unknown.with_focal_prior()
+    free, unknown = 3 + int(np.isinf(unknown.std).sum()), unknown.with_focal_prior()
     theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
     for _ in range(_NOISE_PASSES):
         supposed = noise
-        theta, noise, covariance, cost = _minimize(frame, unknown, theta, noise, loss_scale)
+        theta, noise, covariance, cost = _minimize(frame, unknown, free, theta, noise, loss_scale)
         if noise > 0.7 * supposed:
             break
     K = unknown.calibrations(theta[None, 3:])[0]
@@ -98,7 +98,7 @@ def minimize_quadric(
 
 
 def _minimize(
-    frame: ReferenceFrame, unknown: SolverUnknowns, theta: F64, noise: float, loss_scale: float
+    frame: ReferenceFrame, unknown: SolverUnknowns, free: int, theta: F64, noise: float, loss_scale: float
 ) -> tuple[F64, float, F64, float]:
     def residuals(batch: F64) -> F64:
         K = unknown.calibrations(batch[:, 3:])
@@ -111,8 +111,7 @@ def _minimize(
     )  # fmt: skip
     data = found.residual[: 6 * len(frame.views)]
     # Five independent entries per camera except the reference, whose residuals vanish.
-    free = np.isinf(unknown.std).sum() + 3
-    dof = max(5 * (len(frame.views) - 1) - int(free), 1)
+    dof = max(5 * (len(frame.views) - 1) - free, 1)
     noise = max(float(np.sqrt(np.sum(data**2) / dof)), _MIN_NOISE)
     scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
     return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))

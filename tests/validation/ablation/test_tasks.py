@@ -173,6 +173,17 @@ def test_the_trace_of_the_thesis_falls_and_nothing_is_watched_outside():
     assert len(trace.steps) == len(costs)
 
 
+def test_without_noise_the_cost_of_the_right_model_is_the_share_of_wrong_matches():
+    rng = np.random.default_rng(0)
+    views = make_two_views(Configuration.GENERAL, 100, rng)
+    xy2 = np.concatenate([views.xy2[:70], rng.uniform(0.0, 640.0, (30, 2))])
+    with traced() as trace:
+        thesisrecon.estimate_fundamental(views.xy1, xy2)
+    costs = np.array([s.cost - (1.0 - s.share) for s in trace.steps if s.share >= 0.7])
+    assert len(costs) > 1
+    assert np.abs(costs).max() < 0.05
+
+
 def test_metrics_a_scene_cannot_give_are_rejected_only_on_request(yard, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(yard / "images", bare / "images")
