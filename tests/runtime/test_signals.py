@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import without_progress
 from thesisrecon.cli.commands import run_command
 from thesisrecon.runtime._signals import CODES
 from validation.studies.robustness import different, outputs, stopped
@@ -129,7 +130,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(tmp_path):
     )
     assert (stop.code, stop.left) == (130, 0)
     advice = f"repeat the command to resume from {out}"
-    assert stop.message == f"thesisrecon: interrupted; {advice}\n"
+    assert without_progress(stop.message) == f"thesisrecon: interrupted; {advice}\n"
     assert run_command([*arguments, "-o", str(out)]) == 0
     assert run_command([*arguments, "-o", str(tmp_path / "whole")]) == 0
     assert different(outputs(out), outputs(tmp_path / "whole")) == ()
