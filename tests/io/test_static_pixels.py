@@ -86,8 +86,8 @@ def test_a_run_says_what_it_leaves_out_and_can_keep_it(tmp_path):
     still = texture(1, SIZE)
     given = images([box(frame, still) for frame in moving(5)])
     found = reconstruct(given, tmp_path / "out", until="features")
-    (told,) = [text for text in found.warnings if text.code == "static-pixels"]
-    assert "of the pixels of 5 images look the same" in told
+    (warning,) = [text for text in found.warnings if text.code == "static-pixels"]
+    assert "of the pixels of 5 images look the same" in warning
     for image, features in zip(found.images, found.features, strict=True):
         x, y = features.xy.T
         assert len(features.xy) > 20

@@ -1,4 +1,4 @@
-"""The exercises: solutions pass, wrong solutions are told why, and the command grades files."""
+"""The exercises: solutions pass, the fault of wrong ones is named, and the command grades files."""
 
 import ast
 import importlib

@@ -1,6 +1,7 @@
 """Panoramas: images of a camera that turns, or of a plane, on the image plane of one of them."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -87,20 +88,20 @@ def stitch(images: Sequence[ImageInput], *, config: Config | None = None, seed: 
     H = np.array([[1.0, 0, -low[0] - 0.5], [0, 1, -low[1] - 0.5], [0, 0, 1]]) @ H
     width, height = (high - low).astype(int).tolist()
     total, weights = np.zeros((height, width, 3)), np.zeros((height, width, 1))
+    grid = homogenize(np.stack(np.meshgrid(np.arange(float(width)), np.arange(float(height))), axis=-1))
     for one, G in zip(read, H, strict=True):
-        back = np.linalg.inv(G)
-
-        def lookup(rows: range, back: F64 = back) -> F64:
-            x, y = np.meshgrid(np.arange(float(width)), np.arange(float(rows.start), float(rows.stop)))
-            xh = np.stack([x, y, np.ones_like(x)], axis=-1) @ back.T
-            return np.where(xh[..., 2:] > 0.0, dehomogenize(xh), np.nan)
-
-        pixels = warp_image(one.levels, lookup, (width, height))
+        xh = grid @ np.linalg.inv(G).T
+        places = np.where(xh[..., 2:] > 0.0, dehomogenize(xh), np.nan)
+        pixels = warp_image(one.levels, partial(_rows_of, places), (width, height))
         # Distance to the nearest border, over that of the centre.
-        off = np.abs(lookup(range(height)) - (np.array(one.size) - 1.0) / 2.0) / (np.array(one.size) / 2.0)
+        off = np.abs(places - (np.array(one.size) - 1.0) / 2.0) / (np.array(one.size) / 2.0)
         weight = np.maximum(1.0 - np.nan_to_num(off, nan=1.0).max(axis=2, keepdims=True), 1e-3)
         weight = np.where(np.isfinite(pixels).all(axis=2, keepdims=True), weight, 0.0)
         total += weight * np.nan_to_num(pixels)
         weights += weight
     image = np.clip(np.rint(total / np.maximum(weights, 1e-9)), 0, 255).astype(np.uint8)
     return Panorama(image, weights[..., 0] > 0.0, H)
+
+
+def _rows_of(places: F64, rows: range) -> F64:
+    return places[rows.start : rows.stop]

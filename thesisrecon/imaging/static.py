@@ -50,14 +50,14 @@ def static_pixels(
 
 def _of_equal_size(images: Sequence[Image], group: Sequence[int], map_all: Any) -> dict[int, B8]:
     some = np.unique(np.linspace(0, len(group) - 1, SAMPLES).round().astype(int))
-    template = np.median([_reduced(images[group[k]]) for k in some], axis=0).astype(np.float32)
-    compare = partial(_agreement, template)
-    parts = list(map_all(compare, [images[group[k]] for k in some]))
+    sample = list(map_all(_reduced, [images[group[k]] for k in some]))
+    template = np.median(sample, axis=0).astype(np.float32)
+    parts = [_agreement(template, reduced) for reduced in sample]
     # Most sets have none, which a sample shows.
     if sum(same.mean() >= LEAST for same, _ in parts) < FEWEST - 1:
         return {}
     if len(some) < len(group):
-        parts = list(map_all(compare, [images[n] for n in group]))
+        parts = list(map_all(partial(_agreement_of_image, template), [images[n] for n in group]))
     # The median shows a static part that most images show.
     often = np.sum([same for same, _ in parts], axis=0) >= max(FEWEST - 1, len(group) / 2.0)
     window = np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=bool)
@@ -82,10 +82,14 @@ def _reduced(image: Image) -> F32:
     return resample(image.gray, max(round(width * factor), 1), max(round(height * factor), 1))
 
 
-def _agreement(template: F32, image: Image) -> tuple[B8, B8]:
+def _agreement_of_image(template: F32, image: Image) -> tuple[B8, B8]:
+    return _agreement(template, _reduced(image))
+
+
+def _agreement(template: F32, reduced: F32) -> tuple[B8, B8]:
     """Windows (H, W) that agree with the static image, and those with texture."""
     mean = partial(scipy.ndimage.uniform_filter, size=2 * RADIUS + 1, mode="nearest")
-    a, b = (levels - mean(levels) for levels in (_reduced(image), template))
+    a, b = (levels - mean(levels) for levels in (reduced, template))
     # Rounding may leave a mean of squares below 0.
     aa, bb, ab = np.maximum(mean(a * a), 0.0), np.maximum(mean(b * b), 0.0), mean(a * b)
     textured = aa > CONTRAST**2

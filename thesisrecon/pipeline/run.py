@@ -373,9 +373,8 @@ def run_position(folder: Path) -> str:
     stage, done = _latest_stage(folder)
     total = len(content.get("images", ())) if stage == "features" else 0
     if stage == "matches":
-        manifest = read_json(folder / FOLDERS["pairs"] / _run_folder.MANIFEST_FILE)
-        keys = manifest.get("keys", {}) if isinstance(manifest, dict) else {}
-        choice = _run_folder.read_record(folder / FOLDERS["pairs"] / "choice.npz", keys.get("choice", ""))
+        pairs = _run_folder.StageFolder(folder / FOLDERS["pairs"])
+        choice = _run_folder.read_record(pairs.path / "choice.npz", pairs.keys().get("choice", ""))
         total = 0 if choice is None else len(choice.pairs)
     where = f"{stage}, {errors.counted(done, 'item')} done" if done else f"{stage} begins"
     if done and total:
