@@ -1,6 +1,7 @@
 """Every executor gives the same bytes, and a run survives the loss of workers."""
 
 import concurrent.futures as futures
+import gc
 import hashlib
 import multiprocessing
 import os
@@ -194,7 +195,13 @@ def test_a_cluster_with_certificates_is_used_and_missing_ones_are_named(tmp_path
     cluster = {"n_workers": 1, "processes": False, "security": security, "protocol": "tls://", **LOCAL}
     with distributed.LocalCluster(**cluster) as running:
         one = Workers(1, running.scheduler_address)
-        refuses(UsageError, "needs certificates in the configuration of Dask", one.run, abs, [(-1,)], None)
+        words = "needs certificates in the configuration of Dask"
+        refuses(UsageError, f"{words}.*no key or certificate", one.run, abs, [(-1,)], None)
+        absent = {name: str(tmp_path / "absent.pem") for name in tls}
+        with dask.config.set(absent):
+            refuses(UsageError, f"{words}.*No such file", one.run, abs, [(-1,)], None)
+        # Its finalizer can block the start of the next client for ten seconds.
+        assert not [left for left in gc.get_objects() if isinstance(left, distributed.Client)]
         with dask.config.set(tls):
             one.run(abs, [(-1,)], lambda _, result: found.append(result))
     assert found == [1]

@@ -123,19 +123,25 @@ def connect_dask(executor: str) -> Iterator[Cluster]:
     first_s = wait_s or ANSWER_S
     try:
         import dask
-        from distributed import Client
+        from distributed import Client, Security
     except ImportError:
         raise UsageError(Notice("no-distributed", executor)) from None
     # Errors are reported by this module; large tasks are intended.
     settings = {"distributed.admin.large-graph-warning-threshold": "1TiB"}
     with _quiet("distributed"), dask.config.set(settings):
+        if protocol == "tls":
+            # Checked before: a client that fails on them can block the start of the next client.
+            try:
+                missing = Security().get_connection_args("client")["ssl_context"] is None
+                fault: object = "no key or certificate of the client is set" if missing else None
+            except OSError as error:
+                fault = error
+            if fault is not None:
+                raise UsageError(Notice("no-certificates", executor, fault))
         try:
             client = Client(f"{protocol}://{place}", timeout=ANSWER_S, set_as_default=False)
         except (OSError, futures.TimeoutError):
             raise UsageError(Notice("no-scheduler", place, ANSWER_S)) from None
-        except TypeError as error:
-            # TLS without certificates in Dask's configuration.
-            raise UsageError(Notice("no-certificates", executor, error)) from None
         try:
             if not client.nthreads():
                 _log.warning("the Dask scheduler at %s has no workers yet: waiting %.0f s", place, first_s)
