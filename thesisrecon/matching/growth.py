@@ -402,7 +402,8 @@ def _unique_share(view1: PreparedImage, view2: PreparedImage, matches: Matches) 
         # Copies may lie off the epipolar lines of an F that they determine: F = 0 has no lines.
         best = match_guided(
             view1.pyramid, (some.xy1, view1.features.scale[some.index1]),
-            (some.affine, some.xy2, whole_image), (xy2, scale2, view2.patches), view2.cells, (np.zeros((3, 3)), np.zeros(n), MIN_CORRELATION),
+            (some.affine, some.xy2, whole_image), (xy2, scale2, view2.patches), view2.cells,
+            (np.zeros((3, 3)), np.zeros(n), MIN_CORRELATION),
         )[0]  # fmt: skip
         apart = np.linalg.norm(xy2[best] - some.xy2, axis=1)
         share = float(np.mean((best < 0) | (apart <= 3.0 * scale2[best])))
