@@ -13,8 +13,11 @@ SIZE, SHIFT, DEPTH, VIEWS = (320, 240), 8, 5.0, 3
 K = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
 
 
-def scene(own_ground=(), noise=2.0, ground_from=130):
-    """A wall seen by cameras side by side, matched in its upper rows; some images have another lower part."""
+def scene(own_ground=(), noise=2.0, ground_from=130, depths=(DEPTH,)):
+    """A wall seen by cameras side by side, matched in its upper rows; some images have another lower part.
+
+    Further points of the model, in the same places of the images, have the further ``depths``.
+    """
     rng = np.random.default_rng(0)
     wall, width = texture(SIZE[1], SIZE[0] + SHIFT * VIEWS), SIZE[0]
     images = []
@@ -26,11 +29,13 @@ def scene(own_ground=(), noise=2.0, ground_from=130):
     features = [MultiScaleCorners().detect(image) for image in images]
     xy = features[0].xy
     xy = xy[(xy[:, 1] < 120) & (xy[:, 0] > 40)]
-    view, point = np.repeat(np.arange(VIEWS), len(xy)), np.tile(np.arange(len(xy)), VIEWS)
-    tracks = Tracks(view, point, xy[point] - np.outer(view, [SHIFT, 0]), VIEWS, len(xy))
     P = np.tile(K @ np.eye(3, 4), (VIEWS, 1, 1))
     P[:, 0, 3] = -SHIFT * DEPTH / K[0, 0] * np.arange(VIEWS) * K[0, 0]
-    X = homogenize(DEPTH * homogenize(xy) @ np.linalg.inv(K).T)
+    rays = homogenize(xy) @ np.linalg.inv(K).T
+    X = homogenize(np.concatenate([depth * rays for depth in depths]))
+    view, point = np.repeat(np.arange(VIEWS), len(X)), np.tile(np.arange(len(X)), VIEWS)
+    xy = np.tile(xy, (len(depths), 1))
+    tracks = Tracks(view, point, xy[point] - np.outer(view, [SHIFT, 0]), VIEWS, len(X))
     return reconstruction_of(P, SIZE, X=X, tracks=tracks, K=np.tile(K, (VIEWS, 1, 1))), images, features
 
 
@@ -43,6 +48,12 @@ def test_images_whose_surroundings_differ_are_named():
     # The third image is of another place: both others look alike in its upper half only.
     assert swapped_pairs(*scene([2])) == [(0, 2), (1, 2)]
     assert swapped_pairs(*scene([0, 1, 2])) == [(0, 1), (0, 2), (1, 2)]
+
+
+def test_images_before_close_things_need_not_show_the_same():
+    # A step that turns the view of the wall by a degree turns that of things in front of it by twenty.
+    assert swapped_pairs(*scene([0, 1, 2], depths=[DEPTH, 0.07 * DEPTH])) == []
+    assert swapped_pairs(*scene([0, 1, 2], depths=[DEPTH, 0.7 * DEPTH])) == [(0, 1), (0, 2), (1, 2)]
 
 
 def test_a_small_part_that_moved_does_not_swap_images():

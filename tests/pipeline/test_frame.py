@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import PIL.Image
+import PIL.ImageDraw
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.synthetic import photograph, reconstruction_of
 from thesisrecon import UsageError, compare_models, load, read_cameras, reconstruct
 from thesisrecon.config import ImageOptions
-from thesisrecon.metric.world import up_direction
+from thesisrecon.metric.world import up_direction, upright
+from thesisrecon.records import MetricResult
 
 HOME = Path(__file__).parents[2] / "fixtures" / "courtyard"
 LATITUDE, LONGITUDE, HEIGHT = -33.9, 18.4, 120.0
@@ -105,14 +108,60 @@ def test_up_is_found_by_the_level_sides_of_images_also_of_turned_ones_and_from_a
         up_direction(np.array([turned(a, roll=40 * (-1) ** k) for k, a in enumerate(angles)]))
 
 
+def room(upright_panels):
+    """Images of a room with panels on its walls, upright or turned ones, by cameras that are held askew."""
+    rng, world = np.random.default_rng(5), Rotation.from_euler("xyz", [40, -70, 20], True).as_matrix()
+    K, images, rotations = np.array([[250.0, 0, 159.5], [0, 250, 119.5], [0, 0, 1]]), [], []
+    walls = [(90.0 * side, place) for side in range(4) for place in np.arange(-2.2, 2.2, 0.7)]
+    corners = np.array([[0, -0.2, -0.7], [0, 0.2, -0.7], [0, 0.2, 0.7], [0, -0.2, 0.7]])
+    angles = np.zeros(len(walls)) if upright_panels else rng.uniform(-85, 85, len(walls))
+    for k in range(8):
+        R = turned(20.0 * k, roll=6 + rng.normal(0, 1), pitch=rng.uniform(-8, 8))
+        image = PIL.Image.new("L", (320, 240), 120)
+        for n, ((side, place), angle) in enumerate(zip(walls, angles, strict=True)):
+            panel = Rotation.from_euler("x", angle, True).apply(corners)
+            panel += np.array([2.5, place, 0.1 * (n % 5)])
+            x = Rotation.from_euler("z", side, True).apply(panel) @ R.T @ K.T
+            if (x[:, 2] > 0.1).all():
+                shape = [tuple(p) for p in x[:, :2] / x[:, 2:]]
+                PIL.ImageDraw.Draw(image).polygon(shape, fill=40 * (n % 3))
+        images.append(photograph(np.asarray(image) + rng.normal(0, 2, (240, 320))))
+        rotations.append(R @ world.T)
+    P = K @ np.concatenate([rotations, np.zeros((8, 3, 1))], axis=2)
+    model = reconstruction_of(P, (320, 240), K=np.tile(K, (8, 1, 1)))
+    return MetricResult(model, (), {}, trusted=True), images, world[:, 2]
+
+
+def test_vertical_lines_tell_up_better_than_cameras_that_are_held_askew():
+    result, images, up = room(upright_panels=True)
+    stood, facts = upright(result, images)
+    move = stood.reconstruction.P[0, :, :3].T @ np.linalg.inv(result.reconstruction.P[0, :, :3]).T
+    off = np.degrees(np.arccos((move @ up)[2]))
+    assert facts["by"] == "vertical lines"
+    assert facts["images"] >= 6
+    assert off < 0.5
+    assert off < 4 * facts["std_deg"] + 0.1
+    assert facts["off_level_deg"] > 3.0
+
+
+def test_without_vertical_lines_the_level_sides_of_the_images_tell_up_and_the_facts_say_so():
+    result, images, _ = room(upright_panels=False)
+    facts = upright(result, images)[1]
+    assert facts["by"] == "level sides of the images"
+    assert "std_deg" not in facts
+
+
 def test_a_model_that_stands_upright_has_z_up(tmp_path):
     truth = read_cameras(HOME / "cameras.json")
     files = sorted((HOME / "images").glob("*.jpg"))[:5]
-    given = {"max_size": 320, "until": "metric", "threads": 1}
+    given = {"max_size": 400, "until": "metric", "threads": 1}
     out = tmp_path / "out"
     result = reconstruct(files, out, set=["images.up=auto"], **given)
     found = compare_models(result, truth)
     up = found.similarity.R[:, 2]
-    assert np.degrees(np.arccos(up[2])) < 5.0
-    assert result.summary["world"]["axes"] == "z up"
+    assert np.degrees(np.arccos(up[2])) < 1.0
+    assert result.summary["world"]["by"] == "vertical lines"
+    assert re.search(
+        "points up by vertical lines, to 0.[0-9] degrees", (out / "report.html").read_text("utf-8")
+    )
     assert np.allclose(load(out).cameras[0].t, result.cameras[0].t)

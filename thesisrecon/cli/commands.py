@@ -63,7 +63,7 @@ _EXECUTORS = "local|processes|dask://HOST:PORT|tls://HOST:PORT"
 Executor = Annotated[str, typer.Option("--executor", metavar=_EXECUTORS, help=_EXECUTOR_HELP)]
 _GPS_HELP = "Move the model to the GPS positions of the images: metres east, north, up."
 Gps = Annotated[bool, typer.Option("--gps", help=_GPS_HELP)]
-_UP_HELP = "Turn the model until z is up, by the horizontal sides of the images."
+_UP_HELP = "Turn the model until z is up, by vertical lines or the level sides of the images."
 Up = Annotated[Literal["none", "auto"], typer.Option("--up", help=_UP_HELP)]
 _KNOWN_HELP = "Cameras that are known: cameras.json, COLMAP model, run, or another file of cameras."
 Known = Annotated[Path | None, common.folder_option(_KNOWN_HELP, "--known", metavar="MODEL")]

@@ -276,7 +276,8 @@ class ImageOptions:
         Standard deviation of a coordinate of these positions, which are then observations of the adjustment,
         too; 0: they determine the frame alone.
     up : {"none", "auto"}
-        "auto": without GPS the model is turned until z is up, by the horizontal sides of the images.
+        "auto": without GPS the model is turned until z is up, by vertical lines of the scene if most nearly
+        vertical ones agree, else by the level sides of the images.
     static : {"mask", "keep"}
         "mask": leave out pixels that look the same at the same place in most of at least four images while
         others move: a text, a part of the vehicle, the room around a turntable.

@@ -24,9 +24,9 @@ from thesisrecon.matching._seeds import nearest_neighbours
 from thesisrecon.matching.growth import match_guided
 from thesisrecon.records import Features, Image, Reconstruction, common_points
 
-MAX_TURN, MAX_ZOOM, MIN_COMMON = np.radians(12.0), 1.25, 40
-"""Images are near if the medians of the angles at their common points, of at least this number, and of the
-ratios of distances are at most these."""
+MAX_TURN, NEAREST, MIN_COMMON = np.tan(np.radians(12.0)), 0.1, 40
+"""Images of at least so many common points are near if they stand apart by at most this part of the distance
+to the nearest tenth of the points of either: along a street, close walls change before the far end does."""
 NEIGHBOURS, MOST = 4, 60  # images of most common points that each is compared with; pairs in all
 MIN_SIMILAR, MIN_CONTRAST = 0.8, 8.0  # correlation of a counterpart; standard deviation of textured windows
 GRID, MIN_CORNERS, MIN_SHARE = (6, 5), 15, 0.1
@@ -71,7 +71,7 @@ def swapped_sentence(pairs: Sequence[tuple[int, int]]) -> Notice:
 def _near_pairs(model: Reconstruction) -> list[tuple[int, int, F64, F64]]:
     """Pairs of views that see their common points from nearly the same place, and these points in both."""
     t, here = model.tracks, np.flatnonzero(model.registered)
-    k = np.flatnonzero(model.inlier & (model.registered[t.view_index] & model.valid[t.point_index]))
+    k = np.flatnonzero(model.used)
     k = k[np.lexsort((t.point_index[k], t.view_index[k]))]
     common = scipy.sparse.coo_array(common_points(t.view_index[k], t.point_index[k], t.n_views))
     upper = (common.row < common.col) & (common.data >= MIN_COMMON)
@@ -83,17 +83,17 @@ def _near_pairs(model: Reconstruction) -> list[tuple[int, int, F64, F64]]:
         rank[order] = np.minimum(rank[order], np.arange(len(own)))
     chosen = np.flatnonzero(rank < NEIGHBOURS)
     chosen = chosen[np.lexsort((j[chosen], i[chosen]))]
-    C, X = np.zeros((t.n_views, 3)), dehomogenize(model.X)
+    X, C, rows = dehomogenize(model.X), np.zeros((t.n_views, 3)), [k[:0]] * t.n_views
+    close = np.zeros(t.n_views)
     C[here] = dehomogenize(camera_centre(model.P[here]))
-    rows = [k[t.view_index[k] == v] for v in range(t.n_views)]
+    for v in here:
+        rows[v] = k[t.view_index[k] == v]
+        if len(rows[v]):
+            close[v] = np.quantile(np.linalg.norm(X[t.point_index[rows[v]]] - C[v], axis=1), NEAREST)
     found = []
     for a, b in zip(i[chosen].tolist(), j[chosen].tolist(), strict=True):
-        point, one, two = np.intersect1d(t.point_index[rows[a]], t.point_index[rows[b]], return_indices=True)
-        rays = [X[point] - C[v] for v in (a, b)]
-        length = [np.linalg.norm(ray, axis=1) for ray in rays]
-        cosine = np.median(np.sum(rays[0] * rays[1], axis=1) / np.maximum(length[0] * length[1], 1e-300))
-        zoom = np.exp(abs(np.median(np.log(length[0] / length[1]))))
-        if cosine > np.cos(MAX_TURN) and zoom < MAX_ZOOM:
+        if np.linalg.norm(C[a] - C[b]) <= MAX_TURN * min(close[a], close[b]):
+            one, two = np.intersect1d(*(t.point_index[rows[v]] for v in (a, b)), return_indices=True)[1:]
             found.append((a, b, t.xy[rows[a][one]], t.xy[rows[b][two]]))
     return found[:: 1 + len(found) // MOST]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -16,8 +16,10 @@ from thesisrecon.errors import UsageError
 from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.geometry.strata import estimate_similarity, transform, upgrade_points
 from thesisrecon.metric.refinement import MetricRefinement
+from thesisrecon.metric.vertical_lines import vertical_of_lines
 from thesisrecon.optimize.bundle.knowledge import PositionPrior
 from thesisrecon.records import (
+    Image,
     IntrinsicsPrior,
     MetricResult,
     Reconstruction,
@@ -94,13 +96,18 @@ def up_direction(R: F64) -> tuple[F64, float]:
     return (u if float(np.sum((R[:, 1] + R[:, 2]) @ u)) < 0.0 else -u), roll
 
 
-def upright(result: MetricResult) -> tuple[MetricResult, float]:
-    """A result with z up by :func:`up_direction`, and the RMS roll."""
+def upright(result: MetricResult, images: Sequence[Image]) -> tuple[MetricResult, dict[str, Any]]:
+    """A result with z up by vertical lines, else by :func:`up_direction`, and how up was found."""
     r = result.reconstruction
     assert r.K is not None
     u, roll = up_direction(pose_of_camera(r.K[r.registered], r.P[r.registered])[0])
+    found: dict[str, Any] = {"axes": "z up", "by": "level sides of the images", "roll_rms_deg": roll}
+    if lines := vertical_of_lines(r, images, u):
+        level, (u, std, count) = u, lines
+        off = float(np.degrees(np.arccos(min(float(u @ level), 1.0))))
+        found |= {"by": "vertical lines", "std_deg": std, "images": count, "off_level_deg": off}
     turn = scipy.spatial.transform.Rotation.align_vectors([[0.0, 0.0, 1.0]], [u])[0].as_matrix()
-    return moved(result, Similarity(1.0, turn, np.zeros(3))), roll
+    return moved(result, Similarity(1.0, turn, np.zeros(3))), found
 
 
 def placed(result: MetricResult, positions: F64) -> Placed:

@@ -143,7 +143,7 @@ def metric_in_world(job: Job, metric: MetricResult, attempt: int) -> MetricResul
     keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(f"attempt-{attempt}")]
     code, options = code_digest(placed, constrained, upright), [images.gps, images.gps_std_m, images.up]
     key = run.key("metric", keys, job.inputs.places, options, run.variant_key("metric"), code, run.seed)
-    by = partial(_placed_by_gps, job, metric, attempt) if images.gps else partial(_stood_upright, metric)
+    by = partial(_placed_by_gps, job, metric, attempt) if images.gps else partial(_upright, job, metric)
     try:
         found = run.cached("metric", f"attempt-{attempt}-world", key, by)
     except UsageError as error:
@@ -154,9 +154,8 @@ def metric_in_world(job: Job, metric: MetricResult, attempt: int) -> MetricResul
     return result
 
 
-def _stood_upright(metric: MetricResult) -> dict[str, Any]:
-    result, roll = upright(metric)
-    return {"result": result, "facts": {"axes": "z up", "roll_rms_deg": roll}}
+def _upright(job: Job, metric: MetricResult) -> dict[str, Any]:
+    return dict(zip(("result", "facts"), upright(metric, job.images), strict=True))
 
 
 def _placed_by_gps(job: Job, metric: MetricResult, attempt: int) -> dict[str, Any]:

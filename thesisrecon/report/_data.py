@@ -64,7 +64,9 @@ class ReportData(RunResult):
         if any(found.source == records.GIVEN for view in self.original_intrinsics for found in view.values()):
             return "Lengths and axes are those of the cameras that were given."
         free = "Lengths have no absolute scale, which images alone do not determine."
-        return f"{free} The z axis points up." if world else free
+        if "std_deg" in world:
+            return f"{free} The z axis points up by vertical lines, to {world['std_deg']:.1g} degrees."
+        return f"{free} The z axis points up by the level sides of the images." if world else free
 
     @property
     def original_intrinsics(self) -> tuple[Mapping[str, records.IntrinsicInterval], ...]:
