@@ -125,27 +125,48 @@ def _guess_focals(database: Path) -> None:
     store.close()
 
 
+def _change_lens(database: Path, lens: str) -> None:
+    store = pycolmap.Database.open(database)
+    for camera in store.read_all_cameras():
+        focal = camera.mean_focal_length()
+        other = pycolmap.Camera.create_from_model_name(
+            camera.camera_id, lens, focal, camera.width, camera.height
+        )
+        other.has_prior_focal_length = camera.has_prior_focal_length
+        store.update_camera(other)
+    store.close()
+
+
 def map_with_pycolmap(
     images: Path, out: Path, *, matched: Path | None = None, refine_principal_point: bool = False,
     fixed: bool = False, threads: int = 2, mapper: Literal["incremental", "global"] = "incremental",
+    lens: str = "", seed: int = 0,
 ) -> None:  # fmt: skip
     """Map the matches of ``match_with_pycolmap`` in ``out`` or ``matched``, for :func:`read_run`; ``fixed``
-    intrinsics stay. The models are not read: that would count as COLMAP's work. StageFailure without a model.
+    intrinsics stay, and ``lens`` is another camera model. The global mapper calibrates the view graph first.
+    The models are not read: that would count as COLMAP's work. StageFailure without a model.
     """
     if matched is not None:
         if not (matched / "seconds.json").is_file():
             raise StageFailure("COLMAP left no matches to start from")
         _begin(out)
-        for name in ("database.db", "seconds.json"):
-            shutil.copy(matched / name, out / name)
-    seconds = json.loads((out / "seconds.json").read_text(encoding="utf-8"))
-    pycolmap.set_random_seed(0)
+        shutil.copy(matched / "database.db", out / "database.db")
+    seconds = json.loads(((matched or out) / "seconds.json").read_text(encoding="utf-8"))
+    pycolmap.set_random_seed(seed)
     paths, begun = (out / "database.db", images, out / "sparse"), time.perf_counter()
+    if lens:
+        _change_lens(paths[0], lens)
     if mapper == "global":
         paths[2].mkdir(exist_ok=True)
-        pycolmap.global_mapping(*paths, pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=0))
+        if not fixed:
+            pycolmap.calibrate_view_graph(paths[0])
+        all_at_once = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=seed)
+        adjustment = all_at_once.mapper.bundle_adjustment
+        adjustment.refine_principal_point = refine_principal_point and not fixed
+        adjustment.refine_focal_length = adjustment.refine_extra_params = not fixed
+        pycolmap.global_mapping(*paths, all_at_once)
     else:
-        options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=seed)
         options.mapper.num_threads = threads
         options.ba_refine_principal_point = refine_principal_point and not fixed
         options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed

@@ -1,4 +1,4 @@
-"""F and triangulation by OpenCV, COLMAP and PoseLib and by ours, each with one signature.
+"""F and triangulation by OpenCV, COLMAP, PoseLib and other estimators and by ours, each with one signature.
 
 Every method gets the matches in an order that the seed draws: OpenCV's generators start from a fixed state.
 """
@@ -16,8 +16,8 @@ from thesisrecon.api.pairs import estimate_fundamental
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar.ransac import ThesisRansac, estimate_eight_point, estimate_seven_point
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.two_view import fundamental_from_cameras
-from validation.references.libraries import cv2, poselib, pycolmap
+from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
+from validation.references.libraries import INSTALLED, cv2, load, poselib, pycolmap
 
 BoolArray = NDArray[np.bool_]
 Answer = tuple[Any, Any]
@@ -82,6 +82,46 @@ def _poselib(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
     return F, mask["inliers"]
 
 
+def _degensac(xy1: F64, xy2: F64, threshold_px: float, seed: int) -> Answer:
+    find = load("pydegensac").findFundamentalMatrix
+    F, mask = find(xy1, xy2, threshold_px, CONFIDENCE, ITERATIONS, seed=seed)
+    return F, mask
+
+
+def _of_both_images(library: str, xy1: F64, xy2: F64, **settings: Any) -> Answer:
+    """F by a library that takes the matches (N, 4) and the sizes of the images, here those of the matches."""
+    (width1, height1), (width2, height2) = np.ceil(xy1.max(axis=0)) + 1.0, np.ceil(xy2.max(axis=0)) + 1.0
+    sizes = (width1, height1, width2, height2)
+    if library == "pygcransac":
+        sizes = (int(height1), int(width1), int(height2), int(width2))
+    given = {"probabilities": np.empty(0), "conf": CONFIDENCE, "max_iters": ITERATIONS, "sampler": 0}
+    F, mask = load(library).findFundamentalMatrix(np.hstack([xy1, xy2]), *sizes, **given, **settings)
+    return F, mask
+
+
+def _magsac(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
+    return _of_both_images("pymagsac", xy1, xy2, sigma_th=threshold_px)
+
+
+def _gcransac(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
+    F = _of_both_images("pygcransac", xy1, xy2, threshold=threshold_px)[0]  # its mask holds all matches
+    return F, None if F is None else np.abs(sampson_residuals(F, xy1, xy2)) < threshold_px
+
+
+def _superansac(xy1: F64, xy2: F64, threshold_px: float, _: int) -> Answer:
+    library = load("pysuperansac")
+    settings = library.RANSACSettings()
+    settings.inlier_threshold, settings.confidence = threshold_px, CONFIDENCE
+    settings.max_iterations = ITERATIONS
+    # The order that a seed draws says nothing of the quality of the matches.
+    settings.sampler = library.SamplerType.Uniform
+    sizes = [*(xy1.max(axis=0) + 1.0), *(xy2.max(axis=0) + 1.0)]
+    F, right, _, _ = library.estimateFundamentalMatrix(np.hstack([xy1, xy2]), sizes, config=settings)
+    mask = np.zeros(len(xy1), dtype=bool)
+    mask[right] = True
+    return F, mask
+
+
 SOLVERS: dict[str, Solver] = {
     OURS: _ours,
     THESIS: _thesis,
@@ -90,7 +130,9 @@ SOLVERS: dict[str, Solver] = {
     **{name: _opencv(name) for name in ("USAC_ACCURATE", "USAC_MAGSAC", "FM_RANSAC", "FM_LMEDS")},
     "COLMAP": _colmap,
     "PoseLib": _poselib,
-}  # All methods by name: OpenCV's with ``CONFIDENCE`` and ``ITERATIONS``, COLMAP and PoseLib as they come
+}  # All methods by name: with ``CONFIDENCE`` and ``ITERATIONS``, COLMAP and PoseLib as they come
+_MORE = {"DEGENSAC": _degensac, "MAGSAC++": _magsac, "GC-RANSAC": _gcransac, "SupeRANSAC": _superansac}
+SOLVERS |= {name: _MORE[name] for name in INSTALLED}
 
 
 def estimate_with(

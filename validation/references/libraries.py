@@ -6,14 +6,20 @@ A library that is missing or does not load raises :class:`NoReference` on use; o
 from __future__ import annotations
 
 import importlib
+from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 __all__ = ["Library", "NoReference", "cv2", "load", "one_thread", "open3d", "poselib", "pycolmap"]
 PACKAGES = {"cv2": "opencv-contrib-python-headless", "pycolmap": "pycolmap", "poselib": "poselib"}
 PACKAGES |= {"open3d": "open3d"}
+ESTIMATORS = {"pydegensac": "DEGENSAC", "pymagsac": "MAGSAC++", "pygcransac": "GC-RANSAC"}
+ESTIMATORS |= {"pysuperansac": "SupeRANSAC"}
+"""Robust estimators of the extra ``estimators``, which have no wheel for each Python."""
+INSTALLED = tuple(name for library, name in ESTIMATORS.items() if find_spec(library))
+PACKAGES |= {name: name for name in ESTIMATORS}
 """Reference libraries: module names and pip names."""
-NAMES = {"cv2": "OpenCV", "pycolmap": "pycolmap", "poselib": "PoseLib", "open3d": "Open3D"}
+NAMES = {"cv2": "OpenCV", "pycolmap": "pycolmap", "poselib": "PoseLib", "open3d": "Open3D", **ESTIMATORS}
 
 
 class NoReference(ImportError):

@@ -16,7 +16,7 @@ from thesisrecon.geometry.two_view import epipoles
 from thesisrecon.testing import assert_fundamental
 from validation.metrics.fundamental_precision import NONE_PX, rms_epipolar_distance
 from validation.references.fundamental import estimate_with
-from validation.references.libraries import NoReference
+from validation.references.libraries import INSTALLED, NoReference
 from validation.runs.records import (
     IMAGE_SCENES,
     Judgement,
@@ -53,7 +53,7 @@ class FundamentalStage(Stage):
         return scene == "kusvod2" or (super().takes(scene, options) and load_images(scene, options).has_truth)
 
     def methods(self, scene: str, options: ReportOptions) -> tuple[str, ...]:
-        references = () if options.gates_only else QUICK if options.quick else REFERENCES
+        references = () if options.gates_only else QUICK if options.quick else (*REFERENCES, *INSTALLED)
         return (MATCHES, OURS, *VARIANTS, MINIMAL, *references)
 
     def needs(self, method: str) -> tuple[tuple[str, str], ...]:

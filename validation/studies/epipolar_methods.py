@@ -34,7 +34,7 @@ from validation.metrics.fundamental_precision import (
     fundamental_bound,
 )
 from validation.references.fundamental import OURS, SOLVERS, opencv_eight_point
-from validation.references.libraries import one_thread
+from validation.references.libraries import INSTALLED, one_thread
 from validation.runs.study import Part, pick, report_progress
 from validation.runs.tables import Metric, Rows, text_table
 from validation.scenes.two_views import make_two_views
@@ -119,6 +119,7 @@ LIBRARIES = (
             ("OpenCV USAC_ACCURATE", "USAC_ACCURATE"),
             ("OpenCV USAC_MAGSAC", "USAC_MAGSAC"),
             ("PoseLib", "PoseLib"),
+            *((name, name) for name in INSTALLED),
         )
     ),
 )
