@@ -11,7 +11,7 @@ from tests.synthetic import reconstruction_of
 from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from validation.metrics import cameras
-from validation.references.colmap import read_run, reconstruct_with_pycolmap
+from validation.references.colmap import map_with_pycolmap, read_run, reconstruct_with_pycolmap
 from validation.scenes.real import load_fixture_scene
 from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
 
@@ -135,6 +135,15 @@ def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
     assert errors.rotation_error_deg < 1
     again, _ = read_run(images, tmp_path / "out")
     np.testing.assert_array_equal(again.P, model.P)
+    for mapper in ("incremental", "global"):
+        map_with_pycolmap(
+            images, tmp_path / mapper, matched=tmp_path / "out", lens="OPENCV", mapper=mapper,
+            refine_principal_point=True,
+        )  # fmt: skip
+        opencv, _ = read_run(images, tmp_path / mapper)
+        moved = opencv.K[opencv.registered, :2, 2] - (np.array(small.size) - 1.0) / 2.0
+        assert opencv.distortion.shape[1] > 3, "the decentring of OPENCV"
+        assert np.abs(moved).min() > 1e-3, "the principal point is free"
 
 
 def test_rows_hold_both_methods_and_a_failure_misses_its_targets():
