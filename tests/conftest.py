@@ -1,7 +1,6 @@
 """Shared fixtures; files with slow tests start first, so that workers finish together."""
 
 import gc
-import importlib
 import logging
 import os
 import re
@@ -76,8 +75,6 @@ def real_data(name):
 
 def before_each_output(monkeypatch, call):
     """Call ``call(what)`` before each figure, page or file is made, in all modules."""
-    # Modules that are imported later would keep the replaced function.
-    importlib.import_module("thesisrecon.cli.view_files")
 
     def tried(what, make, *rest):
         return made(what, lambda: (call(what), make())[1], *rest)

@@ -1,6 +1,5 @@
 """Views between and beside photographs: the front door, what is refused, and the command."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,9 +13,6 @@ from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.api import views as between
 from thesisrecon.api.views import match_images, prepare_trilinear_views
-from thesisrecon.cli import view_files as sequences
-from thesisrecon.cli.commands import run_command
-from thesisrecon.cli.view_files import interpolate_images, trilinear_sequence
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
@@ -24,7 +20,6 @@ from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.rectification import PlanarRectification
-from thesisrecon.views.interpolation import InterpolatedPair
 from thesisrecon.views.tensor import VirtualCamera, camera_at
 from validation.scenes.real import load_fixture_scene
 
@@ -41,10 +36,6 @@ def wall():
 
 def known_map(d):
     return DisparityMap(d, np.ones(d.shape, np.float32), 0.0)
-
-
-def interpolated_sequence(images, frames):
-    return sequences.interpolated_sequence(images, frames, config=PipelineConfig(), seed=0, threads=1)
 
 
 def photograph(seed, size=(40, 30)):
@@ -131,63 +122,6 @@ def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeyp
     refuses(StageFailure, words, between.prepare_pair, photograph(0), photograph(1))
 
 
-@pytest.fixture
-def still(monkeypatch):
-    """Photographs of one place: every pixel stays, and what is related is noted."""
-    related = []
-
-    def prepare_pair(first, second, **_):
-        related.append((first.name, second.name))
-        nothing = known_map(np.zeros(first.rgb.shape[:2], np.float32))
-        return InterpolatedPair((first.rgb, second.rgb), np.stack([np.eye(3)] * 2), nothing, nothing)
-
-    monkeypatch.setattr(sequences, "prepare_pair", prepare_pair)
-    return related
-
-
-def even(name, level):
-    return Image(name, np.full((24, 32, 3), level, dtype=np.uint8), (32, 24))
-
-
-def test_a_film_of_two_goes_from_one_to_the_other(still):
-    film = interpolated_sequence([even("a", 100), even("b", 200)], 5)
-    assert film.entries[1] == {"weights": [0.75, 0.25]}
-    assert film.entries[4] == {"weights": [0.0, 1.0]}
-    levels = [float(film.draw(k).mean()) for k in range(5)]
-    assert levels[0] == 100.0
-    assert levels[4] == 200.0
-    # Exposures are mixed by their ratio, in which neither photograph is the darker one's.
-    assert levels == sorted(levels)
-    assert film.facts["violating_monotonicity"] == 0.0
-    assert still == [("a", "b")]
-    assert interpolated_sequence([even("a", 100), even("b", 200)], 1).entries == [{"weights": [0.5, 0.5]}]
-
-
-def test_the_command_writes_frames_and_an_animation(tmp_path, capsys):
-    photographs = [str(COURTYARD / f"000{k}.jpg") for k in (6, 7)]
-    out = tmp_path / "früm one to other"
-    options = ["--frames", "3", "--max-size", "512", "--threads", "2", "-o", str(out)]
-    assert run_command(["interpolate", *photographs, *options]) == 0
-    said = capsys.readouterr()
-    assert said.out.splitlines()[0] == f"3 frames of 512 x 384 px and interpolation.webp written to {out}"
-    names = ["frame-0001.png", "frame-0002.png", "frame-0003.png", "frames.json", "interpolation.webp"]
-    assert sorted(path.name for path in out.iterdir()) == [".lock", *names]
-    reported = json.loads((out / "frames.json").read_text(encoding="utf-8"))
-    assert reported["images"] == ["0006.jpg", "0007.jpg"]
-    assert reported["frames"][1] == {"name": "frame-0002.png", "weights": [0.5, 0.5]}
-    assert 0.0 < reported["violating_monotonicity"] < 0.3
-    assert reported["known"] > 0.3
-    with PIL.Image.open(out / "interpolation.webp") as film:
-        assert film.n_frames == 3
-    frames = []
-    for k in range(3):
-        with PIL.Image.open(out / names[k]) as picture:
-            frames.append(np.asarray(picture).astype(float))
-    # Halfway there is no ghost of either end: mixtures of two photographs are dull.
-    contrast = [np.abs(np.diff(frame, axis=1)).mean() for frame in frames]
-    assert contrast[1] > 0.8 * min(contrast[0], contrast[2])
-
-
 SCENE = load_fixture_scene()
 SMALL = PipelineConfig(images=ImageOptions(max_size_px=512))
 
@@ -227,6 +161,14 @@ def test_calibrated_photographs_show_a_third_one_and_themselves(found):
     assert np.mean(first != found.images[0].rgb) < 1e-3
 
 
+def test_a_view_between_photographs_has_no_ghost_of_either():
+    pair = between.prepare_pair(*(COURTYARD / f"000{k}.jpg" for k in (6, 7)), config=SMALL)
+    frames = [pair.view(s).astype(float) for s in (0.0, 0.5, 1.0)]
+    # Mixtures of two photographs are dull.
+    contrast = [np.abs(np.diff(frame, axis=1)).mean() for frame in frames]
+    assert contrast[1] > 0.8 * min(contrast[0], contrast[2])
+
+
 def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
     refuses(
         ValueError, "det R = -1", thesisrecon.synthesize_view, "no.jpg", "file.jpg", -np.eye(3), np.zeros(3)
@@ -251,27 +193,8 @@ def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
     np.testing.assert_array_equal(picture, views.render(camera, threads=2))
 
 
-def test_cameras_in_one_place_and_one_image_twice_are_refused(found):
+def test_cameras_in_one_place_are_refused():
     """As of one camera with another principal point."""
     picture = _photograph(6)
     halves, words = [picture[:, :-32].copy(), picture[:, 32:].copy()], "no parallax: the camera only rotated"
     refuses(StageFailure, words, match_images, *halves, config=SMALL)
-    twice = found.images[:1] * 2
-    refuses(UsageError, "the same image", trilinear_sequence, twice, 5, config=SMALL, seed=0, threads=1)
-
-
-def test_the_command_goes_from_before_the_first_to_beyond_the_second(tmp_path):
-    paths = tuple(SCENE.image_paths[6:8])
-    made = interpolate_images(tmp_path / "film", paths, method="tensor", frames=5, max_size_px=320)
-    reported = json.loads((tmp_path / "film" / "frames.json").read_text(encoding="utf-8"))
-    assert [frame["baselines"] for frame in reported["frames"]] == [-0.5, 0.0, 0.5, 1.0, 1.5]
-    assert reported["images"] == ["0006.jpg", "0007.jpg"]
-    assert "5 frames of 320 x 240 px" in made
-    pictures = []
-    for path in sorted((tmp_path / "film").glob("frame-*.png")):
-        with PIL.Image.open(path) as image:
-            pictures.append(np.asarray(image))
-    with PIL.Image.open(SCENE.image_paths[7]) as image:
-        second = np.asarray(image.resize((320, 240), PIL.Image.Resampling.BOX))
-    likeness = [_psnr(picture, second) for picture in pictures]
-    assert np.argmax(likeness) == 3

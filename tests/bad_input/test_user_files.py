@@ -16,9 +16,7 @@ import thesisrecon
 from tests.bad_input import files
 from tests.pipeline.fake_stages import fake_config, interrupt_at, photographs
 from thesisrecon import load, reconstruct
-from thesisrecon.cli import view_files
 from thesisrecon.cli.commands import run_command
-from thesisrecon.cli.view_files import ViewSequence
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _frames
 from thesisrecon.pipeline.outputs import RESULT_FILES
@@ -44,7 +42,7 @@ def stock(tmp_path_factory):
         reconstruct_video(place, place / "video")
         with contextlib.suppress(KeyboardInterrupt):
             reconstruct_video(place, place / "cut video", progress=interrupt_at("frames", 4))
-        for name in ("nerfstudio", "colmap", "render", "interpolate", "save"):
+        for name in ("nerfstudio", "colmap", "save"):
             assert COMMANDS[name](place, place / name) in (0, None)
     return place
 
@@ -86,12 +84,6 @@ COMMANDS = {
     "demo": lambda _, out, *more: cli("demo", "-o", out, *more),
     "save": save,
     **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "opencv", "openmvs")},
-    "render": lambda place, out, *more: cli(
-        "render", place / "same", "-o", out, "--frames", "2", "--size", "24x20", *more
-    ),
-    "interpolate": lambda place, out, *more: cli(
-        "interpolate", *sorted((place / "images").iterdir())[:2], "--frames", "3", "-o", out, *more
-    ),
     "compare": lambda place, out, *more: cli(
         "compare", place / "same", place / "other", "--json", out / "summary.json", "--page",
         out / "report.html", *more
@@ -108,10 +100,6 @@ def patched():
             image = files.picture(n)
             yield SimpleNamespace(rotation=0, to_image=lambda image=image: image), 6
 
-    def sequence(images, frames, **_):
-        views = [np.full((8, 8, 3), 40 * k, np.uint8) for k in range(frames)]
-        return ViewSequence(lambda k: views[k], {"images": ["x"]}, [{} for _ in views])
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_frames, "_decoded", decoded)
         patch.setattr(
@@ -120,14 +108,12 @@ def patched():
                 photographs(2), out, config=fake_config(), threads=1, overwrite=options["overwrite"]
             ),
         )
-        patch.setitem(view_files.METHODS, "interpolation", sequence)
         yield
 
 
 KNOWN = (
     *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json",
     "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
-    "frames.json", "frame-0001.png", "frame-0002.png", "orbit.webp", "interpolation.webp",
     "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "scene.mvs",
 )  # fmt: skip
 """Files that --overwrite may replace; the following survive it, too."""
@@ -139,8 +125,8 @@ UNKNOWN = (
 )  # fmt: skip
 FOLDERS = ("sparse", "sparse/0", "tiles", "00-frames", "images", "group-2", "views", "06-metric")
 STATES = (
-    "same", "other", "early", "killed", "video", "cut video", "nerfstudio", "colmap", "render", "interpolate",
-    "save", "nothing", "nothing", "empty",
+    "same", "other", "early", "killed", "video", "cut video", "nerfstudio", "colmap", "save",
+    "nothing", "nothing", "empty",
 )  # fmt: skip
 RUN_FILES = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[:40] if path.is_file() else b'{"vers'),

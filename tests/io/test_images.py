@@ -15,7 +15,6 @@ from tests.conftest import refuses
 from thesisrecon import export
 from thesisrecon.errors import UsageError
 from thesisrecon.io import _pixels as pixels
-from thesisrecon.io._exports import frame_name, write_animation, write_image
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import images_folder, list_images, read_images, read_pixels, scene_name
 from thesisrecon.io._models import read_model
@@ -302,36 +301,6 @@ def test_an_image_whose_decoder_needs_too_much_memory_is_rejected_first(tmp_path
     assert "decoding a WEBP of this size takes" in read.refused["a.webp"]
     assert "decoding a progressive JPEG of this size takes" in read.refused["c.jpg"]
     assert "save it as PNG or TIFF" in read.refused["a.webp"]
-
-
-def solid(k):
-    """A smooth picture with a bright bar at another place in each."""
-    rgb = np.tile(np.linspace(30, 200, 64).astype(np.uint8)[None, :, None], (48, 1, 3))
-    rgb[8 * k : 8 * k + 8] = [220, 40, 60]
-    return rgb
-
-
-def frames(folder, count):
-    paths = [folder / frame_name(k + 1) for k in range(count)]
-    for k, path in enumerate(paths):
-        write_image(path, solid(k))
-    return paths
-
-
-def test_an_animation_plays_all_frames_for_ever(tmp_path):
-    path = write_animation(tmp_path / "all.webp", frames(tmp_path, 4), milliseconds=50)
-    with PIL.Image.open(path) as image:
-        assert image.n_frames == 4
-        assert image.info["loop"] == 0
-        for k in range(4):
-            image.seek(k)
-            image.load()
-            assert image.info["duration"] == 50
-            assert np.abs(np.asarray(image.convert("RGB")).astype(int) - solid(k)).mean() <= 4.0
-    again = write_animation(tmp_path / "again.webp", frames(tmp_path, 4), milliseconds=50)
-    assert again.read_bytes() == path.read_bytes()
-    with PIL.Image.open(write_animation(tmp_path / "one.webp", frames(tmp_path, 1))) as image:
-        assert image.size == (64, 48)
 
 
 OUTSIDE = [

@@ -139,8 +139,6 @@ def test_the_disk_is_full_once_the_summary_is_there(tmp_path):
 def commands(tmp_path_factory):
     """Commands that write files beside those of a run, and the names of what each makes."""
     place = tmp_path_factory.mktemp("commands")
-    frames = "--frames 2 --threads 1 --overwrite"
-    pair = " ".join(str(COURTYARD / "images" / f"000{k}.jpg") for k in (6, 7))
     model = COURTYARD / "cameras.json"
     run(place / "run")
     (place / "in").mkdir()
@@ -148,8 +146,6 @@ def commands(tmp_path_factory):
         PIL.Image.fromarray(image.rgb).save(place / "in" / image.name)
     lines = {
         "reconstruct": f"reconstruct {place / 'in'} --until features --overwrite -o {place / 'out'}",
-        "render": f"render {place / 'run'} --size 40x30 {frames} -o {place / 'render'}",
-        "interpolate": f"interpolate {pair} --max-size 256 {frames} -o {place / 'interpolate'}",
         "compare": f"compare {model} {model} --json {place / 'c.json'} --page {place / 'c.html'} --overwrite",
     }
     with pytest.MonkeyPatch.context() as patch:
@@ -162,7 +158,7 @@ def commands(tmp_path_factory):
 
 
 @pytest.mark.parametrize("error", ERRORS)
-@pytest.mark.parametrize("command", ["reconstruct", "render", "interpolate", "compare"])
+@pytest.mark.parametrize("command", ["reconstruct", "compare"])
 def test_other_commands_print_a_warning_and_end_well(commands, command, error, monkeypatch, capsys):
     line, names = commands[command]
     assert names

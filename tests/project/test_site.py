@@ -50,7 +50,7 @@ def test_every_exported_name_has_a_page_with_an_example(site):
 def test_the_pages_of_commands_and_settings_name_all_of_them(site):
     interface = site("interface")
     commands, settings = interface.command_page(), interface.settings_page()
-    for command, option in (("reconstruct", "--from"), ("export", "--to"), ("interpolate", "--frames")):
+    for command, option in (("reconstruct", "--from"), ("export", "--to"), ("compare", "--json")):
         assert re.search(rf"^## {command}$.*?`{option}`", commands, re.M | re.S)
     for stage, kinds in KINDS.items():
         assert f"## {stage}\n" in settings

@@ -7,7 +7,6 @@ import json
 import logging
 import math
 import os
-import re
 import sys
 import warnings
 from collections.abc import Mapping
@@ -20,7 +19,6 @@ from thesisrecon import __version__
 from thesisrecon.cli import common
 from thesisrecon.errors import Notice, UsageError, counted, made
 from thesisrecon.io._files import printable, read_json
-from thesisrecon.runtime._executors import available_threads
 from thesisrecon.runtime._signals import set_error_stream
 
 if TYPE_CHECKING:
@@ -243,11 +241,6 @@ _SCALE = typer.Option("--scale", metavar="NAME1 NAME2 DISTANCE", help=_SCALE_HEL
 _POINTS_HELP = "Known distance of two points: a CSV of name,x1,y1,x2,y2, their pixels in two or more images."
 _POINTS = typer.Option("--scale-points", metavar="FILE DISTANCE", help=_POINTS_HELP)
 _ALIGN_HELP = "Known camera positions: a CSV of name,x,y,z or name,lat,lon,alt."
-_PATH_HELP = "Camera path: orbit the model, or interpolate between the cameras."
-_SIZE_HELP = "Frame size (px); by default that of the first image, at most 1000."
-_METHOD_HELP = "Matched and blended (thesis 1.2), or by the trilinear tensor (1.3)."
-_TWO_IMAGES = typer.Argument(parser=common.parse_folder, metavar="IMAGE IMAGE", help="Two image files.")
-Frames = Annotated[int, typer.Option("--frames", min=1, max=9999, help="Number of frames.")]
 
 
 def compare(
@@ -359,67 +352,6 @@ def export(
     typer.echo(f"{len(found.views)} images and {len(found.X)} points: {printable(str(written.file))}")
 
 
-def render(
-    run: Annotated[Path, common.folder_argument("OUT", "Output folder of a run.")],
-    path: Annotated[Literal["orbit", "interpolate"], typer.Option("--path", help=_PATH_HELP)] = "orbit",
-    frames: Frames = 90,
-    size: Annotated[str | None, typer.Option("--size", metavar="WxH", help=_SIZE_HELP)] = None,
-    folder: Annotated[Path | None, common.folder_option("Output folder (OUT/views/PATH).")] = None,
-    threads: common.Threads = 0,
-    overwrite: common.Overwrite = False,
-) -> None:
-    """Render the model of a run along a camera path."""
-    common.cap_threads(threads)
-    if run.is_file():
-        raise UsageError(f"render takes the output folder of a run; {run} is a file")
-    from thesisrecon.cli.view_files import render_run
-
-    with common.interruptible("repeat the command to render all frames"), common.progress_bars() as progress:
-        written = render_run(
-            run, folder or run / "views" / path, path=path, frames=frames, progress=progress,
-            size=None if size is None else _size(size), threads=threads or available_threads(),
-            overwrite=overwrite,
-        )  # fmt: skip
-    typer.echo(written)
-
-
-def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"\s*(\d{1,6})\s*[xX×]\s*(\d{1,6})\s*", text)
-    if found is None:
-        raise UsageError(f"--size takes WIDTHxHEIGHT in pixels, as 1000x700; got {text!r}")
-    width, height = int(found[1]), int(found[2])
-    if not 1 <= min(width, height) <= max(width, height) <= 8192:
-        raise UsageError(f"--size takes sides of 1 to 8192 pixels; got {width}x{height}")
-    return width, height
-
-
-def interpolate(
-    images: Annotated[list[Path], _TWO_IMAGES],
-    method: Annotated[
-        Literal["interpolation", "tensor"], typer.Option("--method", help=_METHOD_HELP)
-    ] = "interpolation",
-    frames: Frames = 21,
-    seed: common.Seed = 0,
-    max_size: common.MaxSize = None,
-    folder: Annotated[Path | None, common.folder_option("Output folder (views/METHOD).")] = None,
-    threads: common.Threads = 0,
-    overwrite: common.Overwrite = False,
-) -> None:
-    """Compute views between two images."""
-    common.cap_threads(threads)
-    if max_size is not None and max_size < 64:
-        raise UsageError(f"--max-size takes at least 64 px; got {max_size}")
-    from thesisrecon.cli.view_files import interpolate_images
-
-    folder = folder or Path("views") / method
-    with common.interruptible("repeat the command to compute all frames"), common.progress_bars() as progress:
-        written = interpolate_images(
-            folder, images, method=method, frames=frames, seed=seed, max_size_px=max_size,
-            threads=threads or available_threads(), progress=progress, overwrite=overwrite,
-        )  # fmt: skip
-    typer.echo(written)
-
-
 _ACTION = typer.Argument(
     metavar="list|show|check", help="List all, print one with its skeleton, or grade a file."
 )
@@ -471,7 +403,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]}, rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )  # fmt: skip
-for _command in (reconstruct, demo, inspect, compare, render, interpolate, export, exercises):
+for _command in (reconstruct, demo, inspect, compare, export, exercises):
     app.command()(_command)
 
 

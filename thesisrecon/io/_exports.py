@@ -1,4 +1,4 @@
-"""Point clouds, images, animations, ``cameras.json``, and sparse models in the formats of other programs.
+"""Point clouds, images, ``cameras.json``, and sparse models in the formats of other programs.
 
 These are nerfstudio, OpenMVS, OpenCV and Kalibr. The centre of the top-left pixel is (0, 0) here and in
 all of them but nerfstudio, where it is (0.5, 0.5) and cameras look along -z with y up. Each writer of a
@@ -10,7 +10,7 @@ import io
 import json
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -19,7 +19,6 @@ import PIL.Image
 
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import POSE_STDS, Camera
-from thesisrecon.errors import UsageError
 from thesisrecon.io._colmap import PIXEL_CENTRE, has_skew
 from thesisrecon.io._files import write_atomically, write_json, write_text
 from thesisrecon.io._models import LOOKS_BACK
@@ -239,48 +238,3 @@ def write_image(path: Path, rgb: U8) -> None:
     # Level 6 saves two percent for three times the time. Each format ignores the options of the other.
     PIL.Image.fromarray(rgb).save(encoded, kind, compress_level=3, quality=95, subsampling=0)
     write_atomically(path, encoded.getvalue())
-
-
-def frame_name(number: int) -> str:
-    """File name of a frame, numbered from 1."""
-    return f"frame-{number:04d}.png"
-
-
-def write_animation(path: Path, frames: Sequence[Path], *, milliseconds: int = 40) -> Path:
-    """Write an endless WebP of frame files of the same size; equal frames give equal bytes."""
-    encoded = io.BytesIO()
-    # 38 dB on textured frames; a higher method saves few percent.
-    _Sequence(frames).save(
-        encoded, "WEBP", save_all=True, duration=milliseconds, loop=0, quality=85, method=2
-    )
-    write_atomically(path, encoded.getvalue())
-    return path
-
-
-class _Sequence(PIL.Image.Image):
-    """A multi-frame Pillow image that reads its frames from files on demand."""
-
-    def __init__(self, frames: Sequence[Path]) -> None:
-        super().__init__()
-        self._frames = frames
-        self.n_frames = len(frames)
-        self.__setstate__(_read(frames[0]).__getstate__())
-        self._place = 0
-
-    def tell(self) -> int:
-        return self._place
-
-    def seek(self, frame: int) -> None:
-        if not 0 <= frame < self.n_frames:
-            raise EOFError(f"there is no frame {frame}")
-        if frame != self._place:
-            self.paste(_read(self._frames[frame]))
-            self._place = frame
-
-
-def _read(path: Path) -> PIL.Image.Image:
-    try:
-        with PIL.Image.open(path) as image:
-            return image.convert("RGB")
-    except OSError as error:
-        raise UsageError(f"the frame {path} cannot be read: {error.strerror or error}") from None
