@@ -154,25 +154,6 @@ def read_openmvs(folder):
     return found
 
 
-def read_opencv(folder):
-    import cv2
-
-    file, found = cv2.FileStorage(str(folder / "poses.yml"), cv2.FILE_STORAGE_READ), {}
-    poses = file.getNode("images")
-    for i in range(poses.size()):
-        pose = poses.at(i)
-        stored = cv2.FileStorage(str(folder / pose.getNode("camera").string()), cv2.FILE_STORAGE_READ)
-        K, k = stored.getNode("camera_matrix").mat(), stored.getNode("distortion_coefficients").mat()
-        rvec, t = cv2.Rodrigues(pose.getNode("R").mat())[0], pose.getNode("T").mat()
-        size = tuple(int(stored.getNode(f"image_{side}").real()) for side in ("width", "height"))
-
-        def project(X, args=(rvec, t, K, k)):
-            return cv2.projectPoints(X, *args)[0][:, 0]
-
-        found[pose.getNode("name").string()] = project, size
-    return found
-
-
 @pytest.mark.parametrize(
     ("to", "read", "skew"),
     [
@@ -357,48 +338,14 @@ def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
 
 
 @pytest.mark.references
-@pytest.mark.parametrize(("to", "read"), [("colmap", read_colmap), ("opencv", read_opencv)])
-def test_exports_with_distortion_project_known_points(tmp_path, to, read):
+def test_exports_with_distortion_project_known_points(tmp_path):
     model = make_model(BARREL, PINCUSHION)
-    export(model, tmp_path, to=to)
-    found = read(tmp_path)
+    export(model, tmp_path, to="colmap")
+    found = read_colmap(tmp_path)
     for view in model.views:
         project, size = found[view.name]
         assert size == SIZE
         np.testing.assert_allclose(project(model.X), camera(view).project(model.X), atol=1e-6, rtol=0)
-
-
-def kalibr_cameras(file):
-    cameras = []
-    for line in file.read_text().splitlines():
-        key, value = line.strip().split(": ") if ": " in line else (line.strip(" :"), None)
-        if value is None:
-            assert key == f"cam{len(cameras)}"
-            cameras.append({})
-        else:
-            cameras[-1][key] = json.loads(value) if value[0] == "[" else value
-    return cameras
-
-
-def test_kalibr_cameras_project_known_points(tmp_path):
-    model = make_model(np.array([-0.1, 0.02, 0.0]), BARREL)
-    report = export(model, tmp_path, to="kalibr")
-    cameras = kalibr_cameras(report.file)
-    assert len(cameras) == 2
-    assert len(report.notes) == 1
-    limit_px = float(report.notes[0].split()[-5])
-    for view, given, tolerance in zip(model.views, cameras, (1e-6, limit_px), strict=False):
-        assert (given["camera_model"], given["distortion_model"]) == ("pinhole", "radtan")
-        assert given["resolution"] == [*SIZE]
-        fu, fv, pu, pv = given["intrinsics"]
-        k1, k2, p1, p2 = given["distortion_coeffs"]
-        assert (p1, p2) == (0.0, 0.0)
-        x = model.X @ view.R.T + view.t
-        x = x[:, :2] / x[:, 2:]
-        r2 = np.sum(x**2, axis=1, keepdims=True)
-        xy = x * (1 + k1 * r2 + k2 * r2**2) * [fu, fv] + [pu, pv]
-        assert np.abs(xy - camera(view).project(model.X)).max() <= tolerance
-    assert limit_px < 0.1
 
 
 def test_a_colmap_model_is_an_input_and_equal_cameras_are_shared(tmp_path, images):
@@ -448,7 +395,8 @@ def test_images_of_a_colmap_model_are_used_as_stored(tmp_path, images, orientati
 def test_a_result_is_exported_with_or_without_its_folder(tmp_path, kept):
     run = reconstruct(fakes.photographs(4), tmp_path / "run", config=fakes.fake_config(), until="metric")
     result = run if kept else replace(run, out=None)
-    found = read_opencv(export(result, tmp_path / "out", to="opencv").file.parent)
+    export(result, tmp_path / "out", to="colmap")
+    found = read_colmap(tmp_path / "out")
     assert list(found) == list(result.cameras)
     for name, (project, size) in found.items():
         assert size == result.cameras[name].size
@@ -470,17 +418,17 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
         (model, "nerfstdio", images, "did you mean nerfstudio"),
         (model, "nerfstudio", None, "give it with --images"),
         (model, "openmvs", tmp_path / "run", "4 of the 4 images of the model are not in"),
-        (other, "opencv", None, "lens model of image a b.png is unknown"),
+        (other, "colmap", None, "lens model of image a b.png is unknown"),
         (lost, "colmap", None, "no intrinsics"),
         (twice, "nerfstudio", images, "two images of the model would be written as a b.png"),
         (small, "openmvs", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
         (wild, "openmvs", images, "the camera is not plausible"),
-        (replace(model, views=[]), "opencv", None, "no camera"),
-        (make_model(PINCUSHION, BARREL, skew=3.0), "opencv", None, "opencv has no camera model with skew"),
+        (replace(model, views=[]), "colmap", None, "no camera"),
+        (make_model(PINCUSHION, BARREL, skew=3.0), "colmap", None, "colmap has no camera model with skew"),
     ]
     for bad, to, source, words in cases:
         refuses(UsageError, words, export, bad, tmp_path / "out", to=to, images=source)
-    refuses(UsageError, "holds a run", export, model, tmp_path / "run", to="opencv")
+    refuses(UsageError, "holds a run", export, model, tmp_path / "run", to="colmap")
     far = export(replace(model, X=model.X + 5e6), tmp_path / "far", to="nerfstudio", images=images)
     assert "rounded to 0.5" in far.notes[0]
 

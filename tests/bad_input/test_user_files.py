@@ -83,7 +83,7 @@ COMMANDS = {
     ) and 0,
     "demo": lambda _, out, *more: cli("demo", "-o", out, *more),
     "save": save,
-    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "opencv", "openmvs")},
+    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "openmvs")},
     "compare": lambda place, out, *more: cli(
         "compare", place / "same", place / "other", "--json", out / "summary.json", "--page",
         out / "report.html", *more
@@ -114,7 +114,7 @@ def patched():
 KNOWN = (
     *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json",
     "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
-    "transforms.json", "images/00.png", "images/01.png", "camera_0.yml", "poses.yml", "scene.mvs",
+    "transforms.json", "images/00.png", "images/01.png", "scene.mvs",
 )  # fmt: skip
 """Files that --overwrite may replace; the following survive it, too."""
 UNKNOWN = (

@@ -16,11 +16,11 @@ from thesisrecon.results import SparseModel, SparseView
 SIZE = (640, 480)
 
 
-def _model(lens=(0.0, 0.0, 0.0)):
+def _model():
     rng = np.random.default_rng(0)
     K = np.array([[500.0, 0, 310], [0, 500, 250], [0, 0, 1]])
     R = Rotation.from_rotvec(0.4 * rng.normal(size=(4, 3))).as_matrix()
-    views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, np.array(lens)) for i, r in enumerate(R)]
+    views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, np.zeros(3)) for i, r in enumerate(R)]
     return SparseModel(views, rng.normal(size=(9, 3)))
 
 
@@ -32,12 +32,9 @@ def test_written_models_are_read_again(tmp_path):
         for name in ("R", "t", "K", "distortion"):
             np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9)
         assert a.size == b.size
-    cameras = read_cameras(_exports.write_kalibr(tmp_path, _model((0.1, -0.02, 0.0)))[0])
-    assert list(cameras) == ["cam0"]
-    np.testing.assert_allclose(cameras["cam0"].distortion, [0.1, -0.02, 0.0])
 
 
-def test_nerf_gives_an_angle_and_kalibr_a_chain(tmp_path):
+def test_nerf_gives_an_angle(tmp_path):
     (tmp_path / "train").mkdir()
     PIL.Image.new("L", (800, 600)).save(tmp_path / "train" / "r_0.png")
     pose = [[1.0, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
@@ -50,17 +47,6 @@ def test_nerf_gives_an_angle_and_kalibr_a_chain(tmp_path):
     np.testing.assert_allclose(camera.centre, [1, 2, 3])
     # Cameras of NeRF look along -z: here along +y of the world.
     np.testing.assert_allclose(camera.R[2], [0, 1, 0], atol=1e-12)
-    chain = tmp_path / "camchain.yaml"
-    rows = "".join(f"  - [{', '.join(map(str, row))}]\n" for row in np.c_[np.eye(3), [-0.1, 0, 0]].tolist())
-    entry = "  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.2, {p}, 0.0]\n  distortion_model: radtan\n"
-    entry += "  intrinsics: [400.0, 401.0, 320.0, 240.0]\n  resolution: [640, 480]\n"
-    own = entry.format(p=0.0)
-    chain.write_text(f"cam0:\n{own}cam1:\n  T_cn_cnm1:\n{rows}  - [0, 0, 0, 1]\n{own}")
-    np.testing.assert_allclose(read_cameras(chain)["cam1"].centre, [0.1, 0, 0])
-    chain.write_text(f"cam0:\n{entry.format(p=0.01)}")
-    assert read_cameras(chain)["cam0"].distortion.tolist() == [0.1, 0.2, 0.01, 0.0, 0.0]
-    chain.write_text(f"cam0:\n{entry.format(p=0.01)}".replace("radtan", "fov"))
-    refuses(UsageError, "an unknown kind", read_cameras, chain)
 
 
 @pytest.mark.parametrize(
@@ -68,7 +54,6 @@ def test_nerf_gives_an_angle_and_kalibr_a_chain(tmp_path):
     [
         ("transforms.json", '{"frames": [{"file_path": "a"}]}', "must hold frames"),
         ("transforms.json", '{"frames": []}', "no camera"),
-        ("camchain.yaml", "cam0:\n  resolution: [1]\n", "camchain.yaml of pinhole"),
     ],
 )
 def test_damaged_models_get_one_sentence(tmp_path, name, content, says):

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from thesisrecon.io._meshes import read_mesh as mesh_of_file
 from thesisrecon.io._models import colmap_model_in
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.io._pixels import MemoryBudget
-from thesisrecon.lens import Lens, directions_of_image, growing_radius, named_lens, undistort
+from thesisrecon.lens import directions_of_image, growing_radius, named_lens, undistort
 from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
@@ -52,15 +52,7 @@ def _colmap(folder: Path, model: SparseModel, *, pinhole: bool) -> Path:
     return folder / "sparse" / "0"
 
 
-_DISTORTED: Mapping[str, Callable[[Path, SparseModel], tuple[Path, list[str]]]] = {
-    "colmap": lambda folder, model: (_colmap(folder, model, pinhole=False), []),
-    "opencv": lambda folder, model: (formats.write_opencv(folder, model), []),
-    "kalibr": formats.write_kalibr,
-}
-"""Formats of cameras with distortion, which need no images."""
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
-_LENSES_OF = {"opencv": ("radial", "brown", "rational", "fisheye"), "kalibr": ("radial", "brown", "fisheye")}
-"""Lenses that a format has; others have all, or no distortion."""
 _PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
     "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
     "nerfstudio": lambda folder, model, masked: formats.write_nerfstudio(folder, model, masked=masked),
@@ -71,11 +63,9 @@ _FILES: Mapping[str, Sequence[str]] = {
     **dict.fromkeys(("colmap", "colmap-undistorted"), COLMAP_FILES),
     "nerfstudio": ("transforms.json", "points.ply"),
     "openmvs": ("scene.mvs",),
-    "opencv": ("poses.yml", "camera_[0-9]*.yml"),
-    "kalibr": ("camchain.yaml",),
 }
 """Files of each format beside images and masks."""
-FORMATS = (*_PINHOLE, *_DISTORTED)
+FORMATS = (*_PINHOLE, "colmap")
 
 
 def export(
@@ -94,7 +84,7 @@ def export(
     to : str
         ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
         cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
-        ``"colmap"``, ``"opencv"`` and ``"kalibr"`` keep the distortion, ``"nerfstudio"`` if all lenses are
+        ``"colmap"`` keeps the distortion and needs no images, ``"nerfstudio"`` keeps it if all lenses are
         ``"fisheye"``.
     images : path or mapping of str to path, optional
         Folder of the original images, or their files by name; None: those that the run was made from. Those
@@ -127,9 +117,9 @@ def export(
     >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     >>> view = SparseView("a.jpg", np.eye(3), np.zeros(3), K, (640, 480), np.array([-0.1, 0, 0]))
     >>> with TemporaryDirectory() as folder:
-    ...     report = export(SparseModel([view]), folder, to="kalibr")
+    ...     report = export(SparseModel([view]), folder, to="colmap")
     >>> report.file.name
-    'camchain.yaml'
+    '0'
     """
     require_word("export format", to, FORMATS)
     folder = as_path("export", "out", out)
@@ -150,11 +140,10 @@ def export(
     _require_cameras(model, to)
     if os.path.lexists(folder / "run.json"):
         raise UsageError(f"the folder {folder} holds a run; export to another folder")
+    if to == "colmap":
+        with claim_folder(folder, overwrite=overwrite, names=COLMAP_FILES):
+            return ExportReport(_colmap(folder, model, pinhole=False), tuple(lost))
     notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
-    if to in _DISTORTED:
-        with claim_folder(folder, overwrite=overwrite, names=_FILES[to]):
-            file, more = _DISTORTED[to](folder, model)
-        return ExportReport(file, (*notes, *more))
     native = to == "nerfstudio" and formats.is_fisheye(model)
     undistorted, pinholes = _undistorted(model, keep_lens=native)
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
@@ -207,11 +196,7 @@ def _require_cameras(model: SparseModel, to: str) -> None:
             raise UsageError(f"image {view.name} has no intrinsics or no size, which every export needs")
         if view.distortion is None:
             raise UsageError(f"the lens model of image {view.name} is unknown; it cannot be exported")
-        lens = named_lens(view.distortion)[0]
-        if lens not in _LENSES_OF.get(to, get_args(Lens)):
-            advice = "colmap-undistorted removes it from the images"
-            raise UsageError(f"{to} has no camera model of a {lens} lens, as image {view.name} has; {advice}")
-        if to in _DISTORTED and has_skew(view.K):
+        if to == "colmap" and has_skew(view.K):
             advice = "colmap-undistorted removes it from the images"
             raise UsageError(f"{to} has no camera model with skew, but image {view.name} has skew; {advice}")
 

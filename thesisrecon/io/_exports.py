@@ -1,13 +1,12 @@
 """Point clouds, images, ``cameras.json``, and sparse models in the formats of other programs.
 
-These are nerfstudio, OpenMVS, OpenCV and Kalibr. The centre of the top-left pixel is (0, 0) here and in
-all of them but nerfstudio, where it is (0.5, 0.5) and cameras look along -z with y up. Each writer of a
-format returns its main file; images lie in ``images/`` beside it, masks in ``masks/``.
+These are nerfstudio and OpenMVS. The centre of the top-left pixel is (0, 0) here and in OpenMVS; in
+nerfstudio it is (0.5, 0.5) and cameras look along -z with y up. Each writer of a format returns its main
+file; images lie in ``images/`` beside it, masks in ``masks/``.
 """
 
 import csv
 import io
-import json
 import math
 import struct
 from collections.abc import Mapping
@@ -20,9 +19,9 @@ import PIL.Image
 from thesisrecon.arrays import F64, U8
 from thesisrecon.camera import POSE_STDS, Camera
 from thesisrecon.io._colmap import PIXEL_CENTRE, has_skew
-from thesisrecon.io._files import write_atomically, write_json, write_text
+from thesisrecon.io._files import write_atomically, write_json
 from thesisrecon.io._models import LOOKS_BACK
-from thesisrecon.lens import named_lens, undistort
+from thesisrecon.lens import named_lens
 from thesisrecon.results import SparseModel, SparseView
 
 
@@ -99,72 +98,6 @@ def _matrices(*values: F64) -> bytes:
     return b"".join(np.ascontiguousarray(value, dtype="<f8").tobytes() for value in values)
 
 
-def write_opencv(folder: Path, model: SparseModel) -> Path:
-    """Write OpenCV FileStorage YAML: ``camera_N.yml`` of each camera, and ``poses.yml`` of the images."""
-    cameras, number = _distinct_cameras(model)
-    head = "%YAML:1.0\n---\n"
-    for i, view in enumerate(cameras):
-        K, (width, height), row = view.intrinsics
-        lens, known = named_lens(row)
-        if lens == "radial":
-            known = np.insert(known, [2, 2], 0.0)
-        entries = [f"image_width: {width}\nimage_height: {height}\n", _matrix("camera_matrix", K)]
-        # OpenCV has one set of functions for fisheye lenses and one for all others.
-        entries += ["distortion_model: fisheye\n"] if lens == "fisheye" else []
-        entries.append(_matrix("distortion_coefficients", known[None]))
-        write_text(folder / f"camera_{i}.yml", head + "".join(entries))
-    images = []
-    for view, i in zip(model.views, number, strict=True):
-        name = f'name: {json.dumps(view.name, ensure_ascii=False)}\ncamera: "camera_{i}.yml"\n'
-        entry = name + _matrix("R", view.R) + _matrix("T", view.t[:, None])
-        images.append("   -\n" + "".join(f"      {line}\n" for line in entry.splitlines()))
-    write_text(folder / "poses.yml", f"{head}images:\n{''.join(images)}")
-    return folder / "poses.yml"
-
-
-def _matrix(name: str, values: F64) -> str:
-    rows, cols = values.shape
-    data = ", ".join(map(repr, values.ravel().tolist()))
-    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]\n"
-
-
-def write_kalibr(folder: Path, model: SparseModel) -> tuple[Path, list[str]]:
-    """Write ``camchain.yaml`` of pinhole-radtan cameras without k3, and note the largest difference."""
-    lines, notes = list[str](), list[str]()
-    for i, view in enumerate(_distinct_cameras(model)[0]):
-        K, (width, height), _ = view.intrinsics
-        lens, known = named_lens(view.intrinsics[2])
-        kind, error_px = "equidistant" if lens == "fisheye" else "radtan", 0.0
-        if lens == "radial":
-            (k1, k2), error_px = _two_coefficients(view)
-            known = np.array([k1, k2, 0.0, 0.0])
-        if error_px > 0.0:
-            notes.append(f"cam{i}: k1 and k2 replace k1, k2 and k3, within {error_px:.2g} px in the image")
-        lines += [
-            f"cam{i}:", "  camera_model: pinhole",
-            f"  intrinsics: [{_numbers(K[[0, 1, 0, 1], [0, 1, 2, 2]])}]", f"  distortion_model: {kind}",
-            f"  distortion_coeffs: [{_numbers(known[:4])}]",
-            f"  resolution: [{width}, {height}]", f"  rostopic: /cam{i}/image_raw",
-        ]  # fmt: skip
-    write_text(folder / "camchain.yaml", "\n".join(lines) + "\n")
-    return folder / "camchain.yaml", notes
-
-
-def _two_coefficients(view: SparseView) -> tuple[F64, float]:
-    """Best k1, k2 (least squares over the image area) for k1, k2, k3, and the largest difference (px)."""
-    K, (width, height), k = view.intrinsics
-    if k[2] == 0.0:
-        return k[:2], 0.0
-    corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)]) @ np.linalg.inv(K).T
-    r = np.linspace(0.0, float(np.linalg.norm(undistort(corners[:, :2], k), axis=1).max()), 500)[1:]
-    powers = r[:, None] ** [3, 5, 7]
-    # The area of a ring is proportional to r.
-    weight = np.sqrt(r)[:, None]
-    fitted = np.linalg.lstsq(weight * powers[:, :2], weight[:, 0] * (powers @ k), rcond=None)[0]
-    apart = np.abs(powers @ k - powers[:, :2] @ fitted).max() * max(K[0, 0], K[1, 1])
-    return np.asarray(fitted, np.float64), float(apart)
-
-
 def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
     """Return one view per set of intrinsics and size, and the number of each view's set."""
     first: dict[tuple[object, ...], SparseView] = {}
@@ -182,10 +115,6 @@ def _observations_of_points(model: SparseModel) -> list[list[int]]:
     order = np.lexsort((model.view_index, model.point_index))
     counts = np.bincount(model.point_index, minlength=len(model.X))
     return [part.tolist() for part in np.split(order, np.cumsum(counts)[:-1])] if len(model.X) else []
-
-
-def _numbers(values: F64) -> str:
-    return ", ".join(repr(float(value)) for value in values)
 
 
 def write_point_cloud(path: Path, xyz: F64, rgb: U8) -> None:
