@@ -21,13 +21,11 @@ from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
 from thesisrecon.api.pairs import estimate_homography as estimate_homography
 from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
 from thesisrecon.api.relative_pose import estimate_essential as estimate_essential
-from thesisrecon.api.relative_pose import recover_pose as recover_pose
 from thesisrecon.api.relative_pose import decompose_homography as decompose_homography
 from thesisrecon.api.decompositions import essential_from_fundamental as essential_from_fundamental
 from thesisrecon.api.decompositions import decompose_essential as decompose_essential
 from thesisrecon.api.decompositions import seven_point as seven_point
 from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
-from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate as FundamentalEstimate
 from thesisrecon.records import FundamentalFit as FundamentalFit
 from thesisrecon.records import TwoView as TwoView
@@ -58,7 +56,6 @@ from thesisrecon.api.calibrate import self_calibrate as self_calibrate
 from thesisrecon.records import SelfCalibration as SelfCalibration
 from thesisrecon.api.calibrate import plane_at_infinity as plane_at_infinity
 from thesisrecon.api.calibrate import upgrade_affine as upgrade_affine
-from thesisrecon.api.calibrate import absolute_dual_quadric as absolute_dual_quadric
 from thesisrecon.api.calibrate import kruppa as kruppa
 
 # Stereo and surfaces

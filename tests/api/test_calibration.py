@@ -55,7 +55,7 @@ def test_every_method_is_exact_on_plain_cameras_and_close_under_noise(method):
 @pytest.mark.parametrize("method", ["nonlinear", "linear"])
 def test_the_quadric_projects_to_the_calibrations(method):
     scene = make_scene(seed=1)
-    found = thesisrecon.absolute_dual_quadric(scene.P @ G, scene.sizes, method=method)
+    found = thesisrecon.self_calibrate(scene.P @ G, scene.sizes, method=f"{method}-quadric")
     w = scene.P @ G @ found.Q @ (scene.P @ G).swapaxes(1, 2)
     w /= w[:, 2:, 2:]
     assert np.linalg.matrix_rank(found.Q, tol=1e-9) == 3
@@ -66,7 +66,7 @@ def test_the_quadric_projects_to_the_calibrations(method):
 
 def test_a_biased_focal_length_is_not_reported_without_a_reason():
     P = cameras_on_a_sphere()
-    found = thesisrecon.absolute_dual_quadric(P @ G, (640, 480), method="linear")
+    found = thesisrecon.self_calibrate(P @ G, (640, 480), method="linear-quadric")
     assert abs(found.K[0, 0, 0] / 800.0 - 1.0) > 0.1
     assert len(found.reasons) == 1
     assert "from that of bundle adjustment, 800 px" in found.reasons[0]
@@ -172,7 +172,7 @@ def test_cameras_without_points_are_identifiable_in_any_frame():
         P.append(K @ np.column_stack([R, -R @ centre]))
     for seed in range(6):
         H = np.random.default_rng(seed).normal(size=(4, 4))
-        found = thesisrecon.absolute_dual_quadric(np.array(P) @ H, (640, 480))
+        found = thesisrecon.self_calibrate(np.array(P) @ H, (640, 480), method="nonlinear-quadric")
         assert found.identifiable, found.reasons
         assert found.K[0, 0, 0] == pytest.approx(900, rel=0.01)
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon as tr
 from thesisrecon.geometry.two_view import fundamental_from_cameras
+from thesisrecon.io._images import read_pixels
 from thesisrecon.results import SparseModel, SparseView
 
 PACKAGE = Path(tr.__file__).parent
@@ -208,10 +209,6 @@ CALLS = {
         lambda K, R, t, **given: tr.reconstruction_from_cameras(K, R, t, **given),
         {"K": K, "R": R, "t": T, "sizes": SIZE, "X": X, "xy": XY},
     ),
-    "absolute_dual_quadric": (
-        lambda **given: tr.absolute_dual_quadric(method="linear", **given),
-        {"reconstruction": PROJECTIVE, "sizes": SIZE},
-    ),
     "plane_at_infinity": (
         tr.plane_at_infinity,
         {"reconstruction": P[:2], "sizes": SIZE, "vanishing_points": P[:2, :, :3].transpose(0, 2, 1)},
@@ -240,7 +237,6 @@ CALLS = {
         tr.estimate_essential,
         {"xy1": XY[0], "xy2": XY[1], "K1": K, "threshold_px": 1.0} | SEARCH,
     ),
-    "recover_pose": (tr.recover_pose, {"E": K.T @ F @ K, "xy1": XY[0], "xy2": XY[1], "K1": K}),
     "decompose_homography": (
         tr.decompose_homography,
         {"H": K @ (R[0] + np.outer(T[0], [0.0, 0.0, 0.1])) @ np.linalg.inv(K), "K1": K, "xy1": XY[0]},
@@ -264,10 +260,6 @@ CALLS = {
         {"xy1": XY[0, :9], "xy2": XY[1, :9], "xy3": XY[2, :9], "loss_px": 1.0, "threshold_px": None} | SEARCH,
     ),
     "epipolar_lines": (tr.epipolar_lines, {"F": F, "xy1": XY[0]}),
-    "draw_epipolar_lines": (
-        tr.draw_epipolar_lines,
-        {"image1": LEFT, "image2": RIGHT, "F": F, "xy1": XY[0], "xy2": XY[1], "max_lines": 3},
-    ),
     "rectify": (tr.rectify, {"image1": LEFT, "image2": RIGHT, "F": F, "xy1": XY[0], "xy2": XY[1]}),
     "match_rectified": (tr.match_rectified, {"left": LEFT, "right": RIGHT, "max_disparity_px": 8}),
     "interpolate_view": (
@@ -523,8 +515,7 @@ def test_images_of_all_kinds_are_the_same_image(form):
     known = np.isfinite(found)
     assert known.mean() > 0.6
     assert abs(np.median(found[known]) - 6.0) < 0.1
-    drawn = tr.draw_epipolar_lines(make(LEFT), make(RIGHT), F, XY[0], XY[1], max_lines=0)
-    for image, one in zip(drawn, (LEFT, RIGHT), strict=True):
+    for image, one in zip(read_pixels(make(LEFT), make(RIGHT)), (LEFT, RIGHT), strict=True):
         assert np.abs(image.astype(int) - one[:, :, None]).max() <= 1
     plane = tr.texture(tr.TexturedMesh(CORNERS / [8, 8, 1], FACES), [make(LEFT)], [FRONT]).texture
     assert 90 < np.median(plane) < 170
@@ -533,7 +524,7 @@ def test_images_of_all_kinds_are_the_same_image(form):
 @pytest.mark.parametrize("scale", [1.0, 1 / 255, 257.0])
 def test_a_dark_image_has_the_scale_of_its_pair(scale):
     bright, dark = 0.9 * LEFT * scale, 0.004 * LEFT * scale
-    assert np.median(tr.draw_epipolar_lines(bright, dark, F, XY[0], XY[1], max_lines=0)[1]) <= 1
+    assert np.median(read_pixels(bright, dark)[1]) <= 1
 
 
 def test_levels_outside_all_ranges_are_refused():

@@ -1,4 +1,4 @@
-"""The steps of chapter 7, one function each: plane at infinity, affine frame, dual quadric, metric frame."""
+"""The steps of chapter 7, one function each: plane at infinity, affine frame, metric frame."""
 
 from collections.abc import Callable, Mapping
 
@@ -10,7 +10,7 @@ from thesisrecon.arrays import F64, I64, checked, numbers, require_shapes, sizes
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
-from thesisrecon.errors import StageFailure, UsageError, require_word, unknown_word
+from thesisrecon.errors import StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Reconstruction, SelfCalibration
@@ -56,7 +56,8 @@ def self_calibrate(
     Returns
     -------
     SelfCalibration
-        ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) with standard deviations, and all candidates.
+        ``metric_from_projective`` (4, 4), ``K`` (V, 3, 3) with standard deviations, the absolute dual quadric
+        ``Q`` (4, 4), and all candidates.
 
     Raises
     ------
@@ -94,44 +95,6 @@ def self_calibrate(
     calibrator, settings = _method(projective, method, config)
     prior = prior_for(projective, settings.intrinsics)
     return calibrator.calibrate(projective, prior=prior, rng=stream(seed, "selfcalibration"))
-
-
-def absolute_dual_quadric(
-    reconstruction: Reconstruction | F64, sizes: I64 | None = None, *, X: F64 | None = None,
-    xy: F64 | None = None, config: Config | None = None, method: str = "nonlinear",
-) -> SelfCalibration:  # fmt: skip
-    """Estimate the absolute dual quadric Q of projective cameras, P Q P' ~ K K' (7.3, direct; HZ 19.3).
-
-    Parameters
-    ----------
-    reconstruction, sizes, X, xy, config
-        As for :func:`self_calibrate`.
-    method : {"nonlinear", "linear"}
-        Nonlinear least squares over all unknown intrinsics, or linear equations, which are biased for most
-        lenses.
-
-    Returns
-    -------
-    SelfCalibration
-        ``Q`` (4, 4), ``K`` (V, 3, 3), ``identifiable``, ``reasons`` and the rest.
-
-    Raises
-    ------
-    ValueError, StageFailure
-        As :func:`self_calibrate`.
-
-    Examples
-    --------
-    ``projective`` as in the example of `thesisrecon.self_calibrate`:
-
-    >>> from thesisrecon import absolute_dual_quadric
-    >>> found = absolute_dual_quadric(projective.P, (640, 480))
-    >>> w = projective.P[0] @ found.Q @ projective.P[0].T
-    >>> bool(np.allclose(w / w[2, 2], found.K[0] @ found.K[0].T, rtol=1e-6)), found.identifiable
-    (True, True)
-    """
-    require_word("method", method, ("nonlinear", "linear"))
-    return self_calibrate(reconstruction, sizes, X=X, xy=xy, method=f"{method}-quadric", config=config)
 
 
 def plane_at_infinity(

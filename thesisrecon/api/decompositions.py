@@ -157,7 +157,6 @@ def decompose_essential(
     """Return the four poses of an essential matrix, and how many matches each has in front (HZ 9.6.2, 9.6.3).
 
     With E = U diag(1, 1, 0) V', R is U W V' or U W' V' and t is u3 or -u3.
-    :func:`thesisrecon.recover_pose` returns the one of most matches.
 
     Parameters
     ----------
@@ -171,7 +170,7 @@ def decompose_essential(
     Returns
     -------
     EssentialPoses
-        The poses with more matches in front first.
+        The poses with more matches in front first: ``R[0]``, ``t[0]`` is that of the cameras.
 
     Raises
     ------
