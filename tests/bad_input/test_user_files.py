@@ -85,8 +85,7 @@ COMMANDS = {
     "save": save,
     **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "openmvs")},
     "compare": lambda place, out, *more: cli(
-        "compare", place / "same", place / "other", "--json", out / "summary.json", "--page",
-        out / "report.html", *more
+        "compare", place / "same", place / "other", "--json", out / "summary.json", *more
     ),
 }  # fmt: skip
 

@@ -146,14 +146,14 @@ def test_a_folder_is_cleared_only_if_a_command_made_it(tmp_path):
     assert content(photos) == {"a.jpg": b"of the user"}
 
 
-def test_single_files_are_written_all_or_none(tmp_path):
-    one, two = tmp_path / "1.json", tmp_path / "2.html"
-    two.write_text("of the user", encoding="utf-8")
-    refuses(UsageError, CHANGED, write_new, {one: "{}", two: "page"}, overwrite=False)
-    assert content(tmp_path) == {"2.html": b"of the user"}
-    write_new({one: "{}", two: "page"}, overwrite=True)
-    write_new({one: "{}", two: "page"}, overwrite=False)
-    assert content(tmp_path) == {"1.json": b"{}", "2.html": b"page"}
+def test_a_single_file_of_another_is_not_replaced(tmp_path):
+    path = tmp_path / "1.json"
+    path.write_text("of the user", encoding="utf-8")
+    refuses(UsageError, CHANGED, write_new, path, "{}", overwrite=False)
+    assert content(tmp_path) == {"1.json": b"of the user"}
+    write_new(path, "{}", overwrite=True)
+    write_new(path, "{}", overwrite=False)
+    assert content(tmp_path) == {"1.json": b"{}"}
 
 
 def at(stage, action):

@@ -99,7 +99,7 @@ def made_up_run(*, names=None, points=1500, seed=4):
         images, title="Courtyard wall", reports=_reports(), config_text=CONFIG,
         summary={"images": count, "registered": count - 1, "peak_memory_mb": 312.5},
         unread={"notes.jpg": "it is no image that Pillow can read"}, pairs=pairs, metric=metric,
-        affine=replace(metric.reconstruction, stratum="affine"), colors=colors,
+        colors=colors,
     )  # fmt: skip
 
 

@@ -71,33 +71,12 @@ def test_strata_are_told_apart_and_captions_state_omitted_points(page):
     assert projective.count('<span class="state open">projective camera</span>') == 8
     assert ">registered<" not in projective
     assert page.count('<span class="state good">registered</span>') == 8
-    assert 'id="affine-figure"' in page
-    without = render_report(replace(synthetic.made_up_run(), affine=None))
-    assert 'id="affine-figure"' not in without
     data = synthetic.made_up_run(points=200)
     assert "All 200 points are shown." in render_report(data)
     X = data.metric.reconstruction.X.copy()
     X[0, :3] = 1e6
     metric = replace(data.metric, reconstruction=replace(data.metric.reconstruction, X=X))
     assert "199 of 200 points are shown, without outliers." in render_report(replace(data, metric=metric))
-
-
-@pytest.mark.parametrize("count", [0, 1, 3, 8])
-@pytest.mark.parametrize("offset", [0.0, 1e-13, 1e-6])
-def test_affine_cameras_at_infinity_are_left_out_by_number(count, offset):
-    data = synthetic.made_up_run(points=200)
-    P = data.affine.P.copy()
-    views = np.flatnonzero(data.affine.registered)[:count]
-    # Nearly so: with the centre 1e6 or more units away.
-    P[views, 2, :3] = P[views, 0, :3] / 3000.0 + offset * P[views, 2, :3]
-    warnings = []
-    page = render_report(replace(data, affine=replace(data.affine, P=P)), warnings)
-    assert warnings == []
-    assert 'id="scene-figure"' in page
-    words = {0: [], 1: ["1 camera at infinity, or nearly so, is not drawn."]}
-    expected = words.get(count, [f"{count} cameras at infinity, or nearly so, are not drawn."])
-    assert re.findall(r"\d+ camera[^.]*at infinity[^.]*\.", page) == expected
-    assert ('id="affine-figure"' in page) == (count < 8)
 
 
 def test_pairs_without_an_epipolar_geometry_are_listed_but_not_drawn():

@@ -1,4 +1,4 @@
-"""The viewer of the model and the pages of runs, comparisons and strips as a browser shows them."""
+"""The viewer of the model and the pages of runs as a browser shows them."""
 
 import base64
 import io
@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
-from tests.io.test_colmap import export, scene
 from tests.report import synthetic
 from tests.surface.sphere import SHAPE, K, photograph, ring_of
-from thesisrecon import compare_models
 from thesisrecon.camera import decompose_camera
-from thesisrecon.io._models import read_model
-from thesisrecon.records import Similarity, TexturedMesh
+from thesisrecon.records import TexturedMesh
 from thesisrecon.report import _figures
 from thesisrecon.report._figures import LEVELS, upright_rotation, viewer_data
-from thesisrecon.report._page import comparison_page, render_report
+from thesisrecon.report._page import render_report
 
 
 def unpacked(text, kind, columns):
@@ -368,33 +365,3 @@ def test_missing_webgl_is_reported(browser, model_report):
     assert not model_page.page.locator("#model-reset").is_visible()
     assert all("viewer" not in error.lower() for error in model_page.errors)
     model_page.context.close()
-
-
-def page_in(browser, tmp_path, page, width=900, drawn=("scene-figure",)):
-    (tmp_path / "page.html").write_text(page, encoding="utf-8")
-    return synthetic.Witness(browser, tmp_path / "page.html", width, drawn=drawn)
-
-
-@pytest.mark.browser
-def test_all_points_are_in_view_although_the_reference_has_none(browser, tmp_path):
-    export(tmp_path, scene())
-    a = read_model(tmp_path)
-    b = replace(a, X=a.X[:0], view_index=a.view_index[:0], point_index=a.point_index[:0], xy=a.xy[:0])
-    a = replace(a, X=a.X - np.array([0.0, 4.0, 0.0]))
-    seen = page_in(browser, tmp_path, comparison_page(compare_models(a, b), "a", "b"))
-    points = np.abs(seen.pixels("#scene-figure").astype(int) - (255, 199, 138)).max(axis=2) < 30
-    assert points.sum() > 20
-    assert not points[:3].any()
-    assert not points[-3:].any()
-
-
-@pytest.mark.browser
-def test_a_browser_draws_both_models(browser, tmp_path):
-    export(tmp_path, scene())
-    b = read_model(tmp_path)
-    a = replace(b, X=b.X + 0.2).transformed(Similarity(3.0, np.eye(3), np.ones(3)))
-    seen = page_in(browser, tmp_path, comparison_page(compare_models(a, b), "a", "b"))
-    colors = seen.pixels("#scene-figure").reshape(-1, 3).astype(int)
-    for points in ((255, 199, 138), (159, 216, 247)):
-        assert (np.abs(colors - points).max(axis=1) < 30).sum() > 20
-    assert seen.errors == []

@@ -17,7 +17,7 @@ import typer
 
 from thesisrecon import __version__
 from thesisrecon.cli import common
-from thesisrecon.errors import Notice, UsageError, counted, made
+from thesisrecon.errors import Notice, UsageError, counted
 from thesisrecon.io._files import printable, read_json
 from thesisrecon.runtime._signals import set_error_stream
 
@@ -225,7 +225,6 @@ def _intrinsic_lines(views: list[Mapping[str, Any]]) -> list[str]:
 
 
 _KINDS = "folder of a run, COLMAP model, cameras.json, or trajectory (TUM or KITTI)"
-_PAGE_HELP = "Write a page (HTML) with both models in 3D."
 BEYOND_LIMIT = 4
 
 
@@ -247,7 +246,6 @@ def compare(
     a: Annotated[Path, common.folder_argument("A", f"Model: {_KINDS}.")],
     b: Annotated[Path, common.folder_argument("B", "Reference: any of these.")],
     json: Annotated[Path | None, typer.Option("--json", help="Write all numbers to this file.")] = None,
-    page: Annotated[Path | None, typer.Option("--page", help=_PAGE_HELP)] = None,
     max_time_difference: Annotated[
         float, typer.Option("--max-time-difference", min=0.0, help="Largest difference of paired times, s.")
     ] = 0.01,
@@ -262,10 +260,7 @@ def compare(
     from thesisrecon.api.models import compare_models
     from thesisrecon.io._files import json_text, write_new
     from thesisrecon.report._assessment import camera_table, headline, point_table, summary_table
-    from thesisrecon.report._page import comparison_page
 
-    if json is not None and json == page:
-        raise UsageError("--json and --page name the same file; give different ones")
     times = {"max_time_difference": max_time_difference, "time_offset": time_offset}
     found = compare_models(a, b, **times)
     lines = [f"A: {a}", f"B: {b} (reference)", headline(found), *(f"note: {note}" for note in found.notes)]
@@ -277,13 +272,9 @@ def compare(
         lines += ["", *("  ".join(cells).rstrip() for cells in padded)]
     if len(cameras) > most + 1:
         lines.append(f"and {len(cameras) - 1 - most} more cameras; --json writes all")
-    files = {} if json is None else {json: json_text({"a": str(a), "b": str(b), **found.as_table()})}
-    warnings: list[str] = []
-    if page is not None:
-        html = made(str(page), lambda: comparison_page(found, str(a), str(b)), warnings, "")
-        files |= {page: html} if html else {}
-    write_new(files, overwrite=overwrite, extra=page, warnings=warnings)
-    lines += [f"warning: {warning}" for warning in warnings]
+    if json is not None:
+        text = json_text({"a": str(a), "b": str(b), **found.as_table()})
+        write_new(json, text, overwrite=overwrite)
     limits = [
         ("centre error", found.centre_error, max_centre_error),
         ("rotation error in degrees", found.rotation_error_deg, max_rotation_error),

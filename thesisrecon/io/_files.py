@@ -13,11 +13,10 @@ import stat
 import unicodedata
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from thesisrecon.errors import Notice, OutputError, UsageError, in_words, made
+from thesisrecon.errors import Notice, OutputError, UsageError, in_words
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26  # Limit of text files: far above any list of pairs, far below the memory of a computer
@@ -180,20 +179,14 @@ def json_text(value: Any) -> str:
     return json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n"
 
 
-def write_new(
-    texts: Mapping[Path, str], *, overwrite: bool, extra: Path | None = None,
-    warnings: list[str] | None = None,
-) -> None:  # fmt: skip
-    """Write single texts, or none if a file would be replaced; ``extra`` may fail with a warning."""
-    files = {path: text.encode("utf-8", "replace") for path, text in texts.items()}
-    new = {path: file for path, file in files.items() if not has_content(path, [digest_of(file)])}
-    if refused := next((path for path in new if not overwrite and os.path.lexists(path)), None):
-        raise not_ours(refused)
-    for path, file in new.items():
-        if path == extra and warnings is not None:
-            made(str(path), partial(write_atomically, path, file), warnings, None)
-        else:
-            write_atomically(path, file)
+def write_new(path: Path, text: str, *, overwrite: bool) -> None:
+    """Write a single text; UsageError if another file would be replaced."""
+    content = text.encode("utf-8", "replace")
+    if has_content(path, [digest_of(content)]):
+        return
+    if not overwrite and os.path.lexists(path):
+        raise not_ours(path)
+    write_atomically(path, content)
 
 
 def as_read(value: Any) -> Any:

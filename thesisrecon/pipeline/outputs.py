@@ -24,12 +24,11 @@ from thesisrecon.io._meshes import glb_bytes
 from thesisrecon.io._outputs import claim_folder
 from thesisrecon.pipeline.matching import final_pairs
 from thesisrecon.pipeline.run import FOLDERS, Run, Until, name_images
-from thesisrecon.records import Reconstruction, TexturedMesh
+from thesisrecon.records import TexturedMesh
 from thesisrecon.report._data import ReportData, pictured, point_colors, summarize
 from thesisrecon.report._page import render_report
 from thesisrecon.results import SUMMARY, RunResult
 from thesisrecon.runtime._run_folder import MANIFEST_FILE, RUN_FILE, RunDirectory, StageFolder
-from thesisrecon.selfcalibration.stratified import upgrade_to_affine
 from thesisrecon.surface._simplification import reduce_faces
 from thesisrecon.surface.model import MAX_TEXELS, SurfaceModel, texture_mesh
 
@@ -96,12 +95,11 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
         colors, warnings = _write_exports(run.directory, result, max_mb, run.workers.threads)
-        affine = made("the affine points", lambda: _affine(result), warnings, None)
         model = made("the model in report.html", for_page.result, warnings, None)
         depths = made("a depth map in report.html", lambda: _thinned_maps(result), warnings, dict[int, F32]())
         page = ReportData.of(
-            result, title=run.title, config_text=config, colors=colors, affine=affine, model=model,
-            depths=depths, until=None if until == "model" else until, end=failure,
+            result, title=run.title, config_text=config, colors=colors, model=model, depths=depths,
+            until=None if until == "model" else until, end=failure,
         )  # fmt: skip
         made(PAGE, lambda: write_text(out / PAGE, render_report(page, warnings)), warnings, None)
     run.finish("outputs", counts={})
@@ -190,12 +188,6 @@ def _write_exports(
     made(path.name, lambda: write_point_cloud(path, points, shown), warnings, None)
     _write_model(directory, result, colors, warnings)
     return colors, warnings + _write_surface(directory, result, max_mb, threads)
-
-
-def _affine(result: RunResult) -> Reconstruction | None:
-    if result.metric is None or result.projective is None or result.calibration is None:
-        return None
-    return upgrade_to_affine(result.projective, result.calibration.plane_at_infinity)
 
 
 def _failure_warnings(result: RunResult) -> list[str]:

@@ -34,7 +34,6 @@ class ReportData(RunResult):
     title: str = ""
     config_text: str = ""
     colors: U8 | None = None  # (N, 3) of the metric points, valid or not
-    affine: records.Reconstruction | None = None
     model: records.TexturedMesh | None = None  # 45,000 faces with 2048 x 2048 texels add about 2 MB
     depths: Mapping[int, F32] = field(default_factory=dict)  # by view; a long side of 400 px is enough
     until: str | None = None  # last stage that was requested, None = all

@@ -26,7 +26,6 @@ from thesisrecon.imaging.pinholes import camera_of_image, is_wide, pinhole_numbe
 from thesisrecon.lens import angles_from_axis
 from thesisrecon.records import HeldOut, Image, Reconstruction, TexturedMesh, TwoView
 from thesisrecon.report._data import pictured
-from thesisrecon.results import ModelComparison, SparseModel
 
 MAX_POINTS = 25_000
 _ACCENT = "#ff9f43"
@@ -36,8 +35,6 @@ MAX_MATRIX, MAX_CELLS = 200, 100
 """Largest number of views in the matrix of pairs, and cells per side for more."""
 MAX_PYRAMIDS = 250  # Cameras that are drawn as pyramids; of more, these are evenly spread
 HUES_OF_LENSES = ("#0b6e7f", "#c4560b", "#6a3d9a", "#4d7a18")
-COMPARED_COLORS = {"a": ("#ff9f43", "#ffc78a"), "b": ("#3fb8ff", "#9fd8f7")}
-"""Cameras and points of each model in a comparison."""
 
 
 @dataclass(frozen=True)
@@ -54,38 +51,20 @@ class Scene:
 
 
 def build_scene(reconstruction: Reconstruction, *, max_points: int = MAX_POINTS) -> Scene | None:
-    """3D view of a metric or affine reconstruction without far points and cameras; None without a camera."""
+    """3D view of a metric reconstruction without far points; None without a camera."""
     views = np.flatnonzero(reconstruction.registered & finite_cameras(reconstruction.P)).astype(np.int64)
-    if reconstruction.stratum != "metric":
-        views = views[_near(reconstruction, views)]
     if len(views) == 0:
         return None
     parts = [decompose_camera(reconstruction.P[i]) for i in views]
     rotations = np.stack([R for _, R, _ in parts])
-    centres = np.stack([dehomogenize(camera_centre(reconstruction.P[i])) for i in views])
-    rays = [_corner_rays(K, size) for (K, _, _), size in zip(parts, reconstruction.sizes[views], strict=True)]
+    upright = upright_rotation(rotations)
     index = _kept_points(reconstruction.X, reconstruction.valid, max_points)
-    points = reconstruction.X[:, :3]
-    return _scene(points, index, views, (centres, rotations, rays), upright_rotation(rotations))
-
-
-def model_scene(model: SparseModel, upright: F64, *, max_points: int = MAX_POINTS) -> Scene:
-    """3D view of a sparse model as in :func:`build_scene`; cameras without intrinsics are square."""
-    rays = []
-    for view in model.views:
-        K = np.eye(3) if view.K is None else view.K
-        rays.append(_corner_rays(K, np.array(view.size or 2.0 * K[:2, 2] + 1.0)))
-    centres, rotations = (np.stack([getattr(view, name) for view in model.views]) for name in ("centre", "R"))
-    index = _kept_points(model.X, np.ones(len(model.X), dtype=np.bool_), max_points)
-    return _scene(model.X, index, np.arange(len(rays)), (centres, rotations, rays), upright)
-
-
-def _scene(X: F64, index: I64, views: I64, cameras: tuple[F64, F64, list[F64]], upright: F64) -> Scene:
-    """The points of these numbers and the cameras: centres, rotations and rays through the image corners."""
-    points, centres = X[index] @ upright.T, cameras[0] @ upright.T
+    points = reconstruction.X[index, :3] @ upright.T
+    centres = dehomogenize(camera_centre(reconstruction.P[views])) @ upright.T
     depth = _pyramid_depth(centres, points)
-    views_of = zip(centres, *cameras[1:], strict=True)
-    corners = np.stack([c + depth * rays @ R @ upright.T for c, R, rays in views_of])
+    rays = [_corner_rays(K, size) for (K, _, _), size in zip(parts, reconstruction.sizes[views], strict=True)]
+    views_of = zip(centres, rotations, rays, strict=True)
+    corners = np.stack([c + depth * own @ R @ upright.T for c, R, own in views_of])
     everything = np.concatenate([points, centres, corners.reshape(-1, 3)])
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.03 * float((high - low).max()) or 1.0
@@ -110,16 +89,6 @@ def upright_rotation(rotations: F64) -> F64:
     return np.stack([np.cross(ahead, up), ahead, up])
 
 
-def _near(reconstruction: Reconstruction, views: I64) -> B8:
-    """Whether the centres of these cameras are near the points, relative to their spread."""
-    X = reconstruction.X[reconstruction.valid & np.isfinite(reconstruction.X).all(axis=1), :3]
-    middle = np.median(X, axis=0) if len(X) else np.zeros(3)
-    radius = np.quantile(np.linalg.norm(X - middle, axis=1), 0.8) if len(X) else np.inf
-    centres = dehomogenize(camera_centre(reconstruction.P[views]))
-    # Farther than 50 radii of 80 % of the points a camera is as good as at infinity.
-    return np.asarray(np.linalg.norm(centres - middle, axis=1) <= 50.0 * radius)
-
-
 def _kept_points(X: F64, valid: B8, max_points: int) -> I64:
     kept = np.flatnonzero(valid & np.isfinite(X).all(axis=1))
     if len(kept) == 0:
@@ -134,7 +103,7 @@ def _corner_rays(K: F64, size: NDArray[np.int64]) -> F64:
     width, height = float(size[0]), float(size[1])
     xy = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
     rays = homogenize(xy) @ np.linalg.inv(K).T
-    # Affine cameras may have any K: no edge is longer than 3 depths, as with a field of view of 140 degrees.
+    # No edge is longer than 3 depths, as with a field of view of 140 degrees.
     return np.asarray(rays / max(1.0, float(np.linalg.norm(rays, axis=1).max()) / 3.0))
 
 
@@ -151,23 +120,19 @@ def _pyramid_depth(centres: F64, points: F64) -> float:
 Figure = dict[str, Any]
 
 
-def scene_figure(
-    scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | str | None, *, accent: str = _ACCENT
-) -> Figure:
-    """Cameras and points as a plotly.js figure; ``colors`` are those of the points X, or one for all."""
+def scene_figure(scene: Scene, names: Sequence[str], colors: NDArray[np.uint8] | None) -> Figure:
+    """Cameras and points as a plotly.js figure; ``colors`` are those of the points X."""
     # About the middle: WebGL draws in single precision, too coarse far from the origin.
     parts, middle = ("points", "centres", "corners", "low", "high"), 0.5 * (scene.low + scene.high)
     scene = replace(scene, **{name: getattr(scene, name) - middle for name in parts})
     # Decimals that keep 1e-4 of the size.
     largest = float((scene.high - scene.low).max())
     digits = int(np.clip(4 - np.floor(np.log10(max(largest, 1e-12))), 0, 15))
-    paint: object = "#9fb4c7" if colors is None else colors
-    if isinstance(colors, np.ndarray):
-        paint = [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
+    paint = "#9fb4c7" if colors is None else [f"#{bytes(rgb).hex()}" for rgb in colors[scene.index]]
     marks = [f"{i + 1} · {escape(names[i])}" for i in scene.views]
     hover = {"text": marks, "hovertemplate": "%{text}<extra></extra>"}
     points = _markers("points", 2, paint, _xyz(scene.points, digits)) | {"hoverinfo": "skip"}
-    centres = _markers("centres", 4, accent, _xyz(scene.centres, digits)) | hover
+    centres = _markers("centres", 4, _ACCENT, _xyz(scene.centres, digits)) | hover
     extent = scene.high - scene.low
     aspect = 1.7 * extent / max(float(extent.max()), 1e-12)
     ranges = zip("xyz", scene.low.tolist(), scene.high.tolist(), strict=True)
@@ -180,7 +145,7 @@ def scene_figure(
         "scene": {**axes, "aspectmode": "manual", "aspectratio": ratio, "dragmode": "turntable"},
         "hoverlabel": {"font": {"family": "system-ui, sans-serif"}},
     }
-    return {"data": [points, _pyramids(scene, digits, accent), centres], "layout": layout}
+    return {"data": [points, _pyramids(scene, digits), centres], "layout": layout}
 
 
 def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
@@ -188,7 +153,7 @@ def _markers(name: str, size: int, color: object, xyz: Figure) -> Figure:
     return {"type": "scatter3d", "mode": "markers", "name": name, "marker": marker, **xyz}
 
 
-def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
+def _pyramids(scene: Scene, digits: int) -> Figure:
     """Draw pyramids as one line trace: rim, roof over the upper edge, four edges; None interrupts it."""
     rows: list[list[float] | None] = []
     shown = pictured(len(scene.centres), MAX_PYRAMIDS)
@@ -200,26 +165,9 @@ def _pyramids(scene: Scene, digits: int, accent: str) -> Figure:
             rows += [np.round(vertex, digits).tolist() for vertex in stroke]
             rows.append(None)
     columns = {name: [None if row is None else row[d] for row in rows] for d, name in enumerate("xyz")}
-    line = {"color": accent, "width": 2.5}
+    line = {"color": _ACCENT, "width": 2.5}
     kind = {"type": "scatter3d", "mode": "lines", "name": "cameras", "hoverinfo": "skip", "line": line}
     return {**kind, **columns}
-
-
-def comparison_figure(comparison: ModelComparison) -> dict[str, Any]:
-    """Both models in the world of B as one plotly.js figure, upright."""
-    upright = upright_rotation(np.stack([view.R for view in comparison.b.views]))
-    models = {"b": comparison.b, "a": comparison.a}
-    # Both models take half a megabyte together.
-    scenes = {key: model_scene(model, upright, max_points=10_000) for key, model in models.items()}
-    low = np.min([scene.low for scene in scenes.values()], axis=0)
-    high = np.max([scene.high for scene in scenes.values()], axis=0)
-    figure: dict[str, Any] = {}
-    for key, scene in scenes.items():
-        accent, paint = COMPARED_COLORS[key]
-        names = [f"{key.upper()}: {name}" for name in models[key].names]
-        drawn = scene_figure(replace(scene, low=low, high=high), names, paint, accent=accent)
-        figure = {**drawn, "data": [*figure.get("data", []), *drawn["data"]]}
-    return figure
 
 
 def pair_matrix_figure(pairs: Sequence[TwoView], names: Sequence[str]) -> Figure:

@@ -1,4 +1,4 @@
-"""``report.html`` of a run, and the page of a comparison: files without network access.
+"""``report.html`` of a run, a file without network access.
 
 A page loads nothing from the network, and no file name can run as code: the template escapes all text, data
 for scripts is JSON that cannot close its element, and a content security policy lists the scripts by their
@@ -17,13 +17,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from thesisrecon import __version__
-from thesisrecon.arrays import F64, U8
+from thesisrecon.arrays import F64
 from thesisrecon.errors import made
 from thesisrecon.records import Reconstruction, StageReport
 from thesisrecon.report import _assessment as words
 from thesisrecon.report import _data
 from thesisrecon.report import _figures as figures
-from thesisrecon.results import ModelComparison
 
 _INTRINSICS = {
     "focal_px": "Focal length (px)", "aspect": "Aspect (fy/fx)", "skew_px": "Skew (px)",
@@ -87,21 +86,6 @@ def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]
     return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
 
 
-def comparison_page(comparison: ModelComparison, a: str, b: str) -> str:
-    """Render the page of a comparison; ``a`` and ``b`` name the models."""
-    aligned = comparison.similarity is not None
-    drawn = {"scene-figure": figures.comparison_figure(comparison)} if aligned else {}
-    scripts, content = _figure_content(drawn)
-    return render_page(
-        page_resource("comparison.html.j2"), scripts, **content, version=__version__, names={"a": a, "b": b},
-        colors={key: cameras for key, (cameras, _) in figures.COMPARED_COLORS.items()},
-        headline=words.headline(comparison),
-        notes=[note[:1].upper() + note[1:] + "." for note in comparison.notes],
-        tables=[t for t in (words.summary_table(comparison), words.point_table(comparison)) if t],
-        cameras=words.camera_table(comparison),
-    )  # fmt: skip
-
-
 class _Pictures:
     """Makes the pictures of a page, each on its own; ``warnings`` are about those that failed."""
 
@@ -122,7 +106,7 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     size = {"width": 200.0, "height": 44.0}
     drawn = pictures.make("the histograms of the residuals", figures.histograms, distances, **size)
     limit_px, bars = drawn or (1.0, [""] * len(distances))
-    plotted, shown, omitted = _figures(data, names, pictures)
+    plotted, shown = _figures(data, names, pictures)
     model = None
     held_out = None
     if data.model is not None and len(data.model.faces) and data.metric is not None:
@@ -158,7 +142,7 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
         intrinsic_columns=[(name, heading) for name, heading in _INTRINSICS.items() if name in estimated],
         limit_px=limit_px, held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), **content,
         difference_limit=round(figures.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
-        shown_points=shown, omitted=omitted, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
+        shown_points=shown, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
         warnings=_warnings(data, pictures.warnings), straight=straight, model_scripts=model_scripts,
         histogram_size=tuple(size.values()),
@@ -171,39 +155,29 @@ def _sharing(images: int) -> int:
     return min(images, 2 * _data.MAX_PICTURED)
 
 
-def _figures(
-    data: _data.ReportData, names: Sequence[str], pictures: _Pictures
-) -> tuple[dict[str, Any], int, int]:
-    """The figures by id (not "scene", which plotly.js uses), points in 3D, affine cameras left out."""
+def _figures(data: _data.ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int]:
+    """The figures by id (not "scene", which plotly.js uses), and the number of points in 3D."""
     found: dict[str, Any] = {}
-    points = omitted = 0
+    points = 0
 
-    def draw_scene(
-        best: Reconstruction, colors: U8 | None, most: int
-    ) -> tuple[figures.Figure | None, int, int]:
-        scene, cameras = figures.build_scene(best, max_points=most), int(best.registered.sum())
-        if scene is None:
-            return None, 0, cameras
-        drawn = figures.scene_figure(scene, names, colors)
-        return drawn, len(scene.points), cameras - len(scene.views)
+    def draw_scene(best: Reconstruction) -> tuple[figures.Figure | None, int]:
+        scene = figures.build_scene(best)
+        return (
+            (None, 0)
+            if scene is None
+            else (figures.scene_figure(scene, names, data.colors), len(scene.points))
+        )
 
     if data.metric is not None:
-        given = data.metric.reconstruction, data.colors, figures.MAX_POINTS
-        if drawn := pictures.make("the figure of cameras and points", draw_scene, *given):
-            found["scene-figure"], points, _ = drawn
-    if data.metric is not None and (affine := data.affine) is not None:
-        drawn = pictures.make(
-            "the figure of the affine stratum",
-            lambda: draw_scene(affine, _data.point_colors(affine, data.images), 5_000),
-        )
-        if drawn is not None:
-            found["affine-figure"], _, omitted = drawn
+        best = data.metric.reconstruction
+        if drawn := pictures.make("the figure of cameras and points", draw_scene, best):
+            found["scene-figure"], points = drawn
     if data.bent:
         found["lens-figure"] = pictures.make("the lens", figures.lens_figure, data.bent)
     if data.pairs:
         matrix = pictures.make("the matrix of pairs", figures.pair_matrix_figure, data.pairs, names)
         found["matrix-figure"] = matrix
-    return {name: figure for name, figure in found.items() if figure is not None}, points, omitted
+    return {name: figure for name, figure in found.items() if figure is not None}, points
 
 
 def _cards(
