@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import thesisrecon
-from thesisrecon import plot
 
 folder = thesisrecon.sample("courtyard")
 paths = [folder / "images" / name for name in ("0000.jpg", "0001.jpg")]
@@ -26,9 +25,10 @@ pair = thesisrecon.match_pair(*paths)
 fit = thesisrecon.estimate_fundamental(pair.xy1, pair.xy2)
 some = np.random.default_rng(0).choice(len(pair.xy1), 12, replace=False)
 figure, axes = plt.subplots(1, 2, figsize=(12, 4.8), layout="constrained")
-xy1, xy2 = pair.xy1[some], pair.xy2[some]
-plot.epipolar_lines(paths[0], fit.F.T, xy2, xy1, ax=axes[0])
-plot.epipolar_lines(paths[1], fit, xy1, xy2, ax=axes[1])
+images = thesisrecon.draw_epipolar_lines(*paths, fit.F, pair.xy1[some], pair.xy2[some])
+for axis, image in zip(axes, images, strict=True):
+    axis.imshow(image)
+    axis.set(xticks=[], yticks=[])
 
 # %%
 # How precise is :math:`F`? Each distance has the noise of both images, a variance of :math:`2\sigma^2`, and a

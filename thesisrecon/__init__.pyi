@@ -26,6 +26,7 @@ from thesisrecon.api.decompositions import essential_from_fundamental as essenti
 from thesisrecon.api.decompositions import decompose_essential as decompose_essential
 from thesisrecon.api.decompositions import seven_point as seven_point
 from thesisrecon.api.pairs import epipolar_lines as epipolar_lines
+from thesisrecon.api.pairs import draw_epipolar_lines as draw_epipolar_lines
 from thesisrecon.epipolar.degeneracy import FundamentalEstimate as FundamentalEstimate
 from thesisrecon.records import FundamentalFit as FundamentalFit
 from thesisrecon.records import TwoView as TwoView

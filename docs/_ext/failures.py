@@ -81,7 +81,7 @@ FAILURES = """## Failures
 
 A failure says what happened (reason), what was measured (evidence) and what to do.
 Two different images suffice for matching; a calibration needs three
-([why](photographing.md#why-three-views)). Functions of two images (`rectify`, `match_rectified` and
+([why](photographing.md#why-three-views)). Functions of two images (`rectify`, `draw_epipolar_lines` and
 others) refuse a file that cannot be read with the reasons of the first table.
 
 """

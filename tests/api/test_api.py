@@ -157,7 +157,20 @@ def test_a_pair_is_rectified_and_matched_from_arrays():
     refuses(ValueError, r"finite F \(3, 3\)", thesisrecon.rectify, left, right, np.zeros((3, 3)), xy1, xy2)
 
 
-def test_epipolar_lines_pass_through_the_matches():
+def test_epipolar_lines_pass_through_the_matches(tmp_path):
     pair = make_pair(5, np.random.default_rng(0))
-    for F, one, other in ((pair.F, pair.xy1, pair.xy2), (pair.F.T, pair.xy2, pair.xy1)):
-        assert np.abs(np.sum(homogenize(other) * epipolar_lines(F, one), axis=1)).max() < 1e-6
+    S = np.diag([5.0, 5.0, 1.0])
+    F, xy1, xy2 = S @ pair.F @ S, 0.2 * pair.xy1, 0.2 * pair.xy2
+    gray = np.full((192, 256), 128, np.uint8)
+    PIL.Image.fromarray(np.tile(np.arange(256, dtype=np.uint8), (192, 1))).save(tmp_path / "a.png")
+    for image in (gray, tmp_path / "a.png"):
+        drawn = thesisrecon.draw_epipolar_lines(image, image, F, xy1[:1], xy2[:1])
+        for side, (canvas, xy) in enumerate(zip(drawn, (xy1, xy2), strict=True)):
+            # More red than background: a line covers parts of pixels.
+            rows, columns = np.nonzero(canvas[:, :, 0] > canvas[:, :, 1] + 127.0)
+            line = (epipolar_lines(F, xy1) if side else epipolar_lines(F.T, xy2))[0]
+            off = np.abs(np.column_stack([columns, rows, np.ones(len(rows))]) @ line)
+            near = np.hypot(*(np.column_stack([columns, rows]) - xy[0]).T) < 6.0
+            assert off[~near].max() < 1.0
+            assert (~near).sum() > 100
+    refuses(ValueError, "needs F", thesisrecon.draw_epipolar_lines, gray, gray, F, xy1, xy2[:2])

@@ -6,10 +6,12 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
+from PIL import ImageDraw
 
 from thesisrecon import arrays
 from thesisrecon.api.cameras import require_threshold, search_budget
-from thesisrecon.arrays import F64, number, whole_number
+from thesisrecon.arrays import F64, U8, number, whole_number
 from thesisrecon.config import Detector
 from thesisrecon.config.text import Config, as_config
 from thesisrecon.epipolar._matches import MAX_PX
@@ -21,8 +23,8 @@ from thesisrecon.epipolar.three_view_estimation import NO_POINTS, NO_SEGMENTS, T
 from thesisrecon.errors import Notice, StageFailure, require_word
 from thesisrecon.features.harris import CornerMeasure, HarrisCorners
 from thesisrecon.geometry.homogeneous import unit_norm
-from thesisrecon.geometry.two_view import lines_of_points
-from thesisrecon.io._images import eight_bit_images, full_image, read_image
+from thesisrecon.geometry.two_view import clip_line, lines_of_points
+from thesisrecon.io._images import eight_bit_images, full_image, read_image, read_pixels
 from thesisrecon.pipeline.matching import ImageInput, match_images
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.runtime._blas import one_blas_thread
@@ -96,6 +98,46 @@ def _transformed(pair: TwoView, T1: F64, T2: F64) -> TwoView:
         pair, F=transform(pair.F), sigma_px=pair.sigma_px * scale, xy1=pair.xy1 @ T1[:2, :2] + T1[:2, 2],
         xy2=pair.xy2 @ T2[:2, :2] + T2[:2, 2], affine=pair.affine * (T2[0, 0] / T1[0, 0]), degeneracy=report,
     )  # fmt: skip
+
+
+def draw_epipolar_lines(
+    image1: ImageInput, image2: ImageInput, F: F64, xy1: F64, xy2: F64, *, max_lines: int = 30
+) -> tuple[U8, U8]:
+    """Draw the epipolar lines of matches into both images (figure 3.11).
+
+    Parameters
+    ----------
+    image1, image2 : path or array_like (H, W), (H, W, 3) or (H, W, 4)
+        Files, read at full size, or images.
+    F, xy1, xy2 : ndarray (3, 3), (N, 2) and (N, 2)
+        Fundamental matrix and matches in pixels of these images.
+    max_lines : int
+        Number of matches to draw, spread over all; each has one colour in both images.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8, twice
+        The images, with the line F x1 and the point x2 in the second, F' x2 and x1 in the first, drawn to
+        fractions of a pixel.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import draw_epipolar_lines
+    >>> F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    >>> gray = np.full((60, 80), 128, np.uint8)
+    >>> left, right = draw_epipolar_lines(gray, gray, F, np.array([[40.0, 30]]), np.array([[20.0, 30]]))
+    >>> left.shape, np.unique(np.nonzero((right != 128).any(axis=2))[0]).tolist()
+    ((60, 80, 3), [26, 27, 28, 29, 30, 31, 32, 33, 34])
+    """
+    F, xy1, xy2 = arrays.checked(
+        "draw_epipolar_lines", F=(F, (3, 3)), xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2))
+    )
+    arrays.whole_number("draw_epipolar_lines", "max_lines", max_lines, 0)
+    some = np.unique(np.linspace(0, len(xy1) - 1, min(max_lines, len(xy1))).astype(np.int64))
+    xy1, xy2 = xy1[some], xy2[some]
+    first, second = read_pixels(image1, image2)
+    return _drawn(first, lines_of_points(F.T, xy2), xy1), _drawn(second, lines_of_points(F, xy1), xy2)
 
 
 def estimate_homography(
@@ -329,6 +371,24 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
     """
     F, xy1 = arrays.checked("epipolar_lines", missing=("xy1",), F=(F, (3, 3)), xy1=(xy1, ("N", 2)))
     return lines_of_points(F, xy1)
+
+
+def _drawn(image: U8, lines: F64, xy: F64) -> U8:
+    """An image with lines (N, 3) and points (N, 2); number k always has the same colour."""
+    height, width = image.shape[:2]
+    thick = max(1, round(max(height, width) / 400))
+    # At twice the size, then reduced for smooth edges; other pixels do not change.
+    picture = PillowImage.fromarray(image).resize((2 * width, 2 * height), PillowImage.Resampling.NEAREST)
+    draw = ImageDraw.Draw(picture)
+    for k, (line, point) in enumerate(zip(lines, 2.0 * xy + 0.5, strict=True)):
+        # The golden ratio spreads hues evenly for any number of matches.
+        colour = f"hsv({222.4922 * k % 360.0:.3f}, 100%, 100%)"
+        if (ends := clip_line(line, width, height)) is not None:
+            draw.line([tuple(2.0 * end + 0.5) for end in ends], colour, 2 * thick)
+        radius = 9 * thick - 0.5
+        low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
+        draw.ellipse((*low, *high), outline=colour, width=2 * thick)
+    return np.asarray(picture.reduce(2))
 
 
 Formula = Literal["noble", "harris"]
