@@ -294,7 +294,7 @@ CALLS = {
     ),
     "export": (
         lambda **given: tr.export(**{"out": "exported"} | given),
-        {"model": NAMED, "out": "exported", "to": "opencv", "overwrite": False},
+        {"model": NAMED, "out": "exported", "to": "colmap", "overwrite": False},
     ),
     "export of images": (
         lambda **given: tr.export(NAMED, "exported", to="nerfstudio", **given),

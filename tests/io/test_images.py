@@ -336,7 +336,7 @@ def test_names_outside_the_folder_of_images_are_refused_everywhere(tmp_path, nam
     as_json(tmp_path, name)
     refuses(UsageError, f"{tmp_path} names an image .*{RULE}", read_model, tmp_path)
     model, out = SparseModel([view(name)]), tmp_path / "out"
-    refuses(UsageError, RULE, export, model, out, to="opencv")
+    refuses(UsageError, RULE, export, model, out, to="colmap")
     refuses(UsageError, RULE, export, model, out, to="nerfstudio", images=tmp_path)
     refuses(UsageError, RULE, views_of, [(128, 96)], [name], None)
     image = Image(name, np.zeros((96, 128, 3), np.uint8), (128, 96))

@@ -261,7 +261,6 @@ def test_a_reconstruction_of_pycolmap_is_a_model_wherever_its_folder_is(tmp_path
         "scaled": lambda given: tr.scaled(given, names[0], names[1], 2.0),
         "compare": lambda given: tr.compare_models(given, folder),
         "colmap": lambda given: exported(given, "colmap"),
-        "opencv": lambda given: exported(given, "opencv"),
         "bundle": tr.bundle_adjust,
         "bundle of arrays": lambda given: tr.bundle_adjust(given, X, xy, free=()),
         "again": lambda given: tr.reconstruct_from_colmap(given).metric.reconstruction,
