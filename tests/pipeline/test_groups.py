@@ -82,6 +82,7 @@ def test_each_group_has_a_model_and_the_largest_is_first(tmp_path):
     sentence = f"{models}: 4 images in this model, 3 in group-2, 2 in none"
     assert sentence in summary["warnings"]
     said = summary_text(summary, tmp_path)
+    assert "warning: To join 3 images to the model, photograph between 02.png and 03.png, about" in said
     assert f"group-2: 3 of 3 images registered; report: {tmp_path}" in said
     assert "not registered: 00.png" not in said
     assert '<a href="group-2/report.html">group-2</a>' in (tmp_path / "report.html").read_text("utf-8")

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import thesisrecon
@@ -186,6 +187,13 @@ def asked(place, request):
     shutil.copy(PAGE.parents[2] / "fixtures" / "courtyard" / "cameras.json", home)
     thesisrecon.reconstruct(home / "images", home / "out", until="metric", max_size=400)
     shutil.copytree(place / "sparse", home / "sparse")
+    for k, image in enumerate(sorted((home / "images").iterdir())):
+        folder = home / "cameras" / ("left", "right")[k % 2]
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(image, folder)
+        (home / "masks").mkdir(exist_ok=True)
+        mask = np.where(np.arange(768) < 600, 255, 0).astype(np.uint8)
+        PIL.Image.fromarray(np.tile(mask[:, None], 1024)).save(home / "masks" / f"{image.stem}.png")
     return home
 
 

@@ -19,6 +19,7 @@ from thesisrecon.pipeline import outputs, stages
 from thesisrecon.pipeline.large_sets import calibrated_part, cameras_from_parts, from_metric, prior_of_views
 from thesisrecon.pipeline.lens import as_imaged
 from thesisrecon.pipeline.matching import FromRun, image_groups, require_accepted_pair
+from thesisrecon.pipeline.next_photographs import next_photographs
 from thesisrecon.pipeline.run import Job, Run, name_images, stream
 from thesisrecon.records import MetricResult, Reconstruction, TwoView
 from thesisrecon.results import RunResult
@@ -259,6 +260,8 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
         if linked := [job.names[i] for i in sorted(ends - known)]:
             names = ", ".join(linked[:MAX_NAMED]) + (", ..." if len(linked) > MAX_NAMED else "")
             run.warnings.append(Notice("linked-images", counted(len(linked), "image"), names))
+        if here.stratum == "metric":
+            run.warnings += next_photographs(here, result.pairs, job.names)
     if not run.groups:
         return result
     registered = 0 if here is None else int(here.registered.sum())
