@@ -15,6 +15,7 @@ from tests.epipolar.pairs import SIZE, angle_between, make_pair, spoil
 from tests.geometry.properties import holds_for_every
 from thesisrecon.api.pairs import epipolar_lines, estimate_fundamental
 from thesisrecon.epipolar import ransac
+from thesisrecon.epipolar._matches import noise_scale
 from thesisrecon.epipolar.degeneracy import Method
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.refinement import refine_fundamental
@@ -188,6 +189,13 @@ def test_the_share_of_right_matches_that_pass(test, share):
     sigma, inliers = ransac.discard_outliers(F, xy1, xy2, test=test)
     assert sigma == pytest.approx(0.5, rel=0.1)
     assert inliers.mean() == pytest.approx(share, abs=0.035)
+
+
+@holds_for_every()
+def test_the_noise_within_a_limit_of_zero_is_that_of_the_eight_nearest_matches(rng):
+    F, xy1, xy2 = rng.normal(size=(3, 3)), rng.normal(size=(60, 2)), rng.normal(size=(60, 2))
+    nearest = np.sort(np.abs(two_view.sampson_residuals(F, xy1, xy2)))[: ransac.MINIMUM]
+    assert ransac.discard_outliers(F, xy1, xy2, limit_px=0.0)[0] == noise_scale(nearest)
 
 
 @pytest.mark.parametrize("inlier_test", ["epipolar-distance", "symmetric-distance"])

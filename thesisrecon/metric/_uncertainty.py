@@ -194,15 +194,17 @@ def intrinsic_intervals(
 ) -> Intervals:  # fmt: skip
     """Value, standard deviation and source of each intrinsic of each view; +- 1.96 std is a 95 % interval.
 
-    They contain the errors of a fixed aspect, skew and decentring as those of the poses do.
+    They contain the errors of a fixed aspect and skew as those of the poses do, and of the decentring that
+    the images leave possible, which they determine better than the floor of the model error.
     """
     floors, largest = _std_floor(model, scatter), adjustment.row_prior(model).std
     # The prior of the principal point has longer tails than a normal one.
     tails = np.where(np.isin(np.arange(largest.shape[1]), CENTRE), student_factor(CENTRE_DOF), 1.0)
     largest *= tails
     share = lack_of_fit(scatter, model.tail)
-    faults = MODEL_FLOOR_REL * np.sqrt(share) * np.linalg.norm(uncertainty.intrinsic_fault, axis=1)
-    faults = np.maximum(faults, uncertainty.decentring_change)
+    faults = MODEL_FLOOR_REL * np.sqrt(share) * np.linalg.norm(uncertainty.intrinsic_fault[:, :2], axis=1)
+    faults = np.hypot(faults, uncertainty.decentring_change)
+    floors[:, CENTRE] = 0.0  # for the principal point these are what the floor stands for
     answer: list[dict[str, IntrinsicInterval]] = [{} for _ in model.registered]
     for view in np.flatnonzero(model.registered).tolist():
         g, intervals = int(model.cameras.group[view]), answer[view]
@@ -303,6 +305,8 @@ def pose_std(
                 std[unknown] = own.std / (own.value if column == FOCAL else 1.0)
     share = lack_of_fit(scatter, model.tail)
     common, fault = _common_inflation(scatter, share), MODEL_FLOOR_REL * np.sqrt(share)
+    # Here decentring stands for all smooth errors of a lens: poses absorb them in more ways.
+    std = np.hypot(std, fault * np.linalg.norm(poses.intrinsic_fault[:, 2:], axis=1))
     # Errors of a few blocks move some views more than they move the intrinsics.
     noise = np.full((len(poses.views), 2), common)
     for view, part in zip(*np.nonzero(np.isfinite(scatter.pose_ratios[0])), strict=True):
