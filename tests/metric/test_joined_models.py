@@ -21,10 +21,11 @@ OWN = 60
 WORLD = Similarity(3.0, Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix(), np.ones(3))
 
 
-def row(common=10, singles=0, noise_px=NOISE_PX, seed=0, parts=2, own=OWN, alike=False):
+def row(common=10, singles=0, noise_px=NOISE_PX, seed=0, parts=2, own=OWN, alike=False, before=0):
     """Models of parts of three cameras each in one row, which share points with the next part, and the truth.
 
-    Each model but the first has a world of its own. Of ``singles`` more points the next part sees one image.
+    Each model but the first has a world of its own. Of ``singles`` more points the next part sees one image,
+    of ``before`` more points the part before sees one.
     If the parts are ``alike``, they are rows before equal facades, and the common points are wrong.
     """
     rng, views = np.random.default_rng(seed), 3 * parts
@@ -32,10 +33,10 @@ def row(common=10, singles=0, noise_px=NOISE_PX, seed=0, parts=2, own=OWN, alike
     R = Rotation.from_euler("xyz", rng.normal(0, 4, (views, 3)), degrees=True).as_matrix()
     seen, X, view = [], [], np.arange(views)
     for first in range(0, views, 3):
-        for count, more in ((own, 0), (common, 3), (singles, 1)):
+        for count, less, more in ((own, 0, 0), (common, 0, 3), (singles, 0, 1), (before, 1, 0)):
             left = 0 if alike else first
             X.append(rng.uniform([left - 1, -1, 5], [left + 3, 1, 9], (count, 3)))
-            seen.append(np.tile((view >= first) & (view < first + 3 + more), (count, 1)))
+            seen.append(np.tile((view >= first - less) & (view < first + 3 + more), (count, 1)))
     X, (point, view) = np.concatenate(X), np.nonzero(np.concatenate(seen))
     P = camera_from_centre(np.tile(K, (views, 1, 1)), R, centres)
     xy = dehomogenize(np.einsum("nij,nj->ni", P[view], homogenize(X)[point]))
@@ -141,6 +142,19 @@ def test_points_that_one_model_sees_in_a_single_image_count():
     require_right(joined, P, 0.15)
     assert joined.inlier[joined.tracks.view_index == 3].all()
     assert join(row(4)[0]) is None
+
+
+def test_models_without_a_point_that_both_know_are_joined_by_images_that_see_the_other():
+    models, P = row(0, singles=30, before=30)
+    assert not (models[0].valid & models[1].valid).any()
+    joined = join(models)
+    require_right(joined, P, 0.15)
+    assert joinable(models[0], [[3, 4, 5]]) == [[3, 4, 5]]
+    # Points of one image give no scale.
+    for few in ({"singles": 30}, {"before": 30}):
+        one = row(0, **few)[0]
+        assert join(one) is None
+        assert joinable(one[0], [[3, 4, 5]]) == []
 
 
 def test_models_are_joined_one_behind_another_if_they_share_points():

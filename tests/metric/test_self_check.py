@@ -9,7 +9,14 @@ from tests.metric.metric_stage import centre_error, run, scatter, with_xy
 from tests.synthetic import make_scene, projective_reconstruction, with_poses
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.metric import _adjustment, _model
-from thesisrecon.metric._checks import check_views, self_check, triangulable_observations, weakest_join
+from thesisrecon.metric._checks import (
+    check_returned,
+    check_views,
+    returned_cameras,
+    self_check,
+    triangulable_observations,
+    weakest_join,
+)
 from thesisrecon.metric._shared_camera import (
     check_shared_cameras,
     contradicted_focal_priors,
@@ -18,6 +25,7 @@ from thesisrecon.metric._shared_camera import (
 )
 from thesisrecon.metric._uncertainty import widen_by_camera_model, widen_unverified_focals
 from thesisrecon.metric.refinement import MAX_REMAINING
+from thesisrecon.optimize.bundle.identifiability import measure_motion
 from thesisrecon.optimize.bundle.projection import MetricCameras
 from thesisrecon.optimize.bundle.scatter import block_scatter
 from thesisrecon.records import IntrinsicInterval, SelfCalibration, Tracks
@@ -389,6 +397,20 @@ def test_held_out_blocks_and_differences_of_models():
     zoomed = replace(model, cameras=replace(cameras, intrinsics=longer))
     assert _adjustment.camera_differences(model, zoomed).focal == pytest.approx(np.log(1.02))
     assert _adjustment.camera_differences(model, zoomed).harmless
+
+
+def test_a_model_of_two_of_the_images_is_checked_without_the_others():
+    scene, _, model = setting()
+    prior = prior_for(
+        projective_reconstruction(scene), IntrinsicsOptions(focal="known", focal_px=float(scene.K[0, 0, 0]))
+    )
+    two = found_again(replace(model, registered=np.arange(len(scene.K)) < 2))
+    # Two centres are equal up to a similarity, whatever the cameras are.
+    assert not _adjustment.camera_differences(two, two).harmless
+    none = [{} if k > 1 else one for k, one in enumerate(stated(two))]
+    motion = measure_motion(returned_cameras(two))
+    report = check_returned(two, _adjustment.MetricAdjustment(prior, 0.0, 0.02), motion, none)
+    assert report.identifiable
 
 
 def test_a_richer_model_of_one_camera_predicts_no_better_and_one_of_crops_far_better():

@@ -1,5 +1,7 @@
 """Images too wide for one pinhole view: several see all of them, for depth maps and texture."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -31,7 +33,7 @@ def image_of(colors):
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("degrees", [120.0, 178.0])
+@pytest.mark.parametrize("degrees", [70.0, 90.0, 120.0, 178.0])
 def test_the_pinhole_views_of_a_wide_image_see_all_of_it_with_its_colours(degrees):
     camera = wide_camera(degrees)
     rays = camera.unproject(every_pixel())
@@ -41,7 +43,7 @@ def test_the_pinhole_views_of_a_wide_image_see_all_of_it_with_its_colours(degree
     image, seen = Image("a.png", rgb, SIZE), np.zeros(len(rays), dtype=bool)
     # Of one image the numbers are those of the faces.
     numbers = pinhole_numbers(model)
-    assert numbers[:3] == [0, 1, 2]
+    assert numbers[:3] == ([0, 1, 2] if degrees > 110.0 else [0])
     for n in numbers:
         view = pinhole_view(image, model, n)
         assert view.seen.shape == pinhole_frame(image, model, n).seen.shape
@@ -57,7 +59,15 @@ def test_the_pinhole_views_of_a_wide_image_see_all_of_it_with_its_colours(degree
         x, y = np.rint(xy[here]).astype(int).T
         seen[here] |= view.seen[y, x]
     # Less than 5 % of a view is left out.
-    assert seen[known].mean() > 0.97
+    assert seen[known].mean() > 0.95
+
+
+def test_an_image_of_which_a_pinhole_image_shows_most_has_a_view_of_its_k_and_size():
+    camera = replace(wide_camera(60.0), lens="radial", distortion=np.array([-0.08]))
+    image, model = _scene("depth_maps", [image_of(every_pixel()[:, 0])], [camera], None, 1000)
+    view = pinhole_frame(image[0], model, 0)
+    assert view.seen.shape == SIZE[::-1]
+    np.testing.assert_allclose(view.P[:, :3], camera.K)
 
 
 def test_depth_maps_and_texture_reach_beyond_what_one_pinhole_view_sees():

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from tests.surface.sphere import looking_at_origin, photograph, sphere_map
@@ -87,6 +88,46 @@ def test_an_image_is_rasterised_in_parts_without_effect_on_it(monkeypatch, sampl
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 12 * 1280 * 960
+
+
+@pytest.mark.parametrize(
+    ("lens", "k", "focal"),
+    [("fisheye", [-0.02, 0.001], 38.0), ("fisheye", [], 60.0), ("radial", [-0.2, 0.04], 70.0),
+     ("brown", [0.1, -0.02, 0.003, -0.002], 90.0), ("division", [-0.3], 60.0)],
+)  # fmt: skip
+def test_a_camera_with_a_lens_sees_what_its_rays_meet(lens, k, focal):
+    # A box around the camera, with a lid inside it; colours are linear in space.
+    corner = np.array([[x, y, z] for x in (-2, 3) for y in (-1.5, 2) for z in (-2, 4)], dtype=np.float64)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    sheet = np.array([[-1, -0.8, 2.0], [1.2, -0.8, 2.5], [1.2, 0.9, 2.5], [-1, 0.9, 2.0]])
+    faces = np.array([f for a, b, c, d in [*sides, (8, 9, 10, 11)] for f in ((a, b, c), (a, c, d))])
+    vertices = np.concatenate([corner, sheet])
+    mesh = TexturedMesh(vertices, faces, colors=np.clip(vertices * 30.0 + 120.0, 0, 255).astype(np.uint8))
+    R = Rotation.from_euler("xyz", [20, -35, 10], degrees=True).as_matrix()
+    K = np.array([[focal, 0, 62.0], [0, focal, 45.0], [0, 0, 1]])
+    camera = Camera(K, R, -R @ [0.3, 0.1, 0.2], (120, 90), np.array(k), lens=lens)
+    view = render(mesh, camera, samples=1)
+    xy = np.stack(np.meshgrid(np.arange(120.0), np.arange(90.0)), axis=-1).reshape(-1, 2)
+    rays = camera.unproject(xy)
+    hit = np.isfinite(rays).all(axis=1)
+    assert view.valid.reshape(-1)[hit].all()
+    assert not view.valid.reshape(-1)[~hit].any()
+    # Each ray ends at the first of the planes, within the sheet for the last two.
+    a, b, c = (vertices[faces[:, n]] for n in range(3))
+    M = np.stack([np.broadcast_to(-rays[hit][:, None], (hit.sum(), len(faces), 3)),
+                  np.broadcast_to(b - a, (hit.sum(), len(faces), 3)),
+                  np.broadcast_to(c - a, (hit.sum(), len(faces), 3))], axis=-1)  # fmt: skip
+    solved = np.linalg.solve(M + 1e-12 * np.eye(3), (camera.centre - a)[None, :, :, None])[..., 0]
+    inside = (solved[..., 0] > 0) & (solved[..., 1:] > -1e-7).all(-1) & (solved[..., 1:].sum(-1) < 1 + 1e-7)
+    first = np.where(inside, solved[..., 0], np.inf).min(axis=1)
+    X = camera.centre + first[:, None] * rays[hit]
+    depth = ((X - camera.centre) @ R.T)[:, 2]
+    found = view.depth.reshape(-1)[hit]
+    # At the rim of the sheet the face is that of the nearest pixel of a pinhole view.
+    same = np.abs(found - depth) < 1e-4
+    assert same.mean() > 0.98
+    colour = X * 30.0 + 120.0
+    assert np.abs(view.color.reshape(-1, 3)[hit][same] - colour[same]).max() < 1.6
 
 
 def test_light_on_a_bare_surface_falls_by_the_cosine():

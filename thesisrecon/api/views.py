@@ -329,11 +329,12 @@ def render(
     ----------
     mesh, camera : TexturedMesh, Camera
         Mesh with a texture or vertex colours, shown as photographed, or neither (grey, lit from the camera),
-        and camera without distortion.
+        and camera with any lens, whose image has this lens.
     background : tuple of int, or of float
         Colour of empty pixels, 0 to 255, or 0 to 1 as floats.
     samples : int
-        Samples per pixel side, averaged. Depth and validity refer to the pixel centre.
+        Samples per pixel side, averaged. Depth, z in the camera frame (below 0 beyond 90 degrees from the
+        axis), and validity refer to the pixel centre.
     threads : int
         Number of threads; the image does not depend on it.
 
@@ -344,7 +345,7 @@ def render(
     Raises
     ------
     ValueError
-        If the camera has distortion, ``samples`` is below 1, or the mesh is invalid.
+        If ``samples`` is below 1, or the mesh is invalid.
 
     Examples
     --------

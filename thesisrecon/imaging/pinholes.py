@@ -1,18 +1,20 @@
 """Pinhole views of images: one each, or several where a lens is too wide for one.
 
-Of V images the view of image i has the number i. An image wider than ``WIDE`` is divided: its front view has
-the number i, and those to the left, right, up and down i + V to i + 4 V.
+Of V images the view of image i has the number i. An image wider than ``WIDE``, or of which a pinhole image
+of its size would lose more than ``MAX_LOST``, is divided: its front view has the number i, and those to the
+left, right, up and down (if the image shows them) i + V to i + 4 V.
 """
 
 import numpy as np
 
 from thesisrecon.arrays import F64, resizing_transform
-from thesisrecon.camera import angles_of_view, pixels_of_rays, widest_angle
+from thesisrecon.camera import angles_of_view, pixels_of_rays, viewing_rays, widest_angle
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.imaging.resampling import undistort_image
 from thesisrecon.records import Image, PinholeView, Reconstruction
 
 WIDE = 110.0  # degrees along the long side, of which an image is divided into several pinhole views
+MAX_LOST = 0.15  # of the pixels of an image, of which it is divided too
 FACES = {
     "front": np.eye(3),
     "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -22,12 +24,24 @@ FACES = {
 }
 """Rotations from the axes of a wide camera to those of its pinhole views of 90 x 90 degrees."""
 LEAST_SEEN = 0.05  # of a pinhole view, which is used from there on
-GRID = 33  # samples along a side of a pinhole view at which it is tested what the image shows
+GRID = 33  # samples along a side of an image or a view at which it is tested what the other shows
 
 
 def is_wide(K: F64, size: tuple[int, int], lens: F64) -> bool:
-    """Whether an image is divided into several pinhole views."""
+    """Whether an image is wider than one pinhole image can show."""
     return angles_of_view(K, size, lens)[0] > WIDE
+
+
+def is_divided(K: F64, size: tuple[int, int], lens: F64) -> bool:
+    """Whether the dense stages see an image by views of 90 x 90 degrees, or by one of its K and size."""
+    if not lens.any() or is_wide(K, size, lens):
+        return bool(lens.any())
+    axes = [np.linspace(0.0, side - 1.0, GRID) for side in size]
+    rays = viewing_rays(K, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2), lens)
+    with np.errstate(invalid="ignore"):
+        straight = rays[:, :2] / rays[:, 2:] @ K[:2, :2].T + K[:2, 2]
+        lost = (rays[:, 2] > 0.0) & (np.abs(straight / (np.array(size) - 1.0) - 0.5) > 0.5 + 1e-9).any(axis=1)
+    return bool(lost.mean() > MAX_LOST)
 
 
 def seen_faces(K: F64, size: tuple[int, int], lens: F64) -> tuple[F64, int, dict[str, F64]]:
@@ -55,7 +69,7 @@ def pinhole_numbers(reconstruction: Reconstruction) -> list[int]:
     numbers, V, names = list[int](), len(reconstruction.P), list(FACES)
     for i in np.flatnonzero(reconstruction.registered).tolist():
         camera = camera_of_image(reconstruction, i)
-        shown = seen_faces(*camera)[2] if is_wide(*camera) else names[:1]
+        shown = seen_faces(*camera)[2] if is_divided(*camera) else names[:1]
         numbers += [i + V * names.index(name) for name in shown]
     return sorted(numbers)
 
@@ -103,7 +117,7 @@ def _pinhole_camera(
         raise ValueError(f"image {image.name} must be {reconstruction.sizes[i]} px; got {image.size}")
     P, turn = reconstruction.P[i], None
     P = P * np.sign(np.linalg.det(P[:, :3])) / np.linalg.norm(P[2, :3])
-    if is_wide(K, size, lens):
+    if is_divided(K, size, lens):
         turn = list(FACES.values())[face]
         own, _, boxes = seen_faces(K, size, lens)
         first, last = boxes[list(FACES)[face]]

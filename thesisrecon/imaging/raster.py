@@ -1,16 +1,25 @@
-"""Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective."""
+"""Z-buffer: the mesh face that each pixel of a camera sees, exact in perspective.
 
-from collections.abc import Callable
+A camera with a lens has the faces at the nearest pixels of pinhole views, and the exact places of its rays on
+them.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from thesisrecon._numba import ThreadPool, empty, kernel
-from thesisrecon.arrays import F32, F64, I64, U8
-from thesisrecon.camera import Camera
+from thesisrecon.arrays import B8, F32, F64, I64, U8
+from thesisrecon.camera import Camera, viewing_rays
+from thesisrecon.imaging.pinholes import FACES
 from thesisrecon.records import TexturedMesh
 
+EVERY_WAY = (*FACES.values(), np.diag([-1.0, 1.0, -1.0]))
+"""Rotations from the axes of a camera to those of the pinhole views of 90 x 90 degrees all around it."""
+GRID = 65  # rays along a side of an image, next to all on its border, that show which parts of views are seen
+CHUNK = 2**16  # rays that are intersected at a time
 _SLACK = 1e-7  #: margin of a triangle's edges, px, so that rounding leaves no gap between neighbours
 
 
@@ -185,6 +194,90 @@ def rasterize_rows(corners: F64, near: float, rows: tuple[int, int], width: int)
     raster = Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
     _rasterize_rows(np.ascontiguousarray(corners), near, rows, depth, face, raster.weights)
     return raster
+
+
+def raster_of_camera(
+    vertices: F64, faces: I64, camera: Camera, threads: int = 1
+) -> Callable[[tuple[int, int]], Raster]:
+    """A function that finds the faces at the pixels of rows (first, last + 1) of a camera with any lens."""
+    width, height = camera.size
+    if camera.is_pinhole:
+        corners, near = image_corners(vertices, faces, camera)
+        return lambda rows: rasterize_rows(corners, near, rows, width)
+    K, lens = camera.K, camera.lens_row
+    x, y = (np.linspace(0.0, side - 1.0, GRID) for side in (width, height))
+    edges = [np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2) for axes in (
+        (x, y), (np.arange(width), y[[0, -1]]), (x[[0, -1]], np.arange(height)),
+    )]  # fmt: skip
+    some = viewing_rays(K, np.concatenate(edges), lens)
+    views = [_view_of_rays(vertices, faces, camera, turn, some, threads) for turn in EVERY_WAY]
+    with np.errstate(invalid="ignore"):
+        points = vertices @ camera.R.T + camera.t
+
+    def find(rows: tuple[int, int]) -> Raster:
+        shape = (rows[1] - rows[0], width)
+        depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
+        raster = Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
+        step = max(CHUNK // width, 1)
+        for first in range(0, shape[0], step):
+            part = raster[first : first + step]
+            across = np.arange(rows[0] + first, rows[0] + first + len(part.face))
+            xy = np.stack(np.meshgrid(np.arange(width), across), axis=-1).reshape(-1, 2).astype(np.float64)
+            _fill(part, viewing_rays(K, xy, lens), views, points, faces)
+        return raster
+
+    return find
+
+
+_View = tuple[F64, F64, I64] | None
+"""Of a pinhole view: K times its rotation, the rotation, and the faces at its pixels; None: unseen."""
+
+
+def _view_of_rays(vertices: F64, faces: I64, camera: Camera, turn: F64, rays: F64, threads: int) -> _View:
+    """The part of a pinhole view of 90 x 90 degrees that some rays of an image, near all others, show."""
+    mine, focal = rays[_looks_into(rays, turn)] @ turn.T, float(max(int(camera.K[0, 0]), 8))
+    if not len(mine):
+        return None
+    places, margin = focal * mine[:, :2] / mine[:, 2:], 8.0 * focal / GRID
+    low = np.floor(np.maximum(places.min(axis=0) - margin, -focal))
+    high = np.ceil(np.minimum(places.max(axis=0) + margin, focal))
+    size = (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
+    K = np.array([[focal, 0.0, -low[0]], [0.0, focal, -low[1]], [0.0, 0.0, 1.0]])
+    corners, near = image_corners(vertices, faces, Camera(K, turn @ camera.R, turn @ camera.t, size))
+    found = np.empty(size[::-1], dtype=np.int64)
+
+    def work(rows: tuple[int, int]) -> None:
+        found[slice(*rows)] = rasterize_rows(corners, near, rows, size[0]).face
+
+    run_in_strips(work, size[1], threads)
+    return K @ turn, turn, found
+
+
+def _looks_into(rays: F64, turn: F64) -> B8:
+    """Whether rays (N,) lie in a pinhole view of 90 x 90 degrees; NaN: in none."""
+    across = rays @ turn.T
+    return np.asarray(across[:, 2] >= (1.0 - 1e-12) * np.abs(across[:, :2]).max(axis=1))
+
+
+def _fill(raster: Raster, rays: F64, views: Sequence[_View], points: F64, faces: I64) -> None:
+    """Fill a raster by the faces of views at the pixels nearest to the rays, and their places on these."""
+    found = np.full(len(rays), -1)
+    for view in views:
+        if view is not None:
+            mine = np.flatnonzero(_looks_into(rays, view[1]) & (found < 0))
+            xh = rays[mine] @ view[0].T
+            x, y = np.rint(xh[:, :2] / xh[:, 2:]).astype(np.int64).T
+            found[mine] = view[2][np.clip(y, 0, len(view[2]) - 1), np.clip(x, 0, view[2].shape[1] - 1)]
+    hit = np.flatnonzero(found >= 0)
+    corners = points[faces[found[hit]]]
+    # The ray is a sum of the corners with these weights: their signs are equal inside the face.
+    weights = np.einsum("nkc,nc->nk", np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]), rays[hit])
+    weights *= np.sign(np.einsum("nc,nc->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))[:, None]
+    weights = np.maximum(weights, 0.0)
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+    raster.face.reshape(-1)[hit] = found[hit]
+    raster.depth.reshape(-1)[hit] = np.einsum("nk,nk->n", weights, corners[:, :, 2])
+    raster.weights.reshape(-1, 2)[hit] = weights[:, 1:]
 
 
 def vertex_normals(mesh: TexturedMesh) -> F64:

@@ -326,8 +326,13 @@ class CameraDifferences:
 
 
 def camera_differences(a: MetricEstimate, b: MetricEstimate) -> CameraDifferences:
-    """Differences between the cameras of two estimates after a similarity alignment of their centres."""
+    """Differences between the cameras of two estimates after a similarity alignment of their centres.
+
+    Infinite for fewer than three cameras, whose centres a similarity aligns whatever they are.
+    """
     v = np.flatnonzero(a.registered & b.registered)
+    if len(v) < 3:
+        return CameraDifferences(np.inf, np.inf, np.inf)
     A, B = (m.cameras.centres[v] for m in (a, b))
     move = estimate_similarity(B, A)
     off = np.linalg.norm(A - move.apply(B), axis=1)

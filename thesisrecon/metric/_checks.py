@@ -352,7 +352,7 @@ def check_returned(
     seen = subsample_inliers(part)
     count = np.bincount(seen.view_index, minlength=len(model.registered))
     # The poses of views with fewer of the observations may be undetermined.
-    views = np.flatnonzero(count >= min(10, int(np.sort(count)[-3:][0])))
+    views = np.flatnonzero(part.registered & (count >= min(10, int(np.sort(count)[-3:][0]))))
     used = np.flatnonzero(np.isin(seen.view_index, views))
     used = used[(np.bincount(seen.point_index[used]) >= 2)[seen.point_index[used]]]
     c, rows, prior = model.cameras, model.cameras.group[views], adjustment.row_prior(model)

@@ -2,7 +2,8 @@
 
 Growth ends at an image that sees few points of the model. Beyond it, a further model may share points with
 the first one that no single image sees in number. A track that one of the models observes in a single image
-is a point of unknown depth there.
+is a point of unknown depth there. If all are such tracks, images of one model that resect in the other one
+give the similarity: two of them its scale.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.lens import stacked_rows, undistort
 from thesisrecon.optimize.least_squares import central_differences
-from thesisrecon.optimize.ransac import draw_samples
+from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
 from thesisrecon.records import Reconstruction, Similarity
 
 MIN_COMMON, MIN_SHARE = 6, 0.6  # common points that must agree, and the smallest share of the common points
 SIGMAS = 15.0
 """Largest distance of two estimates of a point, in standard deviations given the cameras; the errors of the
 cameras, largest at the ends of a row, come on top."""
+SAMPLES = Budget(confidence=0.9999, max_samples=2000)
 MAX_CHANCE = 1e-4  # largest expected number of similarities on which as many wrong points agree
 MAX_STD = 0.01
 """Largest standard deviation of the rotation in rad and of the relative scale, given the cameras."""
@@ -67,8 +69,7 @@ class _Points:
 
     def moved(self, s: Similarity, step: F64) -> Similarity:
         """The similarity after a small rotation, scaling and translation (7,) about the points a."""
-        a = self.a[self.whole]
-        centre, size = a.mean(axis=0), float(np.linalg.norm(a.std(axis=0)))
+        centre, size = self.a.mean(axis=0), float(np.linalg.norm(self.a.std(axis=0)))
         turn = np.exp(step[3]) * scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
         t = turn @ (s.t - centre) + centre + size * step[4:]
         return Similarity(float(np.exp(step[3]) * s.scale), np.exp(-step[3]) * turn @ s.R, t)
@@ -86,7 +87,10 @@ def joinable(model: Reconstruction, groups: Sequence[list[int]]) -> list[list[in
         masks = reached, np.isin(np.arange(t.n_views), views)
         a, b = (np.bincount(t.point_index[m[t.view_index]], minlength=t.n_points) for m in masks)
         common = (a > 0) & (b > 0) & (a + b > 2)
-        return bool(common.sum() >= MIN_COMMON and ((a > 1) & (b > 1)).sum() >= 3)
+        if common.sum() < MIN_COMMON or ((a > 1) & (b > 1)).sum() >= 3:
+            return bool(common.sum() >= MIN_COMMON)
+        seen = [np.bincount(t.view_index[(n > 1)[t.point_index]], minlength=t.n_views) for n in (a, b)]
+        return sum(int((n[m] >= MIN_COMMON).sum()) for n, m in zip(seen, masks[::-1], strict=True)) >= 2
 
     while found := next((views for views in left if shares_points(views)), None):
         reached[list(found)] = True
@@ -114,11 +118,13 @@ def join_models(
     """Join models of the same tracks in the world of the first; None if few points agree, or by chance."""
     numbers = np.flatnonzero(_observed(first, second) & _observed(second, first))
     whole = (first.valid & second.valid)[numbers]
-    if len(numbers) < MIN_COMMON or whole.sum() < 3 or not (first.used.any() and second.used.any()):
+    if len(numbers) < MIN_COMMON or not (first.used.any() and second.used.any()):
         return None
     (a, cov_a), (b, cov_b) = (_estimates(model, numbers) for model in (first, second))
     points = _Points(a, b, cov_a, cov_b, whole)
-    best = sorted(_hypotheses(points, rng), key=points.cost)[:5]
+    trials = [*_hypotheses(points, rng), *_of_resected_images(first, second, rng)]
+    if not (best := sorted(trials, key=points.cost)[:5]):
+        return None
     found = min((_refined(points, s) for s in best), key=points.cost)
     agree = points.distances(found) < SIGMAS
     if agree.sum() < max(MIN_COMMON, MIN_SHARE * len(agree)):
@@ -169,6 +175,8 @@ def _seen(model: Reconstruction, views: B8, by: B8) -> I64:
 def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> list[Similarity]:
     """Similarities of three points: of all triples up to ``most``, or of as many random ones."""
     whole = np.flatnonzero(points.whole)
+    if len(whole) < 3:
+        return []
     chosen = whole[draw_samples(rng, most, len(whole), 3)]
     if scipy.special.comb(len(whole), 3) <= most:
         chosen = np.array(list(combinations(whole, 3)))
@@ -184,11 +192,57 @@ def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> l
     return [Similarity(float(scale[k]), R[k], t[k]) for k in usable]
 
 
+def _of_resected_images(
+    first: Reconstruction, second: Reconstruction, rng: np.random.Generator
+) -> list[Similarity]:
+    """Similarities of the second to the first model by two images of either that the other one resects."""
+    poses = [pose[::-1] for pose in _resected(first, second, rng)] + _resected(second, first, rng)
+    answer = list[Similarity]()
+    for one, two in combinations(poses, 2):
+        U, _, Vt = np.linalg.svd(sum(here[:, :3].T @ there[:, :3] for here, there in (one, two)))
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        here, there = (np.array([-p[:, :3].T @ p[:, 3] for p in ends]) for ends in zip(one, two, strict=True))
+        lengths = [float(np.linalg.norm(ends[1] - ends[0])) for ends in (here, there)]
+        if min(lengths) > 0.0:
+            scale = lengths[0] / lengths[1]
+            answer.append(Similarity(scale, R, here.mean(axis=0) - scale * R @ there.mean(axis=0)))
+    return answer
+
+
+def _resected(
+    model: Reconstruction, other: Reconstruction, rng: np.random.Generator
+) -> list[tuple[F64, F64]]:
+    """[R t] in the ``other`` model, and in the model itself, of its images that see enough of the other."""
+    assert model.K is not None
+    t, answer = model.tracks, list[tuple[F64, F64]]()
+    known = other.valid[t.point_index] & ~other.registered[t.view_index]
+    for view in np.flatnonzero(model.registered).tolist():
+        k = np.flatnonzero(known & (t.view_index == view))
+        if len(k) < MIN_COMMON:
+            continue
+        threshold = SIGMAS * model.sigma_px / float(model.K[view, 0, 0])
+        X, rays = other.X[t.point_index[k], :3], _normalized(model, k)
+        pose, inlier, _ = resect_calibrated(X, rays, threshold=threshold, budget=SAMPLES, rng=rng)
+        if pose is not None and inlier.sum() >= MIN_COMMON:
+            R, translation = pose_of_camera(model.K[[view]], model.P[[view]])
+            answer.append((pose, np.column_stack([R[0], translation[0]])))
+    return answer
+
+
+def _normalized(model: Reconstruction, k: I64) -> F64:
+    """Observations (N, 2) of a model without calibration and lens."""
+    assert model.K is not None
+    assert model.distortion is not None
+    t = model.tracks
+    pixels = np.linalg.solve(model.K[t.view_index[k]], homogenize(t.xy[k])[:, :, None])[:, :2, 0]
+    return undistort(np.asarray(pixels, dtype=np.float64), model.distortion[t.view_index[k]])
+
+
 def _refined(points: _Points, s: Similarity) -> Similarity:
     """The similarity of least squares of the points within a gate that narrows."""
     for factor in (3.0, 2.0, 1.0, 1.0):
         near = points.distances(s) < factor * SIGMAS
-        if points.whole[near].sum() < 3:
+        if near.sum() < MIN_COMMON:
             break
         some = points.select(near)
 
@@ -203,7 +257,7 @@ def _refined(points: _Points, s: Similarity) -> Similarity:
 def _log_chance(points: _Points, s: Similarity, agree: B8) -> float:
     """Log expected number of similarities on which as many random points, in the extent of all, agree."""
     variance, axes = np.linalg.eigh(points.covariance(s)[agree])
-    spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a[points.whole].T), axes)
+    spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a.T), axes)
     gate = 2.0 * SIGMAS * np.sqrt(variance / np.maximum(12.0 * spread, 1e-300))
     # The most telling three are spent on the similarity.
     chance = np.sort(np.log(np.minimum(gate, 1.0)).sum(axis=1))[3:].sum()
@@ -230,7 +284,6 @@ def _observed(model: Reconstruction, other: Reconstruction) -> B8:
 def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
     """Points (N, 3) and covariances (N, 3, 3) given the cameras; those seen once at the median depth."""
     assert model.K is not None
-    assert model.distortion is not None
     t, place = model.tracks, np.full(model.tracks.n_points, -1)
     place[numbers] = np.arange(len(numbers))
     used = np.flatnonzero(model.used)
@@ -241,9 +294,7 @@ def _estimates(model: Reconstruction, numbers: I64) -> tuple[F64, F64]:
     k = np.flatnonzero((model.inlier | alone) & model.registered[t.view_index] & (place[t.point_index] >= 0))
     view, point = t.view_index[k], place[t.point_index[k]]
     P, K = model.P[view], model.K[view]
-    pixels: F64 = np.asarray(np.linalg.solve(K, homogenize(t.xy[k])[:, :, None]), dtype=np.float64)
-    normalized = undistort(pixels[:, :2, 0], model.distortion[view])
-    ray = np.linalg.solve(P[:, :, :3], K @ homogenize(normalized)[:, :, None])[:, :, 0]
+    ray = np.linalg.solve(P[:, :, :3], K @ homogenize(_normalized(model, k))[:, :, None])[:, :, 0]
     X = np.where(model.valid[numbers, None], model.X[numbers, :3], 0.0)
     lone = alone[k]
     X[point[lone]] = depth * ray[lone] - np.linalg.solve(P[lone, :, :3], P[lone, :, 3:])[:, :, 0]

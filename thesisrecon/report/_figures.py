@@ -22,7 +22,7 @@ from thesisrecon.camera import Camera, decompose_camera, finite_cameras, viewing
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import clip_line
-from thesisrecon.imaging.pinholes import camera_of_image, is_wide, pinhole_numbers, pinhole_view
+from thesisrecon.imaging.pinholes import camera_of_image, is_divided, pinhole_numbers, pinhole_view
 from thesisrecon.lens import angles_from_axis
 from thesisrecon.records import HeldOut, Image, Reconstruction, TexturedMesh, TwoView
 from thesisrecon.report._data import pictured
@@ -551,7 +551,7 @@ def draw_straight(
     alone = replace(reconstruction, registered=np.arange(len(reconstruction.P)) == number)
     views = [pinhole_view(image, alone, k, max_side=480) for k in pinhole_numbers(alone)]
     sheet = views[0].rgb
-    if is_wide(*camera_of_image(alone, number)):
+    if is_divided(*camera_of_image(alone, number)):
         K = [decompose_camera(view.P)[0] for view in views]
         focal, size = K[0][0, 0], int(6.0 * K[0][0, 0])
         sheet, seen = np.full((size, size, 3), 255, np.uint8), np.zeros((size, size), bool)

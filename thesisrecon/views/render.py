@@ -13,8 +13,7 @@ from thesisrecon.arrays import B8, F32, F64, I64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.imaging.raster import (
     Raster,
-    image_corners,
-    rasterize_rows,
+    raster_of_camera,
     run_in_strips,
     sample_texture,
     vertex_normals,
@@ -83,14 +82,13 @@ def _in_parts(
     mesh: TexturedMesh, camera: Camera, samples: int, threads: int, *uses: Callable[[int, int, Raster], None]
 ) -> None:
     """Rasterise parts of an image (first row, last + 1) with ``samples`` rows per row, and use each."""
-    corners, near = image_corners(mesh.vertices, mesh.faces, camera)
-    width, height = camera.size
+    find, (width, height) = raster_of_camera(mesh.vertices, mesh.faces, camera, threads), camera.size
     step = max(PART_SAMPLES // (samples * width), 1)
 
     def work(rows: tuple[int, int]) -> None:
         for first in range(rows[0], rows[1], step):
             last = min(first + step, rows[1])
-            raster = rasterize_rows(corners, near, (samples * first, samples * last), width)
+            raster = find((samples * first, samples * last))
             for use in uses:
                 use(first, last, raster)
 
