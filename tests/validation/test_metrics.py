@@ -1,6 +1,7 @@
 """Metrics of the validation: numbers, intervals, cameras, and the comparison with COLMAP."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from validation.metrics import cameras
 from validation.references.colmap import map_with_pycolmap, read_run, reconstruct_with_pycolmap
-from validation.scenes.real import load_fixture_scene
+from validation.scenes.real import Scene, load_fixture_scene
 from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
 
 V, N = 6, 30
@@ -150,14 +151,13 @@ def test_rows_hold_both_methods_and_a_failure_misses_its_targets():
     model = _reconstruction(_truth())
     ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
     failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
-    checked = [
-        check_reconstruction("fountain-P11", V, _truth(), {OURS: o, COLMAP: colmap}) for o in (ours, failed)
-    ]
+    scene = Scene("fountain-P11", tuple(Path(f"{k}.png") for k in range(V)), *_truth())
+    checked = [check_reconstruction(scene, {OURS: o, COLMAP: colmap}) for o in (ours, failed)]
     rows, missed = ({row.name: row for row in found} for found in checked)
     assert rows["wall time"].target == 10.0
     # The residuals here are zero, so a claim of one pixel is far off.
-    verdicts = {f"cameras registered of {V}": "reached", "focal error": "reached", "wall time": "reached"}
-    verdicts |= {"rms it claims off by": "missed", "points": "reported"}
+    verdicts = {"registered": "reached", "focal error": "reached", "wall time": "reached"}
+    verdicts |= {"rms it claims off by": "missed", "observations a point": "reported"}
     assert {name: rows[name].verdict for name in verdicts} == verdicts
     assert (missed["focal error"].verdict, missed["focal error"].values[OURS]) == ("missed", None)
-    assert missed[f"cameras registered of {V}"].values[OURS] == 0
+    assert missed["registered"].values[OURS] == 0

@@ -31,6 +31,8 @@ from validation.scenes.real import cache_folder
 PREFIX = "ablation_own_"
 OURS = ("thesisrecon", "validation")
 INSTALLED = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")]
+# Also the folders of another environment or of the system that this one sees.
+PACKAGES = {"site-packages", "dist-packages"}
 
 
 class Helper(NamedTuple):
@@ -187,7 +189,10 @@ def _file_of(module: str, folder: Path) -> Path | None:
 
 def _is_installed(file: str | Path | None) -> bool:
     """Whether a file belongs to Python or to an installed package."""
-    return file is not None and any(Path(file).resolve().is_relative_to(folder) for folder in INSTALLED)
+    if file is None:
+        return False
+    path = Path(file).resolve()
+    return not PACKAGES.isdisjoint(path.parts) or any(path.is_relative_to(folder) for folder in INSTALLED)
 
 
 # ---------------------------------------------------------------- data files

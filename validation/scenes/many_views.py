@@ -190,30 +190,6 @@ def build_near(house: int) -> World:
     return build_world(objects + walls, materials, SUN)
 
 
-@lru_cache(maxsize=1)
-def _plain_houses(count: int, texel: float = 0.02) -> list[Material]:
-    shape = grid((WIDTH, 8.0), texel)
-    ground = [rubble(shape, texel, 900 + 1000 * h, cell_m=0.14, relief_m=0.015) for h in range(count)]
-    return [_front(h) for h in range(count)] + ground
-
-
-def build_corner(C: F64, ahead: F64) -> World:
-    """Houses on both sides of two streets, along the first and the last direction ``ahead`` of a drive."""
-    z, walls, ground = np.eye(3)[2], list[list[Surface]](), list[list[Surface]]()
-    places = [(k, first + h, side) for k, first in ((0, -1), (-1, -3)) for h in range(9) for side in (1, -1)]
-    for number, (k, h, side) in enumerate(places):
-        u, away = side * ahead[k], side * np.cross(z, ahead[k])
-        at = C[k] * [1.0, 1.0, 0.0] + WIDTH * (h + (side < 0)) * ahead[k]
-        ground.append([Surface(at, u, away, (WIDTH, 8.0), len(places) + number)])
-        at = at + np.random.default_rng([82, number]).uniform(6.5, 7.7) * away
-        near = np.linalg.norm(
-            (at + WIDTH * np.linspace(0.0, 1.0, 9)[:, None] * u - C[:, None])[..., :2], axis=2
-        )
-        if near.min() > 4.0:
-            walls.append([Surface(at, u, z, (WIDTH, WALL_HEIGHT), number)])
-    return build_world(walls + ground, _plain_houses(len(places)), SUN)
-
-
 def _crate(place: np.ndarray, size: np.ndarray, angle: float, material: int) -> list[Surface]:
     z, (w, d, h) = np.eye(3)[2], size.tolist()
     u, v = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])

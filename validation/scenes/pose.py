@@ -52,20 +52,13 @@ def turntable(
 
 
 def perturb(
-    cameras: MetricCameras,
-    X: F64,
-    rng: np.random.Generator,
-    *,
-    turned: float,
-    moved: float,
-    zoomed: float,
-    points_moved: float | None = None,
+    cameras: MetricCameras, X: F64, rng: np.random.Generator, *, turned: float, moved: float, zoomed: float
 ) -> tuple[MetricCameras, F64]:
     """Cameras turned about their centres (rad), moved and zoomed (a factor), and points (N, 3) moved."""
     turn = Rotation.from_rotvec(turned * rng.normal(size=cameras.t.shape)).as_matrix()
     t = np.einsum("vab,vb->va", turn, cameras.t) + moved * rng.normal(size=cameras.t.shape)
     rows = cameras.intrinsics * [zoomed, 1.0, 1.0, 1.0, 1.0, 1.0]
-    X = X + (moved if points_moved is None else points_moved) * rng.normal(size=X.shape)
+    X = X + moved * rng.normal(size=X.shape)
     return MetricCameras(turn @ cameras.R, t, rows, cameras.group, cameras.shared), X
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -92,8 +93,13 @@ class CamerasStage(Stage):
     def judge(self, scene: str, outcomes: Mapping[str, Outcome], options: ReportOptions) -> Judgement:
         images = load_images(scene, options)
         models = {m: read_model(images, m, o) for m, o in outcomes.items() if m != MATCHES}
-        metrics = [*_errors(images, models), *_fit(images, models), *_costs(scene, outcomes)]
+        metrics = [*error_rows(images, models), *fit_rows(images, models), *_costs(scene, outcomes)]
         metrics += [*_before_adjustment(images, outcomes.get(OURS)), *_as_colmap_reads(images, outcomes)]
+        metrics += [
+            replace(m, name=f"{THESIS}: {m.name}", values={OURS: m.values[THESIS]})
+            for m in metrics
+            if THESIS in m.values and m.name.endswith(" error")
+        ]
         metrics += [*_per_image(images, models.get(PER_IMAGE)), *_stated(images, outcomes)]
         known, total = int(images.known.sum()), len(images.image_paths)
         partly = 0 < known < total
@@ -135,7 +141,8 @@ def _run_colmap(task: Task, scene: Scene, options: ReportOptions, folder: Path) 
     map_with_pycolmap(images, folder, threads=1, **given)
 
 
-def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+def error_rows(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """Return the share of registered images, errors of cameras and the recall of relative poses."""
     registered = {n: 0.0 if m is None else float(m.registered.mean() * 100) for n, m in models.items()}
     rows = [row(scene.name, "registered", "%", registered, "share of the images", more=True)]
     truth = scene.cameras_of(range(len(scene.image_paths)))
@@ -150,8 +157,6 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
             continue
         values: Values = {n: None if e is None else getattr(e, field) for n, e in errors.items()}
         rows.append(row(scene.name, name, unit, values, text))
-        if THESIS in values:
-            rows.append(row(scene.name, f"{THESIS}: {name}", unit, values[THESIS], text))
     if scene.R is None:
         return rows
     pairs = {n: pose_pair_errors(m, truth) for n, m in models.items()}
@@ -161,7 +166,8 @@ def _errors(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[M
     return rows
 
 
-def _fit(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+def fit_rows(scene: Scene, models: Mapping[str, Reconstruction | None]) -> list[Metric]:
+    """Return reprojection errors and numbers of points of the models."""
     residuals = {n: None if m is None else measure_reprojection(m) for n, m in models.items()}
     points = each(models, lambda m: m.valid.sum())
     seen: Values = {n: r.observations / p if r and (p := points[n]) else None for n, r in residuals.items()}

@@ -12,24 +12,21 @@ import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import version
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.io._outputs import clear_folder
 from thesisrecon.records import Reconstruction
-from validation.metrics.cameras import TrueCameras, measure_cameras, measure_reprojection
+from validation.metrics.cameras import measure_reprojection
 from validation.references.colmap import read_colmap_model, read_run
 from validation.runs.processes import Process, own_cores, run_process
 from validation.runs.results import camera_limit
 from validation.runs.study import Part, report_progress
-from validation.runs.tables import Metric, Rows, each, machine
+from validation.runs.tables import Metric, Rows, each, machine, slug
 from validation.scenes.real import REAL_SCENES, Scene, scenes_here
+from validation.stages.cameras import error_rows, fit_rows
 
 OURS, THESIS = "ours (default)", "ours (thesis)"
 COLMAP, COLMAP_PP = "COLMAP", "COLMAP, principal point refined"
@@ -51,40 +48,20 @@ class Outcome:
     claimed_rms_px: float | None = None
 
 
-def check_reconstruction(
-    scene: str, n_views: int, truth: TrueCameras | None, outcomes: Mapping[str, Outcome]
-) -> list[Metric]:
-    """Return all rows of one scene, bounded by the gates of the report; truth may be None."""
+def check_reconstruction(scene: Scene, outcomes: Mapping[str, Outcome]) -> list[Metric]:
+    """Return all rows of one scene, those of the report bounded by its gates."""
     models = {name: outcome.reconstruction for name, outcome in outcomes.items()}
-    limit = partial(camera_limit, scene)
-    residuals = {name: None if m is None else measure_reprojection(m) for name, m in models.items()}
-    rows = Rows(scene, OURS)
-
-    registered = {name: 0.0 if m is None else float(m.registered.sum()) for name, m in models.items()}
-    share = limit("registered")
-    least = None if share is None else float(np.ceil(share / 100.0 * n_views))
-    rows.add(f"cameras registered of {n_views}", registered, at_least=least)
-    if truth is not None:
-        errors = {name: None if m is None else measure_cameras(m, truth) for name, m in models.items()}
-        for name, unit, gate, field in (
-            ("focal error", "%", "focal-error", "focal_error_pct"),
-            ("principal point error", "px", "principal-point-error", "principal_point_error_px"),
-            ("mean camera-centre error", "mm", "centre-error", "centre_error_mm"),
-            ("median rotation error", "deg", "rotation-error", "rotation_error_deg"),
-        ):
-            rows.add(name, each(errors, attrgetter(field)), unit, at_most=limit(gate))
-    middle = each(residuals, lambda r: r.median_px)
-    rows.add("median reprojection", middle, "px", at_most=limit("reprojection"))
-    rows.add("mean reprojection", each(residuals, lambda r: r.mean_px), "px")
-    rows.add("points", each(models, lambda m: float(m.valid.sum())))
-    rows.add("observations", each(residuals, lambda r: float(r.observations)))
-    bounded = COLMAP in outcomes and scene in ("fountain-P11", "Herz-Jesus-P8")
+    rows = Rows(scene.name, OURS)
+    for metric in (*error_rows(scene, models), *fit_rows(scene, models)):
+        bound = {"at_most" if metric.at_most else "at_least": camera_limit(scene.name, slug(metric.name))}
+        rows.add(metric.name, metric.values, metric.unit, **bound)
+    bounded = COLMAP in outcomes and scene.name in ("fountain-P11", "Herz-Jesus-P8")
     wall_s = each(outcomes, lambda o: o.wall_s)
     rows.add("wall time", wall_s, "s", at_most=wall_s[COLMAP] if bounded else None)
     claims = {
-        name: 100.0 * abs(outcome.claimed_rms_px / measured.rms_px - 1.0)
+        name: 100.0 * abs(outcome.claimed_rms_px / measure_reprojection(model).rms_px - 1.0)
         for name, outcome in outcomes.items()
-        if (measured := residuals[name]) is not None and outcome.claimed_rms_px is not None
+        if (model := outcome.reconstruction) is not None and outcome.claimed_rms_px is not None
     }
     rows.add("rms it claims off by", claims, "%", at_most=1.0)
     rows.add("processor time", each(outcomes, lambda o: o.cpu_s), "s")
@@ -151,8 +128,7 @@ def measure_scene(
     outcomes = {
         method: min(found, key=lambda run: (not run.failure, run.wall_s)) for method, found in runs.items()
     }
-    rows = check_reconstruction(scene.name, len(scene.image_paths), scene.truth, outcomes)
-    return rows, outcomes
+    return check_reconstruction(scene, outcomes), outcomes
 
 
 def warm_up(scene: Scene, out: Path, *, threads: int, environment: dict[str, str]) -> float:

@@ -151,13 +151,14 @@ Results = dict[Setting, dict[str, Result]]
 
 
 class Trial(NamedTuple):
-    """Noisy matches (N, 2), the exact points of the right ones (M, 2), and the KCR bound (px) of these."""
+    """Noisy matches (N, 2), the exact points of the right ones (M, 2), their KCR bound (px), the true F."""
 
     xy1: F64
     xy2: F64
     exact1: F64
     exact2: F64
     bound_px: float
+    F: F64
 
     def ratio(self, F: F64) -> float:
         """Return the RMS distance of the exact points to their epipolar lines over the bound."""
@@ -174,7 +175,7 @@ def make_trial(setting: Setting, seed: int) -> Trial:
     right[: round(setting.wrong * setting.n)] = False
     xy2[~right] = rng.uniform((0.0, 0.0), (1280.0, 960.0), (int(np.sum(~right)), 2))
     bound = fundamental_bound(scene.P1, scene.P2, scene.X[right], sigma_px=setting.sigma_px)
-    return Trial(xy1, xy2, scene.xy1[right], scene.xy2[right], bound.rms_distance_px)
+    return Trial(xy1, xy2, scene.xy1[right], scene.xy2[right], bound.rms_distance_px, bound.F)
 
 
 def measure(method: Method, trials: Sequence[Trial], setting: Setting) -> Result:
@@ -284,18 +285,13 @@ def check_precision(sigma_px: float, n: int, trials: int) -> list[Metric]:
     """Measure RMS distance over the KCR bound and coverage of 95 % intervals."""
     ratios: dict[str, list[float]] = {LEAST: [], DEFAULT: []}
     held: dict[str, dict[str, list[float]]] = {w: {LEAST: [], DEFAULT: []} for w in INTERVALS}
-    for seed in range(trials):
-        rng = np.random.default_rng(seed)
-        scene = make_two_views(Configuration.GENERAL, n, rng)
-        bound = fundamental_bound(scene.P1, scene.P2, scene.X, sigma_px=sigma_px)
-        xy1, xy2 = (xy + rng.normal(0.0, sigma_px, xy.shape) for xy in (scene.xy1, scene.xy2))
-        for name, fit in ((LEAST, gold_standard(xy1, xy2)), (DEFAULT, estimate_fundamental(xy1, xy2))):
-            squared = np.mean(symmetric_residuals(fit.F, scene.xy1, scene.xy2) ** 2) / 2.0
-            ratios[name].append(float(squared) / bound.rms_distance_px**2)
-            off = np.abs(np.sum(homogenize(scene.xy2) * epipolar_lines(fit.F, scene.xy1), axis=1))
-            half = epipolar_distance_interval(fit, scene.xy1, scene.xy2)
-            truths = list(zip(epipoles_of(fit), epipoles(bound.F), strict=True))
-            held[DISTANCES][name].append(float(np.mean(off <= half)))
+    for trial in (make_trial(Setting(sigma_px, n), seed) for seed in range(trials)):
+        matches, exact = (trial.xy1, trial.xy2), (trial.exact1, trial.exact2)
+        for name, fit in ((LEAST, gold_standard(*matches)), (DEFAULT, estimate_fundamental(*matches))):
+            ratios[name].append(trial.ratio(fit.F) ** 2)
+            off = np.abs(np.sum(homogenize(trial.exact2) * epipolar_lines(fit.F, trial.exact1), axis=1))
+            truths = list(zip(epipoles_of(fit), epipoles(trial.F), strict=True))
+            held[DISTANCES][name].append(float(np.mean(off <= epipolar_distance_interval(fit, *exact))))
             held[EPIPOLES][name].append(float(np.mean([e.contains(t) for e, t in truths])))
             held[PIXELS][name].append(float(np.mean([e.contains_xy(t[:2] / t[2]) for e, t in truths])))
     scene_name = f"sigma {sigma_px:g} px, n = {n}"

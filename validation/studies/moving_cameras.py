@@ -7,25 +7,17 @@ errors in stated standard deviations should have mean 0 and standard deviation 1
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from thesisrecon import RunResult, reconstruct, reconstruct_from_tracks
+from thesisrecon import reconstruct_from_tracks
 from thesisrecon.arrays import F64
 from thesisrecon.errors import StageFailure
 from validation.runs.study import Part
 from validation.runs.tables import text_table
-from validation.scenes.many_views import build_corner
-from validation.scenes.pose import Pose
-from validation.scenes.raycast import trace
-from validation.scenes.real import write_png
-from validation.scenes.sensor import PER_PIXEL, Sensor, expose, integrate_pixels
 
 CAR, PHONE = (1241, 376), (640, 480)
 
@@ -57,35 +49,6 @@ def drive(seed: int, lens: Lens, views: int = 17) -> Moving:
     X = X[(near > 4.0) | (X[:, 2] == 0.0)]
     xy = _tracked(_project(X, R, C, focal, CAR, lens), rng, 350, 0.8)
     return Moving(xy + rng.normal(0.0, 0.3, xy.shape), CAR, focal)
-
-
-def render_drive(folder: Path, seed: int, lens: Lens, views: int = 14, width: int = 640) -> float:
-    """Write images of such a drive through rendered streets; return the focal length."""
-    R, C, ahead = _corner(np.random.default_rng([7, seed]), views)
-    world, n, sensor = build_corner(C, ahead), PER_PIXEL, Sensor()
-    size = (width, round(width * CAR[1] / CAR[0]))
-    f, (cx, cy) = 718.9 * width / CAR[0], (np.array(size) - 1) / 2
-    K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
-    pixels = (np.indices((n * size[1], n * size[0]))[::-1] + 0.5) / n - 0.5
-    place = n * (straighten(pixels, f, size, lens)[::-1] + 0.5) - 0.5
-    folder.mkdir()
-    for v in range(views):
-        light = trace(world, Pose(K, R[v], C[v]), size, per_pixel=n)[0]
-        bent = [map_coordinates(channel, place, mode="nearest") for channel in np.moveaxis(light, 2, 0)]
-        seen = integrate_pixels(np.stack(bent, axis=2), n, sensor.blur_px)
-        rng = np.random.default_rng([13, seed, v])
-        write_png(folder / f"{v:02d}.png", expose(seen, sensor, gains=(0.82, 0.82, 0.82), rng=rng))
-    return float(f)
-
-
-def straighten(xy: F64, focal: float, size: tuple[int, int], lens: Lens) -> F64:
-    """Pinhole pixels (2, ...) of those with the k1 and the aspect ratio of a lens."""
-    place, centre = np.moveaxis(xy, 0, -1), (np.array(size) - 1) / 2
-    place = (place - centre) * [np.sqrt(lens.aspect), 1.0 / np.sqrt(lens.aspect)]
-    scale = np.ones(xy.shape[1:])
-    for _ in range(6):
-        scale = 1.0 + lens.k1 * np.sum(place**2, axis=-1) / (focal * scale) ** 2
-    return np.moveaxis(place / scale[..., None] + centre, -1, 0)
 
 
 def _corner(rng: np.random.Generator, views: int) -> tuple[F64, F64, F64]:
@@ -183,46 +146,28 @@ CASES: dict[str, tuple[Callable[[int, Lens], Moving], Lens]] = {
     "hand-held, readout 5 ms": (hand_held, Lens(readout=0.05)),
     "hand-held, readout 25 ms": (hand_held, Lens(readout=0.25)),
 }  # Images of the hand-held videos are 0.1 s apart
-RENDERED = {
-    "rendered car, camera as assumed": Lens(),
-    "rendered car, k1 = 0.015, aspect ratio 1.002": Lens(k1=0.015, aspect=1.002),
-}
 
 
 def measure(scene: Moving) -> F64 | None:
     """Trusted (0 or 1), relative error of the focal length and its relative standard deviation."""
-    return _measured(lambda: reconstruct_from_tracks(scene.xy, [scene.size] * len(scene.xy)), scene.focal)
-
-
-def _measured(run: Callable[[], RunResult], truth: float) -> F64 | None:
     try:
-        result = run()
+        result = reconstruct_from_tracks(scene.xy, [scene.size] * len(scene.xy))
     except StageFailure:
         return None
     camera = next(iter(result.cameras.values()))
     assert result.metric is not None
     assert camera.std is not None
     focal, std = camera.K[0, 0], camera.std["focal_px"]
-    return np.array([result.metric.trusted, focal / truth - 1.0, std / truth])
+    return np.array([result.metric.trusted, focal / scene.focal - 1.0, std / scene.focal])
 
 
-def measure_rendered(seed: int, lens: Lens) -> F64 | None:
-    """The same from images of a rendered drive."""
-    with tempfile.TemporaryDirectory() as name:
-        images, out = Path(name, "images"), Path(name, "out")
-        focal = render_drive(images, seed, lens)
-        return _measured(lambda: reconstruct(images, out, until="metric"), focal)
-
-
-def moving_cameras_study(trials: int = 60, *, rendered: bool = False) -> Iterator[Part]:
+def moving_cameras_study(trials: int = 60) -> Iterator[Part]:
     """Check focal lengths of cars that turn and of hand-held videos, with slightly wrong lenses too."""
     head = ["camera", "results", "trusted", "of these: mean z", "standard deviation of z", "within 95 %",
             "largest z", "median error, %", "median standard deviation, %"]  # fmt: skip
     rows = []
-    cases = {name: (drive, lens) for name, lens in RENDERED.items()} if rendered else CASES
-    for name, (make, lens) in cases.items():
-        tried = (measure_rendered(k, lens) if rendered else measure(make(k, lens)) for k in range(trials))
-        found = [r for r in tried if r is not None]
+    for name, (make, lens) in CASES.items():
+        found = [r for r in (measure(make(k, lens)) for k in range(trials)) if r is not None]
         trusted, error, std = np.array([r for r in found if r[0]]).reshape(-1, 3).T
         z = error / std
         rows.append([

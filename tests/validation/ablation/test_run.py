@@ -203,11 +203,15 @@ def test_edited_data_that_a_task_reads_is_computed_again(tmp_path, executor):
     assert misses() == {15.0}
 
 
-def test_helpers_are_those_outside_installed_packages(tmp_path):
-    for name, text in {"mine.py": OWN, **HELPERS}.items():
+def test_helpers_are_those_outside_installed_packages(tmp_path, monkeypatch):
+    # Also a package of another environment, which this one sees by a .pth file.
+    elsewhere = tmp_path / "other" / "site-packages"
+    elsewhere.mkdir(parents=True)
+    monkeypatch.syspath_prepend(elsewhere)
+    for name, text in {"mine.py": OWN, **HELPERS, elsewhere / "aim_installed.py": ""}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text, encoding="utf-8")
-    found = [helper.module for helper in helpers_of(tmp_path / "mine.py", OWN)]
+    found = [helper.module for helper in helpers_of(tmp_path / "mine.py", f"import aim_installed\n{OWN}")]
     tools = ["aim_tools", "aim_tools.deeper", "aim_tools.shift"]
     assert found == ["aim_factors", "aim_late", *tools]
 
