@@ -256,6 +256,8 @@ def run_ablation(parsed: argparse.Namespace) -> int:
             return 0
         if parsed.read:
             rows = read_rows(study, parsed.out)
+            if not rows:
+                raise UsageError(f"{parsed.out} has no rows of this study and this code; run without --read")
         else:
             how = {"executor": parsed.executor, "threads": parsed.threads, "limit_s": parsed.time_limit}
             with with_resume_advice(KEPT.format(parsed.out)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -151,7 +152,8 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
     values = [as_reported(c) for c in shown]
     errors = _errors(values) | {"color": "#55636f"}
     marker = {"color": [SHADES.get(c.verdict, NONE) for c in shown], "size": 9}
-    names = [f"{c.variant} ({c.condition})" if c.condition else c.variant for c in shown]
+    whole = [f"{c.variant} ({c.condition})" if c.condition else c.variant for c in shown]
+    names = ["<br>".join(textwrap.wrap(name, 24)) for name in whole]
     means = [_finite(mean) for mean, _, _ in values]
     trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
@@ -161,7 +163,7 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
         "xaxis": LOGARITHMIC if ratio else {"zeroline": False},
         "yaxis": {"autorange": "reversed", "automargin": True},
         "shapes": [line | {"x0": int(ratio), "x1": int(ratio)}],
-        "height": 140 + 28 * len(shown),
+        "height": 140 + 14 * sum(2 + name.count("<br>") for name in names),
     }
     return plot(f"{measure.name} against {baseline}", [trace], x, "", **layout)
 

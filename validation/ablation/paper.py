@@ -53,13 +53,15 @@ def latex(text: str) -> str:
 
 
 def write_latex(analysis: Analysis, out: Path) -> Path:
-    """Write ``tables.tex``, a table for each measure; what is shown to be better is bold, worse is italic."""
+    """Write ``tables.tex``, a table for each measure."""
     parts = [f"% {stamp()}", r"% \usepackage{booktabs}"]
     for measure in analysis.plan.measures:
         caption = latex(": ".join(filter(None, (measure.name, measure.definition))))
         label = slug(measure.name.lower())
         for n, table in enumerate(measure_tables(analysis, measure)):
             words = f"{caption}, against {latex(analysis.plan.baseline)}" if n else caption
+            if any(entry.verdict in (*GOOD, *BAD) for entries in table.rows for entry in entries):
+                words += f". Bold: better than {latex(analysis.plan.baseline)}; italic: worse"
             parts += _tabular(table, words, f"{label}-{n}" if n else label)
     write_text(out / "tables.tex", "\n".join(parts) + "\n")
     return out / "tables.tex"

@@ -227,7 +227,8 @@ def _plots(compared: Sequence[Compared]) -> list[Plot]:
     ]
     log, title = {"type": "log"}, "Recall of relative poses"
     found = [plot(title, curves, "largest error (degrees)", "pairs (%)", xaxis=log, **size)] if curves else []
-    order = {view.name: k for k, view in enumerate(compared[0].found.b.views)}
+    order = {view.name: k for k, view in enumerate(compared[0].found.b.views, 1)}
+    zero = {"rangemode": "tozero"}
     for title, attribute, unit, factor in (
         ("Centre error by image", "centre_error", "units of the reference", 1.0),
         ("Rotation error by image", "rotation_error_deg", "degrees", 1.0),
@@ -251,7 +252,7 @@ def _plots(compared: Sequence[Compared]) -> list[Plot]:
             else ""
         )
         if traces:
-            found.append(plot(title, traces, "image", unit, caption, **size))
+            found.append(plot(title, traces, "image", unit, caption, yaxis=zero, **size))
     return found
 
 

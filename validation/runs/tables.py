@@ -13,6 +13,7 @@ import subprocess
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -219,13 +220,18 @@ def write_metrics(path: Path, metrics: Sequence[Metric]) -> None:
 
 
 def commit() -> str:
-    """Return the commit of this clone, with ``-dirty`` if files have changed since; "unknown" without git."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    """Return the commit of this clone, with ``-dirty`` if files have changed since; the version if this is no
+    clone, whatever repository an installed package lies in.
+    """
+    command, root = ["git", "describe", "--always", "--dirty", "--abbrev=10"], Path(__file__).parents[2]
     try:
-        root = Path(__file__).parents[1]
-        return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout.strip()
+        if (root / ".git").exists():
+            return subprocess.run(
+                command, cwd=root, capture_output=True, text=True, check=True
+            ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
-        return "unknown"
+        pass
+    return f"of version {version('thesisrecon')}"
 
 
 def machine() -> str:
