@@ -33,6 +33,7 @@ extensions = [
     "_ext.interface",
     "_ext.ablations",
     "_ext.modules",
+    "_ext.notebooks",
     "_ext.theory_tables",
     "_ext.pictures",
 ]

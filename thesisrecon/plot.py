@@ -26,6 +26,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import clip_line
 from thesisrecon.io._images import read_pixels
 from thesisrecon.pipeline.matching import ImageInput
+from thesisrecon.report._figures import overview
 from thesisrecon.results import ModelComparison, RunResult
 
 P = ParamSpec("P")
@@ -337,17 +338,7 @@ def _errors(comparison: ModelComparison) -> Any:
 @_styled
 def _mesh(mesh: records.TexturedMesh) -> Any:
     ax = _axis(None)
-    middle = np.median(mesh.vertices, axis=0)
-    reach = float(np.quantile(np.linalg.norm(mesh.vertices - middle, axis=1), 0.9))
-    # From the side that most of the surface faces.
-    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
-    away = np.cross(b - a, c - a).sum(axis=0) + 1e-9 * np.array([0.5, -0.5, -2.2])
-    away *= 2.2 * reach / np.linalg.norm(away)
-    z = -away / np.linalg.norm(away)
-    x = np.cross([0.0, 1.0, 0.01], z) / np.linalg.norm(np.cross([0.0, 1.0, 0.01], z))
-    R = np.array([x, np.cross(z, x), z])
-    K = np.array([[480.0, 0, 239.5], [0, 480, 179.5], [0, 0, 1]])
-    view = render(mesh, Camera(K, R, -R @ (middle + away), (480, 360)))
+    view = render(mesh, overview(mesh))
     ax.imshow(np.dstack([view.color, 255 * view.valid.astype(np.uint8)]))
     ax.set_axis_off()
     return ax.figure

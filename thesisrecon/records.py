@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -446,6 +447,14 @@ class TexturedMesh(Record):
     uv: F64 | None = None  #: (M, 3, 2) texels of the corners, (0, 0) = centre of the top-left texel
     texture: NDArray[np.uint8] | None = None  #: (H, W, 3)
     untextured: B8 | None = None  #: (M,) faces that no view sees
+
+    def show(self, cameras: Any = (), height: int = 560) -> Any:
+        """Return the 3D viewer of the report for a notebook, as one page in a frame that needs no server.
+
+        ``cameras``, by name or in a list, are its viewpoints. The HTML is in ``.page`` of the result.
+        """
+        # The report is above the records, and notebooks load it.
+        return import_module("thesisrecon.report._page").ModelFrame.of(self, cameras, height)
 
 
 @dataclass(frozen=True, eq=False)

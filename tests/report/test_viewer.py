@@ -14,7 +14,7 @@ from tests.surface.sphere import SHAPE, K, photograph, ring_of
 from thesisrecon.camera import decompose_camera
 from thesisrecon.records import TexturedMesh
 from thesisrecon.report import _figures
-from thesisrecon.report._figures import LEVELS, upright_rotation, viewer_data
+from thesisrecon.report._figures import LEVELS, numbered_cameras, upright_rotation, viewer_data
 from thesisrecon.report._page import render_report
 
 
@@ -27,8 +27,9 @@ def upright():
     return upright_rotation(np.stack([decompose_camera(p)[1] for p in P]))
 
 
-def data_of(mesh):
-    return viewer_data(mesh, synthetic.sphere_reconstruction(), synthetic.SPHERE_NAMES)
+def data_of(mesh, reconstruction=None):
+    cameras = reconstruction or synthetic.sphere_reconstruction()
+    return viewer_data(mesh, numbered_cameras(cameras, synthetic.SPHERE_NAMES))
 
 
 def corners(data):
@@ -69,7 +70,7 @@ def test_the_viewer_stands_where_photographs_were_taken():
     data, cameras = data_of(synthetic.sphere_model()), synthetic.sphere_reconstruction()
     some = np.arange(8) != 3
     without = replace(cameras, registered=some, P=cameras.P * some[:, None, None])
-    shown = viewer_data(synthetic.sphere_model(), without, synthetic.SPHERE_NAMES)["viewpoints"]
+    shown = data_of(synthetic.sphere_model(), without)["viewpoints"]
     assert [stand["name"][0] for stand in shown] == list("1235678")
     names = [f"{k + 1} · {name}" for k, name in enumerate(synthetic.SPHERE_NAMES)]
     assert [stand["name"] for stand in data["viewpoints"]] == names
@@ -219,6 +220,29 @@ def inner(view):
     seen = np.isfinite(ring_of()[view].depth).astype(float)
     near = np.lib.stride_tricks.sliding_window_view(np.pad(seen, 3), (7, 7))
     return np.asarray(near.min(axis=(2, 3)) > 0)
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("cameras", [{}, numbered_cameras(synthetic.sphere_reconstruction(), "abcdefgh")])
+def test_a_notebook_shows_the_model_in_a_frame(browser, tmp_path, scheme, cameras):
+    path = tmp_path / "notebook.html"
+    frame = synthetic.sphere_model().show(cameras)._repr_html_()
+    path.write_text(f"<!DOCTYPE html><meta charset='utf-8'>{frame}", "utf-8")
+    context = browser.new_context(color_scheme=scheme, viewport={"width": 900, "height": 700})
+    page, errors = context.new_page(), []
+    page.on("pageerror", errors.append)
+    page.on("request", lambda request: request.url.startswith("http") and errors.append(request.url))
+    page.goto(path.as_uri())
+    inside = page.frame_locator("iframe")
+    inside.locator("#model-figure[data-drawn=yes]").wait_for()
+    picture = PillowImage.open(io.BytesIO(inside.locator("canvas").screenshot()))
+    coloured = np.ptp(np.asarray(picture)[..., :3].astype(int), axis=2) > 30
+    assert coloured.mean() > 0.1
+    inside.get_by_role("button", name="From above").click()
+    assert inside.locator("option").count() == 1 + max(1, len(cameras))
+    assert errors == []
+    context.close()
 
 
 @pytest.mark.browser

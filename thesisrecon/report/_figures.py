@@ -314,7 +314,30 @@ _DIRECTIONS = (
 """Viewing directions; z is up and the mean viewing direction of the cameras is along y."""
 
 
-def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Any]:
+def numbered_cameras(reconstruction: Reconstruction, names: Sequence[str]) -> dict[str, Camera]:
+    """Return the registered cameras by number and name."""
+    P, sizes = reconstruction.P, reconstruction.sizes.astype(int)
+    return {
+        f"{i + 1} · {names[i]}": Camera(*decompose_camera(P[i]), tuple(sizes[i].tolist()))
+        for i in np.flatnonzero(reconstruction.registered).tolist()
+    }
+
+
+def overview(mesh: TexturedMesh) -> Camera:
+    """Return a camera before the side that most of the surface faces."""
+    middle = np.median(mesh.vertices, axis=0)
+    reach = float(np.quantile(np.linalg.norm(mesh.vertices - middle, axis=1), 0.9))
+    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
+    away = np.cross(b - a, c - a).sum(axis=0) + 1e-9 * np.array([0.5, -0.5, -2.2])
+    away *= 2.2 * reach / np.linalg.norm(away)
+    z = -away / np.linalg.norm(away)
+    x = np.cross([0.0, 1.0, 0.01], z) / np.linalg.norm(np.cross([0.0, 1.0, 0.01], z))
+    R = np.array([x, np.cross(z, x), z])
+    K = np.array([[480.0, 0, 239.5], [0, 480, 179.5], [0, 0, 1]])
+    return Camera(K, R, -R @ (middle + away), (480, 360))
+
+
+def viewer_data(mesh: TexturedMesh, cameras: Mapping[str, Camera]) -> dict[str, Any]:
     """Build the JSON data of the 3D viewer; z is up.
 
     ``positions`` (N, 3) uint16 in the box ``low`` to ``high``, ``uv`` (N, 2) uint16 or ``colors`` (N, 3)
@@ -325,16 +348,14 @@ def viewer_data(mesh: TexturedMesh, reconstruction: Reconstruction, names: Seque
     if keep.any():
         # Far faces would leave few quantization levels for the rest.
         mesh = replace(mesh, faces=mesh.faces[keep], uv=None if mesh.uv is None else mesh.uv[keep])
-    views = np.flatnonzero(reconstruction.registered).tolist()
-    rotations = np.stack([decompose_camera(reconstruction.P[i])[1] for i in views])
-    upright = upright_rotation(rotations)
+    upright = upright_rotation(np.stack([camera.R for camera in cameras.values()]))
     vertices = mesh.vertices @ upright.T
     low, high = (end(vertices[mesh.faces], axis=(0, 1)) for end in (np.min, np.max))
     steps = np.where(high > low, high - low, 1.0) / LEVELS
     positions = np.rint(np.clip((vertices - low) / steps, 0, LEVELS)).astype("<u2")
     color, faces, vertex = _colored(mesh)
-    shown = sorted(set(views) & set(pictured(len(names)))) or views[:1]
-    places = _viewpoints(mesh, reconstruction, upright, names, shown)
+    names = list(cameras)
+    places = [_viewpoint(mesh, names[k], cameras[names[k]], upright) for k in pictured(len(names))]
     eyes = np.array([place["eye"] for place in places])
     middle = int(np.argmin(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1)))
     return {
@@ -367,23 +388,16 @@ def _colored(mesh: TexturedMesh) -> tuple[dict[str, Any], I64, I64]:
     return color, index.reshape(-1, 3), vertex[first]
 
 
-def _viewpoints(
-    mesh: TexturedMesh, reconstruction: Reconstruction, upright: F64, names: Sequence[str], views: list[int]
-) -> list[dict[str, Any]]:
-    """The viewpoints of images, in the axes of the viewer, with target and field of view."""
-    found = []
-    for i in views:
-        K, R, t = decompose_camera(reconstruction.P[i])
-        size = reconstruction.sizes[i].astype(np.float64)
-        field = size / 2 / np.diag(K)[:2]
-        local = mesh.vertices @ R.T + t
-        with np.errstate(divide="ignore", invalid="ignore"):
-            seen = (local[:, 2] > 0) & (np.abs(local[:, :2] / local[:, 2:]) < field).all(axis=1)
-        depth = float(np.median(local[seen, 2])) if seen.any() else float(np.linalg.norm(t)) or 1.0
-        eye = upright @ (-R.T @ t)
-        name, target = f"{i + 1} · {names[i]}", eye + depth * (upright @ R[2])
-        found.append({"name": name, "eye": eye.tolist(), "target": target.tolist(), "field": field.tolist()})
-    return found
+def _viewpoint(mesh: TexturedMesh, name: str, camera: Camera, upright: F64) -> dict[str, Any]:
+    """A viewpoint at a camera, in the axes of the viewer, with target and field of view."""
+    field = np.array(camera.size) / 2 / np.diag(camera.K)[:2]
+    local = mesh.vertices @ camera.R.T + camera.t
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen = (local[:, 2] > 0) & (np.abs(local[:, :2] / local[:, 2:]) < field).all(axis=1)
+    depth = float(np.median(local[seen, 2])) if seen.any() else float(np.linalg.norm(camera.t)) or 1.0
+    eye = upright @ camera.centre
+    target = eye + depth * (upright @ camera.R[2])
+    return {"name": name, "eye": eye.tolist(), "target": target.tolist(), "field": field.tolist()}
 
 
 def _packed(values: NDArray[Any]) -> str:

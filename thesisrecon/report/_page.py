@@ -9,17 +9,20 @@ import base64
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from html import escape
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from thesisrecon import __version__
 from thesisrecon.arrays import F64
+from thesisrecon.camera import Camera
 from thesisrecon.errors import made
-from thesisrecon.records import Reconstruction, StageReport
+from thesisrecon.records import Reconstruction, StageReport, TexturedMesh, as_mesh
 from thesisrecon.report import _assessment as words
 from thesisrecon.report import _data
 from thesisrecon.report import _figures as figures
@@ -50,8 +53,9 @@ def _compiled(template: str, filters: tuple[tuple[str, Callable[..., str]], ...]
     import jinja2
 
     environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+    )  # fmt: skip
     # NaN is not JSON: the script of the page could not parse it.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     environment.filters.update(filters)
@@ -86,6 +90,31 @@ def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]
     return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
 
 
+@dataclass(frozen=True)
+class ModelFrame:
+    """A page with the viewer of a model, and its frame in a notebook."""
+
+    page: str
+    height: int
+
+    @classmethod
+    def of(cls, mesh: TexturedMesh, cameras: Mapping[str, Camera] | Iterable[Camera], height: int) -> Self:
+        """Make the page of a mesh; without cameras it is seen from the side that most of it faces."""
+        mesh = as_mesh("show", mesh)
+        named = cameras if isinstance(cameras, Mapping) else {str(k): c for k, c in enumerate(cameras)}
+        model = figures.viewer_data(mesh, named or {"overview": figures.overview(mesh)})
+        text, viewer = f"{words.model_text(mesh)}. ", page_resource("viewer.js")
+        page = page_resource("frame.html.j2")
+        return cls(render_page(page, [viewer], model=model, caption=text, note=""), height)
+
+    def __repr__(self) -> str:
+        return f"ModelFrame({len(self.page)} characters, shown by a notebook)"
+
+    def _repr_html_(self) -> str:
+        frame = f'style="width:100%;height:{self.height}px;border:0" sandbox="allow-scripts"'
+        return f'<iframe title="Model" {frame} srcdoc="{escape(self.page)}"></iframe>'
+
+
 class _Pictures:
     """Makes the pictures of a page, each on its own; ``warnings`` are about those that failed."""
 
@@ -110,8 +139,8 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     model = None
     held_out = None
     if data.model is not None and len(data.model.faces) and data.metric is not None:
-        given = (data.model, data.metric.reconstruction, names)
-        model = pictures.make("the model", figures.viewer_data, *given)
+        cameras = figures.numbered_cameras(data.metric.reconstruction, names)
+        model = pictures.make("the model", figures.viewer_data, data.model, cameras)
     side = figures.depth_side(_sharing(len(data.depths)))
     depths = [
         (i + 1, names[i], picture)
