@@ -11,7 +11,8 @@ Optional are ``ours(case)``, the result of the library; ``bound(case)``, the lea
 case)``, the numbers in which results are compared; ``faults(output, case)``, sentences on what is not
 fulfilled; ``FLOOR``, an error that always passes; ``CASES``, the number of data sets.
 
-A wrong result is compared with those of all mistakes: the nearest, if it is near, is named.
+A wrong result is compared with those of all mistakes, and with those of the solution with one expression of
+its source changed (``variants.py``): the nearest, if it is near, is named.
 """
 
 import ast
@@ -20,15 +21,24 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import time
 import traceback
 import warnings
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import variants
 
 HERE = Path(__file__).parent
 CLOSE = 0.35
 """A mistake is named up to this distance from its result, as a share of its distance from the right one."""
+
+
+EQUAL = 0.05
+"""A changed expression of the solution is named up to this distance."""
+SECONDS = 10.0
+"""Processor time for the results of changed expressions."""
 
 
 class Refused(Exception):
@@ -165,25 +175,60 @@ def _rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _mistake(check, outputs, right, cases):
+def _ratio(check, change, output, good, case):
+    """Distance of an output from the result of a mistake, as a share of that result's from the right one."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            wrong = checked("", change(*copy.deepcopy(case.inputs)), check.RETURNS)
+            wrong, good, own = (_vector(check, one, case) for one in (wrong, good, output))
+            # A result of zeros is near all small results.
+            scale = min(_distance(good, wrong), _distance(0 * wrong, wrong))
+            ratio = _distance(own, wrong) / scale
+    except Exception:  # a change may break the solution in any way
+        return np.inf
+    return ratio if np.isfinite(ratio) else np.inf
+
+
+def _mistake(name, check, outputs, right, cases):
     """The sentence of the mistake whose results are nearest, or None if none is near."""
-    best = {}
-    for sentence, change in check.MISTAKES.items():
-        ratios = []
-        for output, good, case in zip(outputs, right, cases, strict=True):
-            try:
-                with np.errstate(all="ignore"):
-                    wrong = change(check.solve, *copy.deepcopy(case.inputs))
-                wrong, good, own = (_vector(check, one, case) for one in (wrong, good, output))
-                # A result of zeros is near all small results.
-                scale = min(_distance(good, wrong), _distance(0 * wrong, wrong))
-                ratios.append(_distance(own, wrong) / scale)
-            except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-                continue
-        if ratios and np.isfinite(ratios).any():
-            best[sentence] = float(np.nanmedian(ratios))
-    nearest = min(best, key=best.get, default=None)
-    return nearest if nearest is not None and best[nearest] < CLOSE else None
+    every = list(zip(outputs, right, cases, strict=True))
+    off = [_distance(_vector(check, o, case), _vector(check, g, case)) for o, g, case in every]
+    wrong = [one for one, far in zip(every, off, strict=True) if far > 1e-3 * max(off)]
+    table = {
+        sentence: [_ratio(check, lambda *given, of=change: of(check.solve, *given), *one) for one in wrong]
+        for sentence, change in check.MISTAKES.items()
+    }
+    listed = min(table, key=lambda sentence: np.median(table[sentence]), default=None)
+    near = np.median(table[listed]) if listed else np.inf
+    if near < EQUAL:
+        return listed
+    found = _changed_expression(name, check, wrong)
+    if found is not None or near < CLOSE:
+        return found or listed
+    # Chance may choose another one of several mistakes in each data set.
+    best = [min(table, key=lambda sentence, k=k: table[sentence][k]) for k in range(len(wrong))]
+    if all(table[sentence][k] < CLOSE for k, sentence in enumerate(best)):
+        kinds = {sentence.split(":")[0] for sentence in best}
+        return kinds.pop() if len(kinds) == 1 else Counter(best).most_common(1)[0][0]
+    return None
+
+
+def _changed_expression(name, check, wrong):
+    """The sentence of the variant of the solution that gives the wrong results, or None."""
+    end, found, least = time.process_time() + SECONDS, None, EQUAL
+    for words, function in variants.of(HERE / "solutions", name):
+        if time.process_time() > end:
+            break
+        ratio = _ratio(check, function, *wrong[0])
+        if ratio >= least:
+            continue
+        ratio = np.median([ratio, *(_ratio(check, function, *one) for one in wrong[1:])])
+        if ratio < least:
+            found, least = words, ratio
+        if least < 1e-9:
+            break
+    return found
 
 
 def grade(name, function, path=None):
@@ -216,7 +261,7 @@ def grade(name, function, path=None):
         return True, lines
     if error <= allowed:
         return False, [*lines, *(f"reason: {fault}" for fault in faults)]
-    if (sentence := _mistake(check, outputs, right, cases)) is not None:
+    if (sentence := _mistake(name, check, outputs, right, cases)) is not None:
         return False, [*lines, f"reason: {sentence}"]
     unknown = f"no usual mistake explains the error; it must be at most {allowed:.3g}"
     return False, [*lines, *(f"reason: {fault}" for fault in faults or [unknown])]

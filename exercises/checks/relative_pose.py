@@ -18,6 +18,9 @@ def data(rng):
     K = scene.K[0]
     x1, x2 = divided(homogeneous(xy) @ np.linalg.inv(K).T)
     E = thesisrecon.estimate_essential(*xy, K, threshold_px=None).E
+    # Either of the two rotations comes first.
+    U, _, Vt = np.linalg.svd(E)
+    E = U @ np.diag([1, 1 + rng.choice([-1e-6, 1e-6]), 0]) @ Vt
     R = scene.R[1] @ scene.R[0].T
     t = scene.t[1] - R @ scene.t[0]
     sign = rng.choice([-1, 1]) * rng.uniform(0.5, 2)

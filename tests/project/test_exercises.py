@@ -11,7 +11,7 @@ import pytest
 from thesisrecon.cli.commands import run_command
 
 HOME = Path(__file__).parents[2] / "exercises"
-NAMES = sorted(path.stem for path in HOME.glob("*.py") if path.stem != "grader")
+NAMES = sorted(path.stem for path in HOME.glob("*.py") if path.stem not in ("grader", "variants"))
 PAGE = HOME.parent / "docs" / "recipes" / "exercises.md"
 
 # Name -> a line of the solution, the wrong line, and words of the reason.
@@ -143,7 +143,7 @@ def grader():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(HOME))
         yield importlib.import_module("grader")
-    for name in [name for name in sys.modules if name.split(".")[0] in ("grader", "checks", "solutions")]:
+    for name in [name for name in sys.modules if name.split(".")[0] in ("grader", "variants", "checks", "solutions")]:
         del sys.modules[name]
 
 

@@ -231,7 +231,7 @@ def test_a_notebook_shows_the_model_in_a_frame(browser, tmp_path, scheme, camera
     path.write_text(f"<!DOCTYPE html><meta charset='utf-8'>{frame}", "utf-8")
     context = browser.new_context(color_scheme=scheme, viewport={"width": 900, "height": 700})
     page, errors = context.new_page(), []
-    page.on("pageerror", errors.append)
+    page.on("pageerror", lambda error: errors.append(error))
     page.on("request", lambda request: request.url.startswith("http") and errors.append(request.url))
     page.goto(path.as_uri())
     inside = page.frame_locator("iframe")
