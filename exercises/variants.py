@@ -190,17 +190,29 @@ def _of_call(node):
 
 
 def _of_index(node):
-    """Other indices, and the columns of U for the rows of V' of an SVD."""
-    try:
-        index = ast.literal_eval(node.slice)
-    except ValueError:
+    """Other indices and shifted slices, and the columns of U for the rows of V' of an SVD."""
+    if isinstance(node.slice, ast.Slice):
+        upper, lower = node.slice.upper, node.slice.lower
+        if lower is None and isinstance(upper, ast.Constant):
+            yield (
+                ast.Subscript(node.value, ast.Slice(ast.Constant(1), _expression("A + 1", upper)), node.ctx),
+                "shifted",
+            )
         return
-    if type(index) is not int:
-        return
-    for other in dict.fromkeys((0, index - 1, index + 1, -1)):
-        if other != index:
-            yield ast.Subscript(node.value, ast.Constant(other), node.ctx), "another index"
-    yield (
-        ast.Subscript(node.value, _expression("(A, B)", ast.Slice(), node.slice), node.ctx),
-        "a column, not a row",
-    )
+    several = isinstance(node.slice, ast.Tuple)
+    parts = node.slice.elts if several else [node.slice]
+    for k, part in enumerate(parts):
+        try:
+            index = ast.literal_eval(part)
+        except ValueError:
+            continue
+        if type(index) is not int:
+            continue
+        for other in dict.fromkeys((0, index - 1, index + 1, -1)):
+            changed = [*parts[:k], ast.Constant(other), *parts[k + 1 :]]
+            place = ast.Tuple(changed, ast.Load()) if several else changed[0]
+            if other != index:
+                yield ast.Subscript(node.value, place, node.ctx), "another index"
+        if not several:
+            column = ast.Tuple([ast.Slice(), part], ast.Load())
+            yield ast.Subscript(node.value, column, node.ctx), "a column, not a row"

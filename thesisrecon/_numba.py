@@ -189,7 +189,7 @@ def cache_folder() -> Path:
             place.mkdir(parents=True, exist_ok=True)
             if os.access(place, os.W_OK):
                 return place
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, AttributeError):  # Windows has no user numbers
         own = Path(tempfile.gettempdir()) / f"thesisrecon-kernels-{os.getuid()}"
         own.mkdir(mode=0o700, exist_ok=True)
         found = own.lstat()

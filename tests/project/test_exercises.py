@@ -143,7 +143,9 @@ def grader():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(HOME))
         yield importlib.import_module("grader")
-    for name in [name for name in sys.modules if name.split(".")[0] in ("grader", "variants", "checks", "solutions")]:
+    for name in [
+        name for name in sys.modules if name.split(".")[0] in ("grader", "variants", "checks", "solutions")
+    ]:
         del sys.modules[name]
 
 

@@ -8,7 +8,6 @@ is replaced or removed through a link, and a refused command leaves no trace.
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -22,6 +21,7 @@ from pathlib import Path
 from thesisrecon.errors import Notice, OutputError, StageFailure, UsageError, WorkersLost
 
 LOCK_FILE = ".lock"
+NOFOLLOW = getattr(os, "O_NOFOLLOW", 0)  # Windows has no such flags
 _claims: list[OutputFolder] = []
 
 
@@ -45,7 +45,7 @@ def has_content(path: Path, digests: Collection[str]) -> bool:
 
 def _open_regular(path: Path) -> BufferedReader:
     """Open a regular file; OSError for links and others (opening a pipe would block)."""
-    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb")
+    file = os.fdopen(os.open(path, os.O_RDONLY | NOFOLLOW | getattr(os, "O_NONBLOCK", 0)), "rb")
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise OSError(errno.EINVAL, "it is not a regular file")
@@ -194,7 +194,9 @@ class OutputFolder:
     def require_present(self) -> None:
         """Raise ``UsageError`` if the folder was moved or removed since it was claimed."""
         with suppress(OSError):
-            if os.path.samestat(self.path.stat(), os.fstat(self._folder)):
+            found = self.path.stat()
+            # Windows opens no folders, and keeps one in which a file is open.
+            if self._folder < 0 or os.path.samestat(found, os.fstat(self._folder)):
                 return
         raise UsageError(Notice("folder-gone", self.path))
 
@@ -213,7 +215,8 @@ class OutputFolder:
         try:
             try:
                 self.path.mkdir(parents=True, exist_ok=True)
-                self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                if hasattr(os, "O_DIRECTORY"):
+                    self._folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
                 self._record = _locked(lock)
             except OSError as error:
                 raise OutputError(f"the output folder {self.path}", error) from None
@@ -258,12 +261,21 @@ class OutputFolder:
             self._used = replaced
 
 
+def lock_file(handle: int, *, shared: bool = False) -> None:
+    """Lock an open file until it is closed, ``OSError`` if another process has it; Windows does not lock."""
+    try:
+        import fcntl
+    except ImportError:
+        return
+    fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+
+
 def _locked(lock: Path) -> int:
     """Open and lock a file, which is created; the lock ends with the process."""
     while True:
-        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW, 0o644)
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_APPEND | NOFOLLOW, 0o644)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_file(handle)
         except OSError:
             os.close(handle)
             raise UsageError(Notice("folder-in-use", lock.parent)) from None

@@ -1,6 +1,5 @@
 """Output files of a run, written and read back: COLMAP model, points, cameras, surface, summary, report."""
 
-import resource
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -227,7 +226,6 @@ def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warning
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:
     seconds = {stage: round(report.seconds, 3) for stage, report in run.reports.items()}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {
         "version": __version__,
         "seed": run.seed,
@@ -243,8 +241,18 @@ def _run_facts(run: Run, until: str) -> dict[str, Any]:
         "seconds": seconds | {"total": round(sum(seconds.values()), 3)},
         "elapsed_seconds": round(time.perf_counter() - run.started, 3),
         "resumed": list(run.resumed),
-        "peak_memory_mb": round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1),
+        "peak_memory_mb": _peak_memory_mb(),
     }
+
+
+def _peak_memory_mb() -> float | None:
+    """The largest resident size of this process; None on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
 
 
 def _model_for_page(result: RunResult, threads: int) -> TexturedMesh | None:

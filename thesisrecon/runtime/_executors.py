@@ -376,7 +376,7 @@ def _answer(caller: Mapping[str, str], task: bytes) -> bytes:
     """Run a pickled task in a worker; other versions would give results with a wrong cache key."""
     own = _environment()
     if others := [name for name in own if own[name] != caller.get(name)]:
-        worker = f"{multiprocessing.current_process().name} on {os.uname().nodename}"
+        worker = f"{multiprocessing.current_process().name} on {platform.node()}"
         both = [", ".join(f"{name} {side.get(name)}" for name in others) for side in (own, caller)]
         raise UsageError(Notice("other-version", worker, *both))
     try:
@@ -397,7 +397,8 @@ class ProcessPool(futures.ProcessPoolExecutor):
         # Forking a process that runs threads can deadlock.
         context = multiprocessing.get_context("spawn")
         # Otherwise the first worker starts it and unblocks the signals.
-        multiprocessing.resource_tracker.ensure_running()
+        if os.name != "nt":
+            multiprocessing.resource_tracker.ensure_running()
         watched, self._held = context.Pipe(duplex=False)
         super().__init__(count, mp_context=context, initializer=_end_with_parent, initargs=(watched,))
 
@@ -428,5 +429,5 @@ def _end_with_parent(watched: multiprocessing.connection.Connection) -> None:
         os._exit(CODES[signal.SIGTERM])
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for end in (end_with_program, end_on_sigterm):
+    for end in (end_with_program, end_on_sigterm)[: 2 if hasattr(signal, "sigwait") else 1]:
         threading.Thread(target=end, daemon=True).start()

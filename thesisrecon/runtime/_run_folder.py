@@ -5,7 +5,6 @@ and its key, made from settings, code and all inputs, is the same.
 """
 
 import dataclasses
-import fcntl
 import hashlib
 import io
 import json
@@ -21,7 +20,7 @@ import numpy as np
 from thesisrecon import records
 from thesisrecon.errors import Notice, OutputError, UsageError
 from thesisrecon.io import _files
-from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_part
+from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_file, lock_part
 from thesisrecon.records import StageReport
 
 FORMAT = 3
@@ -336,7 +335,7 @@ def is_running(folder: Path) -> bool:
     """Whether a run is writing to an output folder."""
     try:
         with (folder / LOCK_FILE).open() as handle:
-            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lock_file(handle.fileno(), shared=True)
     except FileNotFoundError:
         return False
     except OSError:

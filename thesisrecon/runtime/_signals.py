@@ -32,14 +32,16 @@ def install_signal_handlers(program: str, advice: str = "repeat the command to r
     _advice.append(advice)
     pipe, written = os.pipe()
     # A signal handler must not block.
-    os.set_blocking(written, False)
+    if hasattr(os, "set_blocking"):  # Python 3.11 on Windows
+        os.set_blocking(written, False)
     signal.set_wakeup_fd(written, warn_on_full_buffer=False)
     for number in CODES:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: None)
     # The resource tracker of multiprocessing would warn about what it cleans up afterwards.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
-    os.register_at_fork(after_in_child=_forget)
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_forget)
     try:
         threading.Thread(target=_watch, args=(program, pipe), daemon=True).start()
     except RuntimeError:
@@ -81,6 +83,9 @@ def starting_processes() -> Iterator[None]:
     while _leaving:
         time.sleep(START_S)
     with _starting:
+        if not hasattr(signal, "pthread_sigmask"):  # Windows
+            yield
+            return
         before = signal.pthread_sigmask(signal.SIG_BLOCK, CODES)
         try:
             yield
@@ -117,7 +122,8 @@ def _say(sentence: str) -> None:
         # A progress bar hides the cursor and leaves it in the middle of a line.
         start = "\x1b[?25h\n" if os.isatty(_stderr[-1]) else ""
         line = f"{start}{' '.join(sentence.split())}\n"
-        if select.select([], [_stderr[-1]], [], START_S)[1]:
+        # On Windows select takes sockets only.
+        if os.name == "nt" or select.select([], [_stderr[-1]], [], START_S)[1]:
             os.write(_stderr[-1], line.encode("utf-8", "backslashreplace"))
 
 
