@@ -449,9 +449,19 @@ class TexturedMesh(Record):
     untextured: B8 | None = None  #: (M,) faces that no view sees
 
     def show(self, cameras: Any = (), height: int = 560) -> Any:
-        """Return the 3D viewer of the report for a notebook, as one page in a frame that needs no server.
+        """Return the 3D viewer of the report for a notebook: one page in a frame that needs no server.
 
-        ``cameras``, by name or in a list, are its viewpoints. The HTML is in ``.page`` of the result.
+        Parameters
+        ----------
+        cameras : mapping or sequence of Camera
+            Viewpoints, by name or in a list.
+        height : int
+            Height of the frame (px).
+
+        Returns
+        -------
+        ModelFrame
+            Shown by a notebook; ``page`` is the HTML.
         """
         # The report is above the records, and notebooks load it.
         return import_module("thesisrecon.report._page").ModelFrame.of(self, cameras, height)
