@@ -34,42 +34,22 @@ from validation.studies.robustness import different, outputs
 
 def matched_scene():
     scene = make_scene(views=9, points=400, sigma_px=0.3, seed=4)
-    return subsets.Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes, scene.K[:, 0, 0])
+    return subsets.Matched("synthetic", scene.tracks, true_pairs(scene), scene.sizes)
 
 
 def test_a_subset_holds_the_views_their_pairs_and_the_points_that_two_of_them_see():
     whole, views = matched_scene(), np.array([1, 4, 7])
-    kept = np.arange(400) < 250
-    part = subsets.take_views(whole, views, kept)
+    part = subsets.take_views(whole, views)
     assert part.tracks.n_views == 3
     assert np.bincount(part.tracks.point_index).min() >= 2
     assert {(pair.i, pair.j) for pair in part.pairs} == {(0, 1), (0, 2), (1, 2)}
     t = whole.tracks
     seen = np.zeros((9, 400), dtype=bool)
     seen[t.view_index, t.point_index] = True
-    assert part.tracks.n_points == int(((seen[views].sum(axis=0) >= 2) & kept).sum())
+    assert part.tracks.n_points == int((seen[views].sum(axis=0) >= 2).sum())
     mine = part.tracks.xy[part.tracks.view_index == 1]
     theirs = t.xy[t.view_index == 4]
     assert all((np.abs(theirs - xy).max(axis=1) == 0.0).any() for xy in mine)
-
-
-def test_outcomes_of_a_trial_are_distinguished():
-    wrong = subsets.Trial(0, (0, 1), 2, 10.0, 12.0, (), 1, 1.0)
-    shifted = replace(wrong, median_pct=np.nan, reasons=("pure translation",))
-    trials = {
-        "right": replace(wrong, median_pct=1.0),
-        "open": replace(wrong, interval_pct=11.0),
-        "refused": replace(shifted, failed_checks=("close to a pure translation",)),
-        "refused, another reason": replace(shifted, failed_checks=("too few points",)),
-        "right, not trusted": replace(wrong, median_pct=1.0, failed_checks=("no",)),
-        "wrong": wrong,
-        "crash": replace(wrong, median_pct=np.nan, crash="ValueError: no"),
-    }
-    assert tuple(trials) == subsets.OUTCOMES
-    assert [trial.outcome for trial in trials.values()] == list(subsets.OUTCOMES)
-    assert replace(wrong, failed_checks=("no",)).outcome == "refused"
-    assert shifted.outcome == "wrong"
-    assert subsets.table_row("s", "shared", [*trials.values()])[:10] == ["s", "shared", 7, *[1] * 7]
 
 
 def test_times_are_no_difference_and_numbers_and_missing_files_are(tmp_path):
@@ -246,7 +226,7 @@ def test_files_of_the_user_in_an_output_folder_survive(arguments, tmp_path, caps
 
 def test_subsets_of_images_are_connected_by_verified_matches():
     pairs = [SimpleNamespace(i=i, j=i + 1, accepted=i != 3, inliers=100) for i in range(7)]
-    matched = subsets.Matched("row", None, pairs, np.full((8, 2), 100), np.ones(8))
+    matched = subsets.Matched("row", None, pairs, np.full((8, 2), 100))
     for seed in range(20):
         drawn = subsets.draw_neighbours(matched, np.random.default_rng(seed), 3)
         assert len(set(drawn)) == 3
@@ -258,10 +238,11 @@ def test_coverage_counts_trusted_results_only():
     right = np.array([0.5]), np.array([1.5, -3.0]), np.array([0.1, 2.2]), np.array([-0.2, 0.3])
     wrong = tuple(np.full(len(z), 9.0) for z in right)
     trials = [
-        subsets.CoverageTrial("a", 3, 9.0, trusted, z) for trusted, z in ((True, right), (False, wrong))
+        subsets.CoverageTrial("a", 3, 9.0, trusted, off, z)
+        for trusted, off, z in ((True, 4.0, right), (False, 2.0, wrong), (False, 5.0, wrong))
     ]
     row = subsets.coverage_row("a", trials)
-    assert row == ["a", 2, 1, "100 100 100", "0 50 50", "50 50 100", "100 100 100", "0.5 3.0 2.2 0.3"]
+    assert row == ["a", 3, 1, 1, 1, "100 100 100", "0 50 50", "50 50 100", "100 100 100", "0.5 3.0 2.2 0.3"]
 
 
 skip_without("open3d")

@@ -32,7 +32,6 @@ REAL_SCENES = {
 TURNTABLE_SCENES = {"temple": "truth/temple", "lego": "truth/lego"}
 """Larger sets with truth, which only some studies use."""
 FOLDERS = REAL_SCENES | TURNTABLE_SCENES
-SHIFTED = "Cones9"  # Nine views of the Middlebury Cones, by a camera that moves without rotation
 SUFFIXES = {".jpg", ".jpeg", ".png"}
 
 
@@ -180,15 +179,11 @@ def load_fixture_scene(name: str = "courtyard") -> Scene:
 
 
 def load_scene(name: str) -> Scene | None:
-    """Load a fixture, a real scene or the shifted views; None if its images are not on this machine."""
-    if name in FOLDERS:
-        folder = real_folder(name)
-        return None if folder is None else read_scene(folder, name)
-    if name != SHIFTED:
+    """Load a fixture or a real scene; None if its images are not on this machine."""
+    if name not in FOLDERS:
         return load_fixture_scene(name)
-    root = data_root()
-    paths = () if root is None else tuple(sorted((root / "stereo" / SHIFTED).glob("im*.png")))
-    return Scene(SHIFTED, paths) if paths else None
+    folder = real_folder(name)
+    return None if folder is None else read_scene(folder, name)
 
 
 def scenes_here(names: Iterable[str]) -> list[Scene]:

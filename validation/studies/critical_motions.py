@@ -2,7 +2,7 @@
 
 Every trial is a random scene (:mod:`validation.scenes.critical`) with noisy tracks, the projective
 maximum-likelihood reconstruction, self-calibration and its identifiability report. Without parallax, pairs of
-views are verified first, as in the pipeline; a refusal that names the motion counts. The dinosaur is last.
+views are verified first, as in the pipeline; a refusal that names the motion counts.
 """
 
 from __future__ import annotations
@@ -19,18 +19,13 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_for
 from thesisrecon.epipolar.locally_optimised import LocallyOptimisedRansac
 from thesisrecon.epipolar.verification import PairVerification
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.triangulation import triangulate_observations
-from thesisrecon.optimize.bundle.projection import Observations
-from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.projective._model import require_pair_with_parallax
-from thesisrecon.records import IdentifiabilityReport, Matches, Reconstruction, TwoView
+from thesisrecon.records import Matches, TwoView
 from thesisrecon.selfcalibration.quadric import HypothesesAndRefinement
 from validation.runs.study import Part, pick, report_progress
 from validation.runs.tables import Metric, Rows, text_table
 from validation.scenes.critical import Motion, make_sequence, projective_estimate
 from validation.scenes.critical import Sequence as SyntheticSequence
-from validation.scenes.dinosaur import Dinosaur, load_dinosaur
-from validation.studies.subsets import MODES, Cameras
 
 
 class FewHypotheses(HypothesesAndRefinement):
@@ -121,30 +116,6 @@ def check_motion(
     return rows, [motion.value, kind, focal, *shares, names]
 
 
-def dinosaur_verdict(reconstruction: Reconstruction, *, cameras: Cameras = "shared") -> IdentifiabilityReport:
-    prior, rng = prior_for(reconstruction, IntrinsicsOptions(cameras=cameras)), np.random.default_rng(0)
-    answer = HypothesesAndRefinement().calibrate(reconstruction, prior=prior, rng=rng)
-    assert answer.identifiability is not None
-    return answer.identifiability
-
-
-def published_reconstruction(dinosaur: Dinosaur) -> Reconstruction:
-    """Triangulate and adjust the tracks with the published cameras."""
-    t = dinosaur.tracks
-    seen = np.bincount(t.point_index, minlength=t.n_points) >= 3
-    keep = seen[t.point_index]
-    view, point, xy = t.view_index[keep], t.point_index[keep], t.xy[keep]
-    X = triangulate_observations(dinosaur.P, view, point, xy, t.n_points)
-    fit = refine_projective_bundle(dinosaur.P, X, Observations(view, point, xy), max_iterations=30)
-    inlier = np.zeros(len(t.xy), dtype=bool)
-    inlier[np.flatnonzero(keep)] = np.linalg.norm(fit.residual_px, axis=1) < 2.0
-    n = len(dinosaur.P)
-    sigma = float(np.median(np.linalg.norm(fit.residual_px, axis=1))) / 1.18
-    return Reconstruction(
-        "projective", fit.P, fit.X, np.ones(n, dtype=bool), seen, inlier, t, dinosaur.sizes, sigma, ("",) * n
-    )
-
-
 HEAD = ["motion", "made", "focal", "named %", "identifiable %", "its focal error %", "wrong %", "names"]
 
 
@@ -169,11 +140,3 @@ def critical_motions_study(
                     report_progress(" | ".join(map(str, line)))
     yield text_table(HEAD, lines)
     yield from judged
-    dinosaur = load_dinosaur()
-    for cameras in MODES:
-        if dinosaur is None:
-            break
-        report = dinosaur_verdict(published_reconstruction(dinosaur), cameras=cameras)
-        numbers = ", ".join(f"{name} {value:.3g}" for name, value in report.evidence.items())
-        sentences = "; ".join(report.sentences)
-        yield f"dinosaur, {cameras}: {report.motion}, critical {report.critical}: {sentences} ({numbers})"

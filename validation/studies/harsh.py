@@ -243,11 +243,11 @@ def run_trial(kind: str, number: int) -> Trial:
     observed = scene.observe(rng)
     pairs, config = pairs_from_tracks(observed, seed=number), PipelineConfig()
     config = replace(config, intrinsics=replace(config.intrinsics, cameras=scene.cameras))
-    matched = Matched(kind, verified_tracks(observed, pairs), pairs, scene.sizes, scene.focal_px)
-    result, failures, _ = solve(matched, config, seed=number, first=0)
+    matched = Matched(kind, verified_tracks(observed, pairs), pairs, scene.sizes)
+    result, failures = solve(matched, config, seed=number)
     if result is None:
         return Trial(number, "refused", 0, np.nan, np.nan, 0, tuple(failures[-1:]))
-    error, stated = focal_errors(result, matched)
+    error, stated = focal_errors(result, scene.focal_px)
     silent = int(((error > OFF) & (error > stated)).sum())
     outcome = "trusted" if result.trusted else "not trusted"
     worst, median = float(error.max()), float(np.median(error))
@@ -264,12 +264,12 @@ def verified_tracks(t: Tracks, pairs: Sequence[TwoView]) -> Tracks:
     return Tracks(t.view_index[k], t.point_index[k], t.xy[k], t.n_views, t.n_points)
 
 
-def focal_errors(result: MetricResult, matched: Matched) -> tuple[F64, F64]:
+def focal_errors(result: MetricResult, truth: F64) -> tuple[F64, F64]:
     """Return |log f / f_true| of the registered cameras and half their 95 % intervals (relative)."""
     views = np.flatnonzero(result.reconstruction.registered)
     found = [result.intrinsics[v]["focal_px"] for v in views]
     value = np.array([interval.value for interval in found])
-    error = np.abs(np.log(value / matched.focal_px[views]))
+    error = np.abs(np.log(value / truth[views]))
     return error, LEVEL * np.array([interval.std for interval in found]) / value
 
 
