@@ -126,4 +126,5 @@ def dinosaur_study(seed: int = 0) -> Iterator[Part]:
         )
         if report is not None:
             numbers = ", ".join(f"{name} {value:.3g}" for name, value in report.evidence.items())
-            yield f"{cameras}: {report.motion}, critical {report.critical}: {report.sentences} ({numbers})"
+            said = "; ".join(report.sentences)
+            yield f"{cameras}: {report.motion}, critical {report.critical}: {said} ({numbers})"
