@@ -55,6 +55,33 @@ def test_an_adjustment_ends_when_the_cameras_are_settled(monkeypatch, seed):
     assert exact.cost < early.cost < exact.cost * 1.001
 
 
+@pytest.mark.parametrize("groups", [1, 40])
+def test_conjugate_gradients_find_the_minimum_and_covariances_of_cholesky(monkeypatch, groups):
+    block, rng = make_block(views=40, points=300, groups=groups), np.random.default_rng(0)
+    cameras, X = perturbed(block)
+    seen, fixed = block.seen(block.xy + 0.3 * rng.normal(size=block.xy.shape)), np.arange(40) == 3
+    prior = IntrinsicsPrior.unshared(cameras.intrinsics, np.full(cameras.intrinsics.shape, 0.1))
+    options = {"free": FOCAL_CENTRE_RADIAL, "prior": prior, "covariance": True, "loss_px": 0.6}
+    direct = _refine(cameras, X, seen, **options)
+    monkeypatch.setattr(schur, "MANY_VIEWS", 30)
+    monkeypatch.setattr(schur, "CHUNK", 1000)
+    found, again = (_refine(cameras, X, seen, threads=threads, **options) for threads in (1, 2))
+    assert found.cost == pytest.approx(direct.cost, rel=1e-8)
+    np.testing.assert_allclose(found.cameras.intrinsics, direct.cameras.intrinsics, rtol=1e-5, atol=1e-5)
+    variances = [np.diagonal(r.pose_covariance, axis1=1, axis2=2).mean(axis=0) for r in (found, direct)]
+    np.testing.assert_allclose(*variances, rtol=0.15)
+    of_focal = [r.intrinsics_covariance[:, 0, 0].mean() for r in (found, direct)]
+    np.testing.assert_allclose(*of_focal, rtol=1e-4 if groups == 1 else 0.15)
+    np.testing.assert_array_equal(found.X, again.X)
+    one = refine_metric_bundle(cameras, X, seen, free=FOCAL, fixed=fixed, options=BundleOptions())
+    np.testing.assert_array_equal(one.cameras.R[3], cameras.R[3])
+    monkeypatch.undo()
+    assert one.cost == pytest.approx(
+        refine_metric_bundle(cameras, X, seen, free=FOCAL, fixed=fixed, options=BundleOptions()).cost,
+        rel=1e-8,
+    )
+
+
 def test_cost_does_not_depend_on_the_frame():
     block = make_block()
     cameras, X = perturbed(block)

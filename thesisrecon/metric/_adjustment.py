@@ -38,7 +38,7 @@ from thesisrecon.optimize.bundle.metric import (
     refine_metric_bundle,
 )
 from thesisrecon.optimize.bundle.projection import LENS, Observations
-from thesisrecon.optimize.bundle.scatter import LinearisedFit, linearise_fit, point_blocks
+from thesisrecon.optimize.bundle.scatter import LinearisedFit, linearise_fit, median_blocks
 from thesisrecon.optimize.least_squares import best_huber_width, noise_from_distances
 from thesisrecon.records import IntrinsicsPrior
 
@@ -232,7 +232,7 @@ def held_out_observations(model: MetricEstimate) -> I64:
     """Inliers of every fifth block of neighbouring points, others in each view; points keep two or more."""
     t = model.tracks
     count = np.bincount(t.point_index[model.inlier], minlength=t.n_points)
-    block = point_blocks(model.X, count > 0)
+    block = median_blocks(model.X, count > 0)
     held = model.inlier & ((block[t.point_index] + t.view_index) % 5 == 0)
     left = count - np.bincount(t.point_index[held], minlength=t.n_points)
     return np.flatnonzero(held & (left >= 2)[t.point_index])

@@ -19,13 +19,15 @@ from thesisrecon.optimize.bundle.projection import Jacobians
 class BlockIndex(NamedTuple):
     """``start`` (N + 1,) of each point, ``block`` (V,) and border columns ``common`` (V, F) of each view.
 
-    Both are -1 if fixed; ``pair`` (b, b) is the block of two views, upper triangle.
+    Both are -1 if fixed. Row v of the reduced matrix has blocks ``row[v]`` to ``row[v + 1]``, of the views
+    ``column`` (n,); others are not summed.
     """
 
     start: I64
     view_index: I64
     block: I64
-    pair: I64
+    row: I64
+    column: I64
     common: I64
 
 
@@ -91,7 +93,7 @@ def eliminate_points(
     Z = empty((n if J.A.shape[2] == 6 else 0, 3, 6))
     left = _Elimination(k, empty((n, 2, 3)), Z, empty((n, 2)), empty((last - first, 3)))
     _sum_points(first, last, damping, J, index, points, left)
-    _add_views(J, index.pair, by_view, sums, left)
+    _add_views(J, index, by_view, sums, left)
     if len(sums.corner) > 0:
         _add_common(first, last, J, index, sums, left)
 
@@ -139,7 +141,9 @@ def _sum_points(
 
 
 @kernel(forceinline=True)
-def _add_views(J: Jacobians, pair: I64, by_view: ByView, sums: ReducedSums, left: _Elimination) -> None:
+def _add_views(
+    J: Jacobians, index: BlockIndex, by_view: ByView, sums: ReducedSums, left: _Elimination
+) -> None:
     """Add the blocks of all pairs of views that observe a point, and right sides, view by view (cache)."""
     C = J.A.shape[2]
     for k in by_view.order:
@@ -153,28 +157,41 @@ def _add_views(J: Jacobians, pair: I64, by_view: ByView, sums: ReducedSums, left
             sums.rhs[v * C + a] -= a0 * t0 + a1 * t1
             sums.diagonal[v * C + a] += a0 * a0 + a1 * a1
     if C == 6:
-        _add_blocks_of_six(left.first, by_view, pair, J.A, left.Z, sums.blocks)
+        _add_blocks_of_six(left.first, by_view, index, J.A, left.Z, sums.blocks)
     else:
-        _add_blocks(left.first, by_view, pair, J.A, left.Bt, sums.blocks)
+        _add_blocks(left.first, by_view, index, J.A, left.Bt, sums.blocks)
+
+
+@kernel(inline="always")
+def _select_row(index: BlockIndex, before: int, v: int, slot: I64) -> None:
+    """Set ``slot`` (b,) to the blocks of row v, -1 for none, from those of the row before."""
+    if before >= 0:
+        slot[index.column[index.row[before] : index.row[before + 1]]] = -1
+    for n in range(index.row[v], index.row[v + 1]):
+        slot[index.column[n]] = n
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def _add_blocks(first: int, by_view: ByView, pair: I64, A: F64, Bt: F64, blocks: F64) -> None:
+def _add_blocks(first: int, by_view: ByView, index: BlockIndex, A: F64, Bt: F64, blocks: F64) -> None:
     """Add A_k' Q_km A_m of observations k <= m of a point to their blocks, within one view transposed too."""
     order, block, end = by_view
+    slot, before = full(len(index.row) - 1, -1, np.int64), -1
     for i in range(len(order)):
         k = order[i] - first
         v = block[k]
+        if v != before:
+            _select_row(index, before, v, slot)
+            before = v
         for m in range(k, end[k] - first):
             w = block[m]
-            if w < 0:
+            if w < 0 or slot[w] < 0:
                 continue
             same = 1.0 if m == k else 0.0
             q00 = same - Bt[k, 0, 0] * Bt[m, 0, 0] - Bt[k, 0, 1] * Bt[m, 0, 1] - Bt[k, 0, 2] * Bt[m, 0, 2]
             q01 = -Bt[k, 0, 0] * Bt[m, 1, 0] - Bt[k, 0, 1] * Bt[m, 1, 1] - Bt[k, 0, 2] * Bt[m, 1, 2]
             q10 = -Bt[k, 1, 0] * Bt[m, 0, 0] - Bt[k, 1, 1] * Bt[m, 0, 1] - Bt[k, 1, 2] * Bt[m, 0, 2]
             q11 = same - Bt[k, 1, 0] * Bt[m, 1, 0] - Bt[k, 1, 1] * Bt[m, 1, 1] - Bt[k, 1, 2] * Bt[m, 1, 2]
-            n = pair[v, w]
+            n = slot[w]
             _add_block(blocks, n, A, first + k, first + m, (q00, q01, q10, q11))
             if v == w and m > k:
                 _add_block(blocks, n, A, first + m, first + k, (q00, q10, q01, q11))
@@ -192,20 +209,24 @@ def _add_block(blocks: F64, n: int, A: F64, k: int, m: int, Q: tuple[float, floa
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
-def _add_blocks_of_six(first: int, by_view: ByView, pair: I64, A: F64, Z: F64, blocks: F64) -> None:
+def _add_blocks_of_six(first: int, by_view: ByView, index: BlockIndex, A: F64, Z: F64, blocks: F64) -> None:
     """As :func:`_add_blocks` for C = 6: A_k' A_k - Z_k' Z_m, three times as fast (vectors)."""
     order, block, end = by_view
+    slot, before = full(len(index.row) - 1, -1, np.int64), -1
     for i in range(len(order)):
         k = order[i] - first
         v = block[k]
-        _add_gram_of_six(blocks, pair[v, v], A, order[i])
+        if v != before:
+            _select_row(index, before, v, slot)
+            before = v
+        _add_gram_of_six(blocks, slot[v], A, order[i])
         for m in range(k, end[k] - first):
             w = block[m]
-            if w < 0:
+            if w < 0 or slot[w] < 0:
                 continue
-            _subtract_product_of_six(blocks, pair[v, w], Z, k, m)
+            _subtract_product_of_six(blocks, slot[w], Z, k, m)
             if m > k and v == w:
-                _subtract_product_of_six(blocks, pair[v, w], Z, m, k)
+                _subtract_product_of_six(blocks, slot[w], Z, m, k)
 
 
 @kernel(inline="always", fastmath={"contract"}, forceinline=True)
@@ -334,15 +355,23 @@ def _add_corner(column: I64, E: F64, p: F64, g: F64, residual: F64, ends: tuple[
 
 @kernel
 def substitute_points(
-    first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64
-) -> None:
-    """Compute the steps -V^-1 (h + B' J step) of points for a camera step."""
+    first: int, last: int, camera_step: F64, J: Jacobians, index: BlockIndex, points: PointSums, step: F64,
+    product: F64,
+) -> None:  # fmt: skip
+    """Compute the steps -V^-1 (h + B' J step) of points for a camera step.
+
+    If h = 0, ``product`` (D,) grows by that of the camera step with the reduced matrix, unless it is empty.
+    """
     C, F = J.A.shape[2], index.common.shape[1]
-    border = len(index.pair) * C
+    border = (len(index.row) - 1) * C
+    most = 1
     for j in range(first, last):
-        h = points.gradient[j]
+        most = max(most, index.start[j + 1] - index.start[j])
+    moved = empty((most, 2))
+    for j in range(first, last):
+        h, s = points.gradient[j], index.start[j]
         t0, t1, t2 = h[0], h[1], h[2]
-        for k in range(index.start[j], index.start[j + 1]):
+        for k in range(s, index.start[j + 1]):
             e0 = e1 = 0.0
             view = index.view_index[k]
             v = index.block[view] * C
@@ -355,12 +384,28 @@ def substitute_points(
                 if column >= 0:
                     e0 += J.E[k, 0, f] * camera_step[border + column]
                     e1 += J.E[k, 1, f] * camera_step[border + column]
+            moved[k - s, 0], moved[k - s, 1] = e0, e1
             t0 += J.B[k, 0, 0] * e0 + J.B[k, 1, 0] * e1
             t1 += J.B[k, 0, 1] * e0 + J.B[k, 1, 1] * e1
             t2 += J.B[k, 0, 2] * e0 + J.B[k, 1, 2] * e1
         V = points.inverse[j]
         for a in range(3):
             step[j, a] = -(V[a, 0] * t0 + V[a, 1] * t1 + V[a, 2] * t2)
+        if len(product) == 0:
+            continue
+        p0, p1, p2 = step[j, 0], step[j, 1], step[j, 2]
+        for k in range(s, index.start[j + 1]):
+            e0 = moved[k - s, 0] + J.B[k, 0, 0] * p0 + J.B[k, 0, 1] * p1 + J.B[k, 0, 2] * p2
+            e1 = moved[k - s, 1] + J.B[k, 1, 0] * p0 + J.B[k, 1, 1] * p1 + J.B[k, 1, 2] * p2
+            view = index.view_index[k]
+            v = index.block[view] * C
+            if v >= 0:
+                for c in range(C):
+                    product[v + c] += J.A[k, 0, c] * e0 + J.A[k, 1, c] * e1
+            for f in range(F):
+                column = index.common[view, f]
+                if column >= 0:
+                    product[border + column] += J.E[k, 0, f] * e0 + J.E[k, 1, f] * e1
 
 
 @kernel

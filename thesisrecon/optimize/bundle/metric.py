@@ -1,6 +1,8 @@
 """Metric bundle adjustment: poses, points and intrinsics, shared or separate, with priors."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -8,8 +10,10 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import require_range
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns
+from thesisrecon.optimize.bundle.covariance import similarity_motions
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicColumns, IntrinsicUnknowns
+from thesisrecon.optimize.bundle.iterative import EXACT
 from thesisrecon.optimize.bundle.knowledge import BundleKnowledge, KnowledgeTerms, remaining_gauge
 from thesisrecon.optimize.bundle.projection import (
     POSE_DOF,
@@ -25,6 +29,7 @@ from thesisrecon.optimize.bundle.projection import (
     project_metric,
     sort_observations,
 )
+from thesisrecon.optimize.bundle.scatter import median_blocks
 from thesisrecon.optimize.bundle.schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
 from thesisrecon.records import IntrinsicsPrior
@@ -118,7 +123,28 @@ class _MetricProblem:
             J.A[:] = np.where(c.pinned[self.layout.observations.seen.view_index][:, None], 0.0, J.A)
         gradient = np.zeros(self.layout.size)
         gradient[c.place] = self.values.terms.gradient(state.values)
-        return BundleSystem(cost, self.layout, J, (*self.information, gradient))
+        motions = None if self.layout.coarse is None else self._motions(state.model)
+        return BundleSystem(cost, self.layout, J, (*self.information, gradient), motions)
+
+    def _motions(self, model: MetricModel) -> F64:
+        """Motions of the views with their cluster: similarities, and a common change of own intrinsics."""
+        C, poses = self.layout.width, similarity_motions(model.R[self.moves], model.t[self.moves])
+        W = np.zeros((self.layout.views, C, C + 1))
+        W[:, :POSE_DOF, : POSE_DOF + 1] = poses.reshape(-1, POSE_DOF, POSE_DOF + 1)
+        W[:, POSE_DOF:, POSE_DOF + 1 :] = np.eye(C - POSE_DOF)
+        W[self.columns.pinned[self.moves]] = 0.0
+        return W
+
+    def noise(self, system: BundleSystem) -> Iterator[F64]:
+        """Draw right sides (D,) of adjustments to noise, whose covariance is the information."""
+        rng, terms, J = np.random.default_rng(0), self.values.terms, self.jacobians
+        while True:
+            J.residual[:] = rng.normal(size=J.residual.shape)
+            rhs = system.eliminate(0.0)[0].rhs
+            rhs[self.columns.place] += terms.A.T @ (
+                np.sqrt(terms.weight) * rng.normal(size=len(terms.weight))
+            )
+            yield rhs
 
     def retract(self, state: _State, step: BundleStep) -> _State:
         m, layout = state.model, self.layout
@@ -184,7 +210,7 @@ def refine_metric_bundle(
     moves = np.bincount(o.seen.view_index, minlength=len(cameras.R)) > 0
     if fixed is not None:
         moves &= ~fixed
-    problem, values, table = _metric_problem(cameras, o, (moves, np.asarray(free, bool)), prior, options)
+    problem, values, table = _metric_problem(cameras, X, o, (moves, np.asarray(free, bool)), prior, options)
     start = MetricModel(
         np.ascontiguousarray(cameras.R),
         scale * (cameras.t + cameras.R @ origin),
@@ -250,8 +276,8 @@ def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) ->
 
 
 def _metric_problem(
-    cameras: MetricCameras, o: SortedObservations, unknown: tuple[B8, B8], prior: IntrinsicsPrior | None,
-    options: BundleOptions,
+    cameras: MetricCameras, X: F64, o: SortedObservations, unknown: tuple[B8, B8],
+    prior: IntrinsicsPrior | None, options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:  # fmt: skip
     """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
     # `unknown`: the views (V,) that move, and the intrinsics (C,) that do.
@@ -259,9 +285,17 @@ def _metric_problem(
     used = np.bincount(group[moves], minlength=len(cameras.intrinsics)) > 0
     values, start, table = intrinsic_unknowns.number_unknowns(cameras, used, free, prior)
     columns = intrinsic_unknowns.assign_columns(values, group, np.flatnonzero(free), moves)
+
+    def clusters() -> I64:
+        # Of views from near places that see near points.
+        view, centre = o.seen.view_index, -np.einsum("vba,vb->va", cameras.R, cameras.t)
+        sums = [np.bincount(view, x, len(centre)) for x in (np.ones(len(view)), *X[o.seen.point_index].T)]
+        place = np.column_stack([centre, *(x / np.maximum(sums[0], 1.0) for x in sums[1:])])[moves]
+        return median_blocks(place, np.ones(len(place), dtype=bool), most=256, least=8)
+
     layout = build_layout(
         o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
-        threads=options.threads,
+        threads=options.threads, clusters=None if options.point_covariance else clusters,
     )  # fmt: skip
     weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
     Q = values.terms.information().tocoo()
@@ -275,12 +309,18 @@ def _covariances(
 ) -> _Covariances:
     """Return the covariances, lengths in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
-    reduced, sums, _ = problem.linearize(state).reduce(1e-10)
+    system = problem.linearize(state)
+    reduced, sums, _ = system.reduce(1e-10)
     m, seen, layout = state.model, problem.moves, problem.layout
     number = problem.columns.columns_of(problem.values.number)
     own = np.arange(int(seen.sum()))
     row, column = (layout.row, layout.column) if points else (own, own)
-    blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column, problem.gauge)
+    if (solve := None if layout.coarse is None else system.iterative_solver(1e-10, reduced, sums)) is None:
+        blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column, problem.gauge)
+    else:
+        N = covariance.gauge_basis(layout.size, layout.width, m.R[seen], m.t[seen], problem.gauge)
+        exact = partial(solve, forcing=EXACT)
+        blocks = covariance.sampled_blocks(exact, problem.noise(system), N, layout.width, len(own))
     poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
     intrinsics, poses[seen] = covariance.bundle_covariances(
         blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale

@@ -84,12 +84,14 @@ class BlockScatter:
         return float(np.sqrt(max(self.median_ratio, 1.0)))
 
 
-def point_blocks(X: F64, used: B8) -> I64:
-    """Divide points into blocks of neighbours by median splits along the longest axis; -1 if not used."""
+def median_blocks(X: F64, used: B8, *, most: int = 32, least: int = 12) -> I64:
+    """Divide points (N, d) into blocks of neighbours by median splits along the longest axis; -1 if not used.
+
+    At most ``most`` blocks, of ``least`` points or more.
+    """
     block = np.where(used, 0, -1)
     count = 1
-    # At most 32 blocks, each of 12 points or more.
-    while 2 * count <= 32 and np.count_nonzero(used) >= 2 * count * 12:
+    while 2 * count <= most and np.count_nonzero(used) >= 2 * count * least:
         for b in range(count):
             rows = np.flatnonzero(block == b)
             spread = np.subtract(*np.percentile(X[rows], [90, 10], axis=0))
@@ -114,7 +116,7 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     poses = np.arange(0, first, max(first // 30, 1) if first > _ALL_POSES else 1)
     tested = np.concatenate([poses, np.arange(first, S.shape[0])])
     rows = solve(unit_columns(S.shape[0], tested)).T
-    block = point_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
+    block = median_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
     curvature = _loss_correction(fit.residual.reshape(-1, 2), fit.loss_sigmas)
     ratio, large = (curvature * _block_ratio(fit, rows, b) for b in (block, block % _LARGE_BLOCKS))
     alone = curvature * _point_ratio(fit, rows)

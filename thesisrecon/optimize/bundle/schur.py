@@ -2,13 +2,14 @@
 
 [[U, W], [W', V]] (a, b) = (e_a, e_b) with V block-diagonal: (U - W V^-1 W') a = e_a - W V^-1 e_b, then b =
 V^-1 (e_b - W' a) (HZ A6.3). Points are eliminated in chunks, whose sums lose fewer digits than a long sum. A
-banded Cholesky factor is linear in the views if an order keeps neighbours together (streets).
+banded Cholesky factor is linear in the views if an order keeps neighbours together (streets). Others of more
+than ``MANY_VIEWS`` are solved by conjugate gradients.
 """
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TypeVar
 
 import numpy as np
@@ -18,17 +19,19 @@ from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 from thesisrecon.optimize.bundle import elimination
+from thesisrecon.optimize.bundle.iterative import Preconditioner, conjugate_gradients
 from thesisrecon.optimize.bundle.projection import Jacobians, Observations, SortedObservations
 
 CHUNK = 4096
+MANY_VIEWS = 1000  # views above which a system without a band is solved by conjugate gradients
 
 Answer = TypeVar("Answer")
 
 
-def add_diagonal(sums: elimination.ReducedSums, pair: I64, values: F64) -> None:
-    """Add values (D,) to the diagonal of the reduced matrix; ``pair`` (b, b) is the block of two views."""
+def add_diagonal(sums: elimination.ReducedSums, first: I64, values: F64) -> None:
+    """Add values (D,) to the diagonal of the reduced matrix; ``first`` (b,) are the blocks on it."""
     (b, C, e), c = sums.border.shape, np.arange(sums.border.shape[1])
-    sums.blocks[np.diag(pair)[:, None], c, c] += values[: b * C].reshape(b, C)
+    sums.blocks[first[:, None], c, c] += values[: b * C].reshape(b, C)
     sums.corner[np.diag_indices(e)] += values[b * C :]
 
 
@@ -123,7 +126,8 @@ class BundleLayout:
     """Structure of one problem: ``width`` columns for each view's block, then ``border`` common columns.
 
     ``row`` and ``column`` (n,) are the views of each block of the reduced matrix, ``chunks`` ranges of points
-    that do not depend on ``threads``, so that sums are the same for any number.
+    that do not depend on ``threads``, so that sums are the same for any number. With ``coarse``, the layout
+    of clusters of views, the system is solved by conjugate gradients and has only the blocks of single views.
     """
 
     observations: SortedObservations
@@ -136,11 +140,17 @@ class BundleLayout:
     by_view: tuple[elimination.ByView, ...]
     solver: BandedCholesky | None
     threads: int = 1
+    coarse: "BundleLayout | None" = None
+
+    @property
+    def views(self) -> int:
+        """Number of views b, or of clusters, that move."""
+        return len(self.index.row) - 1
 
     @property
     def size(self) -> int:
         """Number of camera unknowns D."""
-        return len(self.index.pair) * self.width + self.border
+        return self.views * self.width + self.border
 
     @cached_property
     def _pool(self) -> ThreadPool:
@@ -171,33 +181,55 @@ class BundleLayout:
 
     def sums(self) -> elimination.ReducedSums:
         """Return a reduced system of zeros."""
-        C, b, e, D = self.width, len(self.index.pair), self.border, self.size
+        C, b, e, D = self.width, self.views, self.border, self.size
         shapes = [(len(self.row), C, C), (b, C, e), (e, e), (D,), (D,), (D,)]
         return elimination.ReducedSums(*(np.zeros(shape) for shape in shapes))
 
 
 def build_layout(
-    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int, threads: int = 1
-) -> BundleLayout:
-    """Find the pairs of views with common points, divide the points into chunks and choose a solver."""
+    observations: SortedObservations, block: I64, *, width: int, common: I64, border: int, threads: int = 1,
+    clusters: Callable[[], I64] | None = None,
+) -> BundleLayout:  # fmt: skip
+    """Find the pairs of views with common points, divide the points into chunks and choose a solver.
+
+    ``clusters`` returns the cluster (b,) of every view; without it, conjugate gradients are not used.
+    """
     seen, start, n = observations.seen, observations.start, int(block.max(initial=-1)) + 1
     moves = block[seen.view_index] >= 0
     places = seen.point_index[moves], block[seen.view_index[moves]]
     points = scipy.sparse.csr_array((np.ones(len(places[0])), places), (len(start) - 1, n))
-    marked = (points.T @ points).toarray() > 0.0
-    row, column = (a.astype(np.int64) for a in np.nonzero(np.triu(marked | np.eye(n, dtype=bool))))
-    pair = np.full((n, n), -1, dtype=np.int64)
-    pair[row, column] = np.arange(len(row))
+    ties = scipy.sparse.triu(points.T @ points + scipy.sparse.eye_array(n), format="csr")
+    ties.sort_indices()
+    column = ties.indices.astype(np.int64)
+    row = np.repeat(np.arange(n), np.diff(ties.indptr))
+    solver = choose_solver(row, column, n, width, border)
+    coarse = None
+    if solver is None and n > MANY_VIEWS and clusters is not None:
+        row = column = np.arange(n)
+        label = clusters()
+        coarse = np.append(label, -1)[block], int(label.max()) + 1
     bytes_each = 8.0 * (len(row) * width**2 + n * width * border + border**2)
     # Every chunk has its own sums: few chunks if these are large.
     most = max(1, min(16, int(128e6 / max(bytes_each, 1.0))))
     count = int(np.clip(len(seen.xy) // CHUNK, 1, most))
     bounds = np.searchsorted(start, np.linspace(0, len(seen.xy), count + 1)[1:-1])
     chunks = tuple(itertools.pairwise([0, *bounds.tolist(), len(start) - 1]))
-    index = elimination.BlockIndex(start, seen.view_index, block, pair, np.ascontiguousarray(common))
-    solver = choose_solver(row, column, n, width, border)
-    by_view = tuple(elimination.sort_by_view(*chunk, index) for chunk in chunks)
-    return BundleLayout(observations, index, width, border, row, column, chunks, by_view, solver, threads)
+
+    def layout(block: I64, row: I64, column: I64, n: int, width: int) -> BundleLayout:
+        first = np.searchsorted(row, np.arange(n + 1))
+        index = elimination.BlockIndex(
+            start, seen.view_index, block, first, column, np.ascontiguousarray(common)
+        )
+        by_view = tuple(elimination.sort_by_view(*chunk, index) for chunk in chunks)
+        return BundleLayout(observations, index, width, border, row, column, chunks, by_view, solver, threads)
+
+    found = layout(block, row, column, n, width)
+    if coarse is None:
+        return found
+    label, m = coarse
+    # The clusters of two views of a point stand in any order: blocks of both triangles.
+    pairs = np.divmod(np.arange(m * m), m)
+    return replace(found, coarse=layout(label, *pairs, m, width + 1))
 
 
 # Rows, columns and values of the information on the camera columns, of which pairs are in the border, and
@@ -216,9 +248,11 @@ class BundleSystem:
     layout: BundleLayout
     jacobians: Jacobians
     prior: CameraPrior | None = None
+    #: (b, width, width + 1) motions of the views with their cluster, if there are any
+    motions: F64 | None = None
 
-    def reduce(self, damping: float) -> tuple[ReducedSystem, elimination.PointSums, F64]:
-        """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
+    def eliminate(self, damping: float) -> tuple[elimination.ReducedSums, elimination.PointSums]:
+        """Return the sums, without prior and damping of the cameras, and those of the points."""
         N, layout = len(self.layout.observations.start) - 1, self.layout
         points = elimination.PointSums(np.zeros((N, 3, 3)), np.zeros((N, 3)), np.zeros((N, 3)))
 
@@ -234,12 +268,17 @@ class BundleSystem:
         for part in others:
             for into, values in zip(total, part, strict=True):
                 into += values
-        pair = layout.index.pair
+        return total, points
+
+    def reduce(self, damping: float) -> tuple[ReducedSystem, elimination.PointSums, F64]:
+        """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
+        (total, points), layout = self.eliminate(damping), self.layout
+        first = layout.index.row[:-1]
         if self.prior is not None:
-            _add_prior(pair, total, self.prior)
+            _add_prior(first, total, self.prior)
         damped = damping * floored_diagonal(total.diagonal)
         # A column without effect does not move: any positive pivot will do.
-        add_diagonal(total, pair, np.where(total.diagonal == 0.0, 1.0, damped))
+        add_diagonal(total, first, np.where(total.diagonal == 0.0, 1.0, damped))
         return ReducedSystem(layout.row, layout.column, total), points, damped
 
     def solve(self, damping: float) -> tuple[BundleStep, float, float] | None:
@@ -250,18 +289,14 @@ class BundleSystem:
         """
         reduced, points, damped = self.reduce(damping)
         solver = self.layout.solver
-        cameras = solve_dense(reduced) if solver is None else solver.solve(reduced)
+        if self.layout.coarse is not None:
+            solve = self.iterative_solver(damping, reduced, points)
+            cameras = None if solve is None else solve(reduced.sums.rhs)
+        else:
+            cameras = solve_dense(reduced) if solver is None else solver.solve(reduced)
         if cameras is None:
             return None
-        moves = np.zeros_like(points.gradient)
-
-        def substitute(n: int) -> None:
-            index = self.layout.index
-            elimination.substitute_points(
-                *self.layout.chunks[n], cameras, self.jacobians, index, points, moves
-            )
-
-        self.layout.map_chunks(substitute)
+        moves, _ = self._multiply(cameras, points, product=False)
         if not np.isfinite(moves).all():
             return None
         stiff = float(damped @ cameras**2) + damping * float(np.vdot(points.diagonal, moves**2))
@@ -269,8 +304,59 @@ class BundleSystem:
         gain = 0.5 * (stiff - slope)
         return (cameras, moves), gain, 0.5 * float(reduced.sums.rhs @ cameras) if len(cameras) else gain
 
+    def _multiply(self, x: F64, points: elimination.PointSums, *, product: bool) -> tuple[F64, F64]:
+        """Return the steps of the points for a step of the cameras, and its ``product`` with S."""
+        layout, moves = self.layout, np.zeros_like(points.gradient)
 
-def _add_prior(pair: I64, total: elimination.ReducedSums, prior: CameraPrior) -> None:
+        def substitute(n: int) -> F64:
+            out = np.zeros(len(x) if product else 0)
+            elimination.substitute_points(
+                *layout.chunks[n], x, self.jacobians, layout.index, points, moves, out
+            )
+            return out
+
+        parts = layout.map_chunks(substitute)
+        return moves, np.sum(parts, axis=0)
+
+    def iterative_solver(
+        self, damping: float, reduced: ReducedSystem, points: elimination.PointSums
+    ) -> Callable[..., F64] | None:
+        """Return the solver of the damped system, a function of rhs and ``forcing``; None if not positive."""
+        layout, coarse, W = self.layout, self.layout.coarse, self.motions
+        assert coarse is not None
+        assert W is not None
+        sums, (b, C, m), n = reduced.sums, W.shape, coarse.views
+        added, edge = np.where(sums.diagonal == 0.0, 1.0, damping * floored_diagonal(sums.diagonal)), b * C
+        i, j, w, _ = self.prior or (np.zeros(0, int), np.zeros(0, int), np.zeros(0), None)
+        known = scipy.sparse.csr_array((w, (i, j)), shape=(len(added),) * 2) + scipy.sparse.diags_array(added)
+        diagonal = known.diagonal()[:edge].reshape(b, C)
+        label = np.empty(b, dtype=np.int64)
+        moves = layout.index.block >= 0
+        label[layout.index.block[moves]] = coarse.index.block[moves]
+        A = self.jacobians.A @ W[layout.index.block[layout.index.view_index]]
+        total, _ = replace(self, layout=coarse, jacobians=self.jacobians._replace(A=A)).eliminate(damping)
+        own = np.zeros((n, m, m))
+        np.add.at(own, label, np.swapaxes(W, 1, 2) @ (diagonal[:, :, None] * W))
+        total.blocks[coarse.row == coarse.column] += own
+        total.blocks[coarse.row == coarse.column] *= 0.5
+        S = ReducedSystem(coarse.row, coarse.column, total).dense()
+        S[: n * m, : n * m] += S[: n * m, : n * m].T.copy()
+        S[n * m :, n * m :] += known[edge:, edge:]
+        try:
+            factor = np.asarray(scipy.linalg.cho_factor(S)[0])
+            inverse = np.asarray(np.linalg.inv(sums.blocks), dtype=np.float64)
+            precondition = Preconditioner(inverse, W, label, factor)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        still = points._replace(gradient=np.zeros_like(points.gradient))
+
+        def multiply(x: F64) -> F64:
+            return np.asarray(self._multiply(x, still, product=True)[1] + known @ x)
+
+        return partial(conjugate_gradients, multiply, precondition)
+
+
+def _add_prior(first: I64, total: elimination.ReducedSums, prior: CameraPrior) -> None:
     """Add the information and gradient of the prior."""
     size, border = len(total.rhs), len(total.corner)
     (i, j, w, gradient), edge = prior, size - border
@@ -278,7 +364,7 @@ def _add_prior(pair: I64, total: elimination.ReducedSums, prior: CameraPrior) ->
     total.gradient[:] += gradient
     weight = np.bincount(i[i == j], w[i == j], minlength=size).astype(np.float64)
     total.diagonal[:] += weight
-    add_diagonal(total, pair, weight)
+    add_diagonal(total, first, weight)
     inside, off = i >= edge, (i != j) & (j >= edge)
     total.corner[i[off & inside] - edge, j[off & inside] - edge] += w[off & inside]
     total.border.reshape(edge, border)[i[off & ~inside], j[off & ~inside] - edge] += w[off & ~inside]
