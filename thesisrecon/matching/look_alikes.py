@@ -2,8 +2,9 @@
 
 Matches of places that look alike agree with one geometry, since nothing else of the images is matched. But
 two images from nearly the same direction show the same everywhere: corners of every textured part of one have
-a similar corner on their epipolar line in the other. If not, more often than on lines beside it, the places
-differ (missing correspondences: Zach, Irschara and Bischof, CVPR 2008).
+a similar corner on their epipolar line in the other, as often as those of the parts where the images were
+matched. If they have one as rarely as on lines beside it, the places differ (missing correspondences: Zach,
+Irschara and Bischof, CVPR 2008).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
@@ -29,12 +30,13 @@ MAX_TURN, NEAREST, MIN_COMMON = np.tan(np.radians(12.0)), 0.1, 40
 to the nearest tenth of the points of either: along a street, close walls change before the far end does."""
 NEIGHBOURS, MOST = 4, 60  # images of most common points that each is compared with; pairs in all
 MIN_SIMILAR, MIN_CONTRAST = 0.8, 8.0  # correlation of a counterpart; standard deviation of textured windows
-GRID, MIN_CORNERS, MIN_SHARE = (6, 5), 15, 0.1
-"""Parts of an image along its sides, textured corners from which one counts, and the share of them that must
-have a counterpart, beyond the share on the lines beside."""
-MAX_DIFFERENT = 0.25
-"""Largest share of the parts without counterparts, of one of both images: at most 0.12 if right, of images
-of equal sides 0.33 and more."""
+GRID, MIN_CORNERS, MIN_COMMON_IN_PART = (6, 5), 15, 4
+"""Parts of an image along its sides, textured corners from which one counts, and common points by which it
+tells how often corners repeat."""
+EVIDENCE = 3.0  # log ratio of likelihoods, 20 to 1, from which a part shows the same or something else
+MAX_DIFFERENT, MIN_DIFFERENT = 0.22, 6
+"""Parts that show something else, of both images of a pair: share and number from which the pair is doubtful.
+Of right models at most 0.11 (0.33 and five parts in a crowd), of equal sides 0.25 to 0.42."""
 MAX_NAMED = 6  # pairs that a sentence names
 
 
@@ -102,7 +104,7 @@ def _different(
     model: Reconstruction, a: int, b: int, views: tuple[PreparedImage, PreparedImage],
     common: tuple[Image, F64, F64],
 ) -> float:  # fmt: skip
-    """Share of the textured parts of image a that have no counterparts in image b."""
+    """Share of the textured parts of image a that show something else in image b."""
     (one, two), (image, xy1, xy2) = views, common
     xy, size, long_side = one.features.xy, np.array(one.size), two.long_side
     # The common points predict where a corner is, to a tenth of the image.
@@ -128,13 +130,24 @@ def _different(
     inside = ((xy > 0.06 * size) & (xy < 0.94 * size)).all(axis=1)
     inside &= ((place > 0.06 * np.array(two.size)) & (place < 0.94 * np.array(two.size))).all(axis=1)
     use = inside & (_contrast(image, xy) > MIN_CONTRAST)
-    part = np.minimum((xy / size * GRID).astype(np.int64), np.array(GRID) - 1) @ [1, GRID[0]]
-    count, here, *beside = (
-        np.bincount(part[use & s], minlength=GRID[0] * GRID[1]) for s in (inside, *similar)
-    )
+
+    def in_parts(xy: F64) -> I64:
+        """Number of places in each part of the image."""
+        part = np.minimum((xy / size * GRID).astype(np.int64), np.array(GRID) - 1) @ [1, GRID[0]]
+        return np.bincount(part, minlength=GRID[0] * GRID[1])
+
+    count, here, *beside = (in_parts(xy[use & s]) for s in (inside, *similar))
     dense = count >= MIN_CORNERS
-    share = (here - np.maximum(*beside))[dense] / count[dense]
-    return float((share < MIN_SHARE).mean()) if len(share) else 0.0
+    matched = dense & (in_parts(xy1) >= MIN_COMMON_IN_PART)
+    # How often corners have a counterpart where the images show the same, and by chance.
+    repeated = np.clip(here[matched].sum() / max(count[matched].sum(), 1), 0.05, 0.95)
+    chance = (np.maximum(*beside).sum() + 1.0) / (count.sum() + 2.0)
+    if matched.sum() < 3 or repeated <= chance:
+        return 0.0
+    hit, missed = np.log(repeated / chance), np.log((1.0 - repeated) / (1.0 - chance))
+    ratio = (here * hit + (count - here) * missed)[dense]
+    different, same = np.count_nonzero(ratio < -EVIDENCE), np.count_nonzero(ratio > EVIDENCE)
+    return different / (different + same) if different >= MIN_DIFFERENT else 0.0
 
 
 def _contrast(image: Image, xy: F64) -> F64:
