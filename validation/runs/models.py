@@ -49,13 +49,13 @@ PARTS = {
 
 class Compared(NamedTuple):
     """A model, its comparison with the reference, the pose errors (degrees) of all pairs of cameras of the
-    reference, and standard deviations of centres by name (units of the reference) if the model states them.
+    reference, and the standard deviations that the model states, by error and camera.
     """
 
     name: str
     found: ModelComparison
     pairs: F64
-    stated: Mapping[str, float]
+    stated: Mapping[str, Mapping[str, float]]
 
 
 def report_models(models: Mapping[str, Path], reference: tuple[str, Path], out: Path) -> Path:
@@ -127,19 +127,28 @@ def _compared(name: str, path: Path, reference: tuple[str, Path]) -> Compared:
     of_a = {view.name: view for view in found.a.views}
     for a, b in zip(found.names, found.names_b, strict=True):
         R[of_b[b]], C[of_b[b]] = of_a[a].R, of_a[a].centre
-    return Compared(name, found, relative_pose_errors(R, C, R_true, C_true), _stated_centres(path, found))
+    return Compared(name, found, relative_pose_errors(R, C, R_true, C_true), _stated(path, found))
 
 
-def _stated_centres(path: Path, found: ModelComparison) -> dict[str, float]:
-    """Standard deviations of centres (RMS over the axes) that a model states, in units of the reference."""
-    scale, stated = 1.0 if found.similarity is None else found.similarity.scale, dict[str, float]()
+def _stated(path: Path, found: ModelComparison) -> dict[str, dict[str, float]]:
+    """Standard deviations that a model states (RMS over the axes) by error and camera: of centres in units of
+    the reference, of rotations in degrees, and relative ones of focal lengths.
+    """
+    scale, stated = 1.0 if found.similarity is None else found.similarity.scale, dict[str, dict[str, float]]()
     file = path / "cameras.json" if path.is_dir() else path
     content = read_json(file) if file.suffix == ".json" else None
     cameras = content.get("cameras") if isinstance(content, dict) else None
     for camera in cameras if isinstance(cameras, list) else ():
-        deviations = [std for part, std in camera.get("std", {}).items() if part.startswith("centre_")]
-        if deviations:
-            stated[str(camera["name"])] = scale * float(np.sqrt(np.mean(np.square(deviations))))
+        focal = camera["K"][0][0] if camera.get("K") else np.nan
+        for error, part, unit in (
+            ("centre_error", "centre_", scale),
+            ("rotation_error_deg", "rotation_", 1.0),
+            ("focal_error_rel", "focal_px", 1.0 / focal),
+        ):
+            deviations = [std for name, std in camera.get("std", {}).items() if name.startswith(part)]
+            if deviations:
+                rms = float(np.sqrt(np.mean(np.square(deviations))))
+                stated.setdefault(error, {})[str(camera["name"])] = unit * rms
     return stated
 
 
@@ -242,15 +251,11 @@ def _plots(compared: Sequence[Compared]) -> list[Plot]:
             x = [order[name] for name in c.found.names_b]
             marker = {"color": colour, "size": 6}
             more: dict[str, Any] = {"text": list(c.found.names), "hoverinfo": "text+y"}
-            if attribute == "centre_error" and c.stated:
-                bars = [1.96 * c.stated.get(name, 0.0) for name in c.found.names]
+            if std := c.stated.get(attribute):
+                bars = [1.96 * factor * std.get(name, 0.0) for name in c.found.names]
                 more["error_y"] = {"type": "data", "array": bars, "color": colour, "thickness": 1}
             traces.append(scatter(c.name, x, [_finite(e) for e in errors], marker=marker, **more))
-        caption = (
-            "Bars: stated 95 % intervals."
-            if attribute == "centre_error" and any(c.stated for c in compared)
-            else ""
-        )
+        caption = "Bars: stated 95 % intervals." if any("error_y" in trace for trace in traces) else ""
         if traces:
             found.append(plot(title, traces, "image", unit, caption, yaxis=zero, **size))
     return found

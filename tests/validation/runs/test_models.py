@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -66,7 +67,8 @@ def write_model(path, R, C, *, f=500.0, scale=1.0, names=None, std=None):
     for i, (turn, centre) in enumerate(zip(R, C, strict=True)):
         entry = {"name": f"{i}.png" if names is None else names[i], "width": 640, "height": 480}
         entry |= {"K": K_own.tolist(), "R": turn.tolist(), "t": (-turn @ (scale * centre)).tolist()}
-        cameras.append(entry if std is None else {**entry, "std": {f"centre_{a}": std for a in "xyz"}})
+        stated = {**{f"centre_{a}": std for a in "xyz"}, "focal_px": 2.0}
+        cameras.append(entry if std is None else {**entry, "std": stated})
     path.write_text(json.dumps({"cameras": cameras}))
     return path
 
@@ -91,7 +93,10 @@ def test_a_report_of_two_models_is_one_command(tmp_path, capsys):
     assert float(numbers["focal error, median"]["good"]) == pytest.approx(0.2)
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "good, bad against truth.json" in page
-    assert "stated 95 % intervals" in page
+    assert page.count("stated 95 % intervals") == 2, "of centres and focal lengths, not of rotations"
+    bars = {round(float(v), 4) for part in re.findall(r'"array": ?\[(.*?)\]', page) for v in part.split(",")}
+    # Centres in units of the reference, whose scale is a quarter; focal lengths in per cent of 501 px.
+    assert bars == {round(1.96 * 0.01 / 4.0, 4), round(100.0 * 1.96 * 2.0 / 501.0, 4)}
 
 
 def test_models_that_cannot_be_compared_are_named(tmp_path, capsys):
