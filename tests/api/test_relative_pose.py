@@ -121,6 +121,30 @@ def test_normalised_coordinates_agree_and_random_matches_are_refused():
     refuses(StageFailure, "6 different", estimate_essential, xy1[:5], xy2[:5], K)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 0.3])
+def test_one_of_the_two_poses_of_a_plane_is_the_true_one_and_other_scenes_have_one(noise):
+    found = []
+    for seed in range(12):
+        _, xy1, xy2, _, _ = _pair(seed, noise=noise)
+        assert not len(estimate_essential(xy1, xy2, K).competing_poses)
+        rng = np.random.default_rng(seed)
+        X = np.c_[rng.uniform(-1.0, 1.0, (80, 2)), np.zeros(80)]
+        R = Rotation.from_euler("xyz", rng.uniform([20, -20, -20], [50, 20, 20], (2, 3)), True).as_matrix()
+        t = np.c_[rng.uniform(-0.3, 0.3, (2, 2)), [5.0, 6.0]]
+        poses = zip(R, t, strict=True)
+        xy1, xy2 = (
+            Camera(K, *pose, (640, 480)).project(X) + noise * rng.normal(size=(80, 2)) for pose in poses
+        )
+        turn = R[1] @ R[0].T
+        move = t[1] - turn @ t[0]
+        fit = estimate_essential(xy1, xy2, K)
+        poses = [(fit.R, fit.t), *((pose[:, :3], pose[:, 3]) for pose in fit.competing_poses)]
+        found.append(len(poses))
+        off = min(_off_deg(*pose, turn, move / np.linalg.norm(move)) for pose in poses)
+        assert off < (5.0 if noise > 0.1 else 1e-3)
+    assert min(found) == 2
+
+
 @pytest.mark.references
 @pytest.mark.parametrize("wrong", [0.0, 0.5])
 def test_poses_are_as_accurate_as_those_of_opencv(wrong):

@@ -438,6 +438,25 @@ def test_noise_inliers_and_covariance_are_those_of_the_errors(given):
     assert 0.7 < np.mean(ratios) < 1.6
 
 
+def test_the_mirrored_pose_of_a_small_plane_is_given_where_noise_explains_it():
+    X = np.array([[x, y, 0.0] for x in np.linspace(-0.1, 0.1, 7) for y in np.linspace(-0.1, 0.1, 7)])
+    named = {3.0: 0, 30.0: 0}
+    for distance in named:
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            R = Rotation.from_euler(
+                "xyz", rng.uniform([20, -20, -20], [50, 20, 20]), degrees=True
+            ).as_matrix()
+            xy = project(compose_camera(GIVEN_K, R, np.array([0.0, 0.0, 0.4 * distance])), X)
+            found = thesisrecon.resect(X, xy + 0.3 * rng.normal(size=xy.shape), GIVEN_K)
+            poses = [found.R, *found.competing_poses[:, :, :3]]
+            off = [np.degrees(Rotation.from_matrix(one @ R.T).magnitude()) for one in poses]
+            assert min(off) < (1.0 if distance == 3.0 else 15.0)
+            named[distance] += len(poses) - 1
+    assert named[3.0] == 0
+    assert named[30.0] >= 6
+
+
 @pytest.mark.parametrize("threshold_px", [1.0, None])
 def test_mirrored_points_equal_pixels_and_points_without_a_pose_have_no_camera(threshold_px):
     X, xy = points(30, np.random.default_rng(0))

@@ -67,7 +67,7 @@ def resect(
     Returns
     -------
     Resection
-        Camera, inliers, noise and covariance.
+        Camera, inliers, noise and covariance; ``competing_poses`` if another pose fits as well.
 
     Raises
     ------

@@ -57,8 +57,9 @@ def estimate_essential(
     Returns
     -------
     EssentialFit
-        E, the pose R and t with most matches in front of both cameras, inliers, noise and covariance. After
-        a rotation without translation t is arbitrary, which its covariance shows.
+        E, the pose R and t with most matches in front of both cameras, inliers, noise and covariance. Points
+        of one plane leave two poses possible: the other one is in ``competing_poses``. After a rotation
+        without translation t is arbitrary, which its covariance shows.
 
     Raises
     ------

@@ -14,6 +14,7 @@ from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry import relative_pose
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.optimize.bundle.projection import move_poses
 from thesisrecon.optimize.least_squares import INLIER_SIGMAS, trimmed_noise_scale
 from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
@@ -29,6 +30,11 @@ _REFITTED = 1000  # matches of a refit
 _HIGH, _DOUBT = 3.0, 0.05
 # Residuals in units of the frame below which they are rounding errors.
 _EXACT = 1e-9
+
+# Another pose is as good up to three standard deviations, sqrt(4 n) each, of the difference of sums of
+# squares, which are other parts of the same noise, if nearly all points are in front. Essential matrices of
+# unit norm this close are the same.
+_AS_GOOD, _IN_FRONT, _SAME = 6.0, 0.95, 0.02
 
 Pose = tuple[F64, F64]
 
@@ -49,6 +55,9 @@ class EssentialFit:
     covariance : ndarray (6, 6)
         Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as
         if all inliers were right; it has no part along t.
+    competing_poses : ndarray (C, 3, 4)
+        [R t] of the other pose that explains the inliers to within their noise, as points of one plane have
+        one (Longuet-Higgins, Proc. R. Soc. B 227, 1986); C = 0 if the pose is determined.
     """
 
     E: F64
@@ -58,6 +67,7 @@ class EssentialFit:
     in_front: B8
     sigma_px: float
     covariance: F64
+    competing_poses: F64
 
 
 @dataclass(frozen=True)
@@ -306,8 +316,28 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = np.asarray((relative_pose.depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(
-        unit_norm(relative_pose.essential_from_pose(R, t)), R, t, inliers, front, sigma / scale, half @ half.T
-    )
+        unit_norm(relative_pose.essential_from_pose(R, t)), R, t, inliers, front, sigma / scale,
+        half @ half.T, _competing_poses(pair, (R, t), rows, max(sigma, _EXACT)),
+    )  # fmt: skip
+
+
+def _competing_poses(pair: _Pair, pose: Pose, rows: I64, sigma: float) -> F64:
+    """Other poses (C, 3, 4), from the plane nearest to the points, whose distances are as small."""
+    x1, x2, found = pair.x1[rows], pair.x2[rows], list[F64]()
+    known = [unit_norm(relative_pose.essential_from_pose(*pose))]
+    limit = pair.squared(known[0][None], rows).sum() + _AS_GOOD * np.sqrt(len(rows)) * sigma**2
+    # Solutions of one plane come in pairs of the same E.
+    H = homography_linear(dehomogenize(x1), dehomogenize(x2))
+    R, t, _ = (each[::2] for each in relative_pose.poses_from_homography(H))
+    for start in zip(R[t.any(axis=1)], t[t.any(axis=1)], strict=True):
+        E = unit_norm(relative_pose.essential_from_pose(*_refined(pair, start, rows)))
+        R, t, depths = relative_pose.pose_in_front(E, x1, x2)
+        same = any(min(np.linalg.norm(E - one), np.linalg.norm(E + one)) < _SAME for one in known)
+        right = (depths > 0.0).all(axis=1).mean() > _IN_FRONT
+        if not same and right and pair.squared(E[None], rows).sum() <= limit:
+            known.append(E)
+            found.append(np.column_stack([R, t]))
+    return np.array(found).reshape(-1, 3, 4)
 
 
 def _require_more_than_chance(xy1: F64, xy2: F64, inliers: B8, threshold_px: float, samples: int) -> None:

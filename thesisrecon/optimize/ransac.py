@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -29,6 +29,9 @@ AT_ONCE = 2**17  # residuals of models computed at once
 WITHOUT = 100_000  # samples without any model after which there is none
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
+_AS_GOOD, _SAME = 9.0, 0.02
+"""Largest difference of two poses' squared residuals, in variances, that noise explains (three standard
+deviations), and of the rotations of one pose."""
 REACHES = 1.0, 3.0
 """Thresholds at which chance is tested: right data whose noise is the threshold lie within three."""
 
@@ -189,6 +192,9 @@ class Resection(Record):
     covariance : ndarray (12, 12) or (6, 6)
         Covariance of the entries of P (row-major, rank 11) or, with a given K, of the pose: rotation vector w
         (rad) and translation d of x -> exp(w) x + d in the camera frame.
+    competing_poses : ndarray (C, 3, 4)
+        With a given K, [R t] of the mirrored pose if it explains the inliers as well, as it does for small or
+        distant planes (Schweighofer and Pinz, PAMI 28(12), 2006); C = 0 if the pose is determined.
     """
 
     P: F64
@@ -198,6 +204,7 @@ class Resection(Record):
     inliers: B8
     sigma_px: float
     covariance: F64
+    competing_poses: F64 = field(default_factory=lambda: np.zeros((0, 3, 4)))
 
 
 def resect_robust(
@@ -245,8 +252,29 @@ def resect_robust(
     if threshold_px is not None:
         _require_more_than_chance(X, xy, fit.P, threshold_px, samples, _SAMPLE if K is None else 3)
     left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
-    sigma = float(np.sqrt(np.sum(distance[fit.inliers] ** 2) / left)) if left > 0 else float("nan")
-    return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance)
+    others = [] if K is None else _mirrored(fit, X, xy)
+    (cost, fit), *others = sorted([(_cost(fit, X, xy), fit), *others], key=lambda one: one[0])
+    sigma = float(np.sqrt(cost / left)) if left > 0 else float("nan")
+    as_good = [one for worse, one in others if worse - cost <= _AS_GOOD * max(sigma, _EXACT_PX) ** 2]
+    poses = np.array([np.column_stack([one.R, one.t]) for one in as_good]).reshape(-1, 3, 4)
+    return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance, competing_poses=poses)
+
+
+def _cost(fit: Resection, X: F64, xy: F64) -> float:
+    """Sum of squared residuals of the inliers in px, infinite if one is behind the camera."""
+    return float(_squared_residuals(fit.P[None], homogenize(X[fit.inliers]), xy[fit.inliers]).sum())
+
+
+def _mirrored(fit: Resection, X: F64, xy: F64) -> list[tuple[float, Resection]]:
+    """The other pose near which a flat object looks the same, with its cost; none if it has only one."""
+    centre, inside = X[fit.inliers].mean(axis=0), X[fit.inliers]
+    normal = np.linalg.eigh((inside - centre).T @ (inside - centre))[1][:, 0]
+    place = fit.R @ centre + fit.t
+    view = place / np.linalg.norm(place)
+    # Reflected along the normal, which does not move a plane, and the line of sight: pixels hardly move.
+    R = (np.eye(3) - 2.0 * np.outer(view, view)) @ fit.R @ (np.eye(3) - 2.0 * np.outer(normal, normal))
+    other = _refine(np.column_stack([R, place - R @ centre]), fit.K, X, xy, fit.inliers)
+    return [] if np.linalg.norm(other.R - fit.R) < _SAME else [(_cost(other, X, xy), other)]
 
 
 def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples: int, size: int) -> None:
