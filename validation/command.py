@@ -100,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--resume", type=Path, help="folder of an earlier run whose references are reused"
         )
-        command.add_argument("--time-limit", type=float, default=300.0, help="limit of one task in seconds")
+        command.add_argument("--time-limit", type=float, default=300.0, help="processor seconds of one task")
         if name == "report":
             text = "report an existing model (of any format that thesisrecon compare reads), and run nothing"
             command.add_argument("--model", action="append", metavar="NAME=PATH", default=[], help=text)

@@ -45,6 +45,8 @@ def run_jobs(
         yield [(running.pop(future), future) for future in done]
 
 
+PATIENCE = 10.0
+"""Time limits in seconds of the clock over those in processor seconds."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1"}
 _PIN = (
     "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 9); "
@@ -79,12 +81,13 @@ def run_process(
     stop: Event | None = None,
     loaded: Path | None = None,
 ) -> Process:
-    """Run ``command`` on these cores and wait; its output goes to the file ``log``. After ``limit_s``, which
-    counts from when the child writes the file ``loaded`` if there is one, or if ``stop`` is set, the child
-    and its children are killed.
+    """Run ``command`` on these cores and wait; its output goes to the file ``log``. The child and its
+    children are killed if ``stop`` is set, or after ``limit_s`` seconds of processor time (a busy machine is
+    no failure), or :data:`PATIENCE` times as long without them; these count from when the child writes the
+    file ``loaded`` if there is one.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    start, timed_out = time.perf_counter(), False
+    start, begun_s, timed_out = time.perf_counter(), 0.0, False
     with log.open("wb") as sink:
         child = subprocess.Popen(
             # The child sets its own affinity, so that its threads inherit it.
@@ -103,9 +106,11 @@ def run_process(
                     pid, status, usage = os.wait4(child.pid, os.WNOHANG)
                     if pid:
                         break
+                    used_s = _processor_s(child.pid)
                     if loaded is not None and not loaded.is_file():
-                        start = time.perf_counter()
-                    late = limit_s is not None and time.perf_counter() - start > limit_s
+                        start, begun_s = time.perf_counter(), used_s
+                    waited_s = (time.perf_counter() - start) / PATIENCE
+                    late = limit_s is not None and max(used_s - begun_s, waited_s) > limit_s
                     if (stop is not None and stop.is_set()) or (late and not timed_out):
                         timed_out = late
                         kill()
@@ -116,6 +121,12 @@ def run_process(
     child.returncode = os.waitstatus_to_exitcode(status)
     wall_s, cpu_s = time.perf_counter() - start, usage.ru_utime + usage.ru_stime
     return Process(child.returncode, wall_s, usage.ru_maxrss / 1024.0, cpu_s, timed_out)
+
+
+def _processor_s(number: int) -> float:
+    """Processor seconds of a running process and of its children that ended."""
+    fields = Path(f"/proc/{number}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def last_line(log: Path) -> str:
@@ -130,7 +141,7 @@ def last_line(log: Path) -> str:
 def failure_of(process: Process, message: str, limit_s: float) -> str:
     """Return the failure of a process, or an empty string; ``message`` is the last line of its log."""
     if process.timed_out:
-        return f"exceeded the time limit of {limit_s:.0f} s"
+        return f"exceeded the time limit of {limit_s:.0f} processor seconds"
     if process.code < 0:
         return f"crashed with signal {-process.code}"
     if process.code:

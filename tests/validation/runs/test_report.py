@@ -18,6 +18,7 @@ from thesisrecon.errors import STRICT_VARIABLE
 from validation.command import main
 from validation.references.libraries import NAMES, PACKAGES, NoReference, load
 from validation.runs.page import write_pages
+from validation.runs.processes import own_cores, run_process
 from validation.runs.records import Judgement, ReportOptions
 from validation.runs.report import run_tasks
 from validation.runs.results import Gate, Results, Row, collect, read_gates, write_results
@@ -25,7 +26,7 @@ from validation.runs.tables import plot
 from validation.scenes.real import ROOT
 from validation.studies.robustness import stopped
 
-LIMIT_S = 8.0
+LIMIT_S = 3.0
 GATES = {
     "toy/yard/wheels-lost": Gate("toy/yard/wheels-lost", 1.0, True, "a toy needs wheels"),
     "toy/yard/never-reported": Gate("toy/yard/never-reported", 1.0, True, "no stage reports this"),
@@ -44,6 +45,14 @@ def ran(tmp_path_factory):
     return options, run_tasks(options, STAGES, reported.append), reported
 
 
+def test_a_busy_machine_is_no_failure_and_waiting_for_nothing_is_one(tmp_path):
+    given = {"cores": own_cores()[:1], "environment": {}, "limit_s": 0.8}
+    for code, late in (("import time; time.sleep(1.5)", False), ("import time; time.sleep(60.0)", True)):
+        process = run_process([sys.executable, "-c", code], log=tmp_path / "log", **given)
+        assert process.timed_out == late
+        assert process.cpu_s < 0.8
+
+
 def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     _, judged, reported = ran
     assert list(judged) == [("toy", "yard")]
@@ -53,8 +62,7 @@ def test_a_reference_that_fails_leaves_a_row_and_nothing_else(ran):
     assert outcomes["missing"].failure == "No module named 'no_such_library'"
     assert outcomes["failing"].failure == "the toy is broken; it has 1 wheel; buy another."
     assert outcomes["crashing"].failure == "crashed with signal 11"
-    assert outcomes["hanging"].failure == "exceeded the time limit of 8 s"
-    assert outcomes["hanging"].wall_s < 3 * LIMIT_S
+    assert outcomes["hanging"].failure == "exceeded the time limit of 3 processor seconds"
     values = judgement.metrics[0].values
     assert (values["ours"], values["good"], values["after"]) == (0.5, 2.0, 8.0)
     assert values["crashing"] is None
@@ -216,7 +224,8 @@ def test_report_and_check_run_without_any(stub, tmp_path):
     command = [sys.executable, "-m", "validation", "check", "--quick", "--scenes", "street"]
     command += ["--stages", "bundle", "-o", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.stderr == ""
+    # Progress, a line in half a minute.
+    assert all(line.startswith("[") for line in done.stderr.splitlines()), done.stderr
     reported = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))
     assert reported["failures"] == {"bundle/street/Ceres": not_installed("pycolmap")}
     promised = [key for key in read_gates() if key.startswith("bundle/street/")]
