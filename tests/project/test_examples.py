@@ -119,3 +119,13 @@ def test_the_comparison_with_colmap_runs_with_and_without_it(run):
     names, text = run(11)
     assert names["found"]["thesisrecon"].centre_error.max() < 2e-3
     assert ("COLMAP" in names["found"]) == (names["pycolmap"] is not None) == ("not installed" not in text)
+
+
+def test_a_lens_is_found_without_a_prior(run):
+    names, printed = run(12)
+    assert "lens: fisheye" in printed
+    camera, truth = names["camera"], names["truth"]
+    off = np.abs(np.subtract(camera.angles_of_view, truth.angles_of_view))
+    assert (off < 3.0 * np.array([camera.std["angle_of_view_deg"], camera.std["corner_deg"]])).all()
+    assert off[0] < 0.3
+    assert np.ptp(names["scale"]) < 0.005 * names["scale"].mean()
