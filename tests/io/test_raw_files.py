@@ -199,3 +199,11 @@ def test_many_files_left_out_for_one_reason_are_counted(tmp_path):
     assert warnings[0].startswith("DSC_0.NEF and 7 more files are left out: each is a raw file: ")
     assert [warning[:20] for warning in warnings[1:]] == ["cut0.jpg is left out", "cut1.jpg is left out"]
     assert len(found.refused) == 10
+
+
+def test_pictures_of_formats_that_are_not_read_are_named(tmp_path):
+    files.picture(0).save(tmp_path / "a.png")
+    files.picture(1).save(tmp_path / "b.tga")
+    (tmp_path / "c.PSD").write_bytes(b"8BPS\0\1")
+    refused = read_images(tmp_path, max_size_px=1600).refused
+    assert dict.fromkeys(["b.tga", "c.PSD"], "is not an image of a known format") == refused

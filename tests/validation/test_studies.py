@@ -321,6 +321,8 @@ def test_an_image_is_left_out(tmp_path):
 
 def test_look_alikes_are_counted_by_their_verdicts(monkeypatch):
     monkeypatch.setattr(look_alikes, "verdict", lambda *scene: look_alikes.VERDICTS[scene[1]])
-    (table,) = look_alikes.look_alikes_study(kinds=["rooms"])
-    assert "| two equal rooms | 2 | 2 | 2 | 0 | 0 |" in table
+    (table,) = look_alikes.look_alikes_study(kinds=["rooms", "flat tower, 3"])
+    assert "| two equal rooms | 2 | 2 | 0 | 0 | 0 |" in re.sub(" +", " ", table)
+    assert "| flat tower, 3 equal sides | 2 | 2 | 2 | 0 | 0 |" in re.sub(" +", " ", table)
     assert len(look_alikes.SCENES) == 60
+    assert {kind for kind, *_ in look_alikes.SCENES} == set(look_alikes.KINDS)

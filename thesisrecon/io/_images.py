@@ -42,10 +42,11 @@ T = TypeVar("T")
 MapAll: TypeAlias = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
 ImageSource: TypeAlias = str | Path | Sequence[str | Path | NDArray[Any] | Image]
 
-# Raw files, and HEIC files without their reader, are listed so that they are refused by name, not overlooked.
+# Raw files, other pictures, and HEIC files without their reader are refused by name, not overlooked.
 SUFFIXES = (
     *(".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".bmp", ".webp", ".gif", ".jp2", ".avif"),
     *(".ppm", ".pgm", ".pbm", ".pnm", ".heic", ".heif", *_pixels.RAW_SUFFIXES),
+    *(".tga", ".psd", ".exr", ".hdr", ".jxl"),
 )
 """Suffixes of files that are listed unseen; others are listed if they begin like an image."""
 _SIGNATURE = re.compile(

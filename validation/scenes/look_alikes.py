@@ -31,8 +31,8 @@ GROUND, SIGN, WOOD, FRONT = range(4)
 """Materials of all scenes; the walls follow."""
 TOWERS = tuple(f"{shape} tower, {n} equal sides" for shape in ("flat", "round") for n in (2, 3, 4, 6))
 KINDS = (*TOWERS, "two equal rooms", "equal houses", "a row of equal windows")
-SCENES = [(kind, detail, seed) for kind in KINDS for detail in range(3) for seed in range(2)][:60]
-"""Kind, detail and seed of the scenes; of the last kind there are no scenes with crates."""
+SCENES = [(kind, d, seed) for kind in KINDS for d in range(3 if kind in TOWERS else 2) for seed in range(2)]
+"""Kind, detail and seed of the 60 scenes; only towers have crates."""
 
 
 class LookAlike(NamedTuple):
