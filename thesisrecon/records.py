@@ -228,24 +228,15 @@ class Reconstruction(Record):
         t, keep = self.tracks, self.inlier
         return np.asarray(common_points(t.view_index[keep], t.point_index[keep], t.n_views).toarray())
 
-    def with_reasons(self, min_points: int) -> "Reconstruction":
-        """Give each unregistered view without a reason the number of reconstructed points that it sees.
 
-        Parameters
-        ----------
-        min_points : int
-            Number of points that were needed to register a view.
-
-        Returns
-        -------
-        Reconstruction
-        """
-        t, reasons = self.tracks, list(self.reasons)
-        seen = np.bincount(t.view_index[self.valid[t.point_index]], minlength=t.n_views)
-        for view in np.flatnonzero(~self.registered):
-            few = Notice("few-common-points", counted(seen[view], "point"), min_points)
-            reasons[view] = reasons[view] or (few if seen[view] else Notice("no-common-points"))
-        return replace(self, reasons=tuple(reasons))
+def with_reasons(found: Reconstruction, min_points: int) -> Reconstruction:
+    """Give each unregistered view without a reason the number of points that it sees, of ``min_points``."""
+    t, reasons = found.tracks, list(found.reasons)
+    seen = np.bincount(t.view_index[found.valid[t.point_index]], minlength=t.n_views)
+    for view in np.flatnonzero(~found.registered):
+        few = Notice("few-common-points", counted(seen[view], "point"), min_points)
+        reasons[view] = reasons[view] or (few if seen[view] else Notice("no-common-points"))
+    return replace(found, reasons=tuple(reasons))
 
 
 INTRINSICS = ("focal", "aspect", "skew", "principal_x", "principal_y", "k1")
@@ -324,23 +315,6 @@ class SelfCalibration(Record):
     candidates: tuple[Upgrade, ...] = ()  #: all candidates, best first
     identifiability: IdentifiabilityReport | None = None  #: the evidence; None: not tested
 
-    @classmethod
-    def of_metric(cls, K: F64, method: str) -> "SelfCalibration":
-        """Return the calibration of cameras that are metric already.
-
-        Parameters
-        ----------
-        K, method : ndarray (V, 3, 3), str
-            Calibration matrices, and where they are from.
-
-        Returns
-        -------
-        SelfCalibration
-            With one candidate, the identity.
-        """
-        only = Upgrade(np.eye(4), K, 0.0, method)
-        return cls(np.eye(4), K, np.full_like(K, np.nan), True, (), (only,))
-
     @property
     def Q(self) -> F64:
         """Absolute dual quadric in the projective frame (4, 4), rank 3, unit norm."""
@@ -352,6 +326,12 @@ class SelfCalibration(Record):
         """Plane at infinity in the projective frame (4,), unit norm."""
         plane = self.metric_from_projective[3]
         return np.asarray(plane / np.linalg.norm(plane), dtype=np.float64)
+
+
+def calibration_of_metric(K: F64, method: str) -> SelfCalibration:
+    """The calibration of cameras that are metric already: one candidate, the identity."""
+    only = Upgrade(np.eye(4), K, 0.0, method)
+    return SelfCalibration(np.eye(4), K, np.full_like(K, np.nan), True, (), (only,))
 
 
 GIVEN = "given"

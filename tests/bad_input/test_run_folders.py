@@ -170,7 +170,7 @@ def test_inspect_lets_nothing_through_to_the_terminal(tmp_path, run_cli):
 
 @pytest.mark.parametrize(
     ("arguments", "code"),
-    [("reconstruct in -o out --until features", 3), ("inspect in", 2), ("render in", 2)],
+    [("reconstruct in -o out --until features", 3), ("inspect in", 2)],
 )
 def test_programs_of_their_own_end_so_too(arguments, code, tmp_path):
     """With an address space of 6 GiB, and another alphabet on the terminal."""

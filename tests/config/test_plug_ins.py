@@ -110,21 +110,12 @@ def test_a_function_estimates_f_and_the_library_adds_noise_and_covariance(by_fun
     refuses(StageFailure, "returned no F", nothing.estimate, pair.xy1, pair.xy2, None)
 
 
-def test_a_function_selects_pairs_by_name_or_number(tmp_path):
-    for n, chosen in enumerate((lambda names: [(0, np.int64(2))], lambda names: [(names[2], names[0])])):
-        config = PipelineConfig(images=SMALL, features=strong, pairs=chosen, matching=mutual)
-        result = reconstruct(images(3), tmp_path / str(n), config=config, until="matches")
-        assert result.pair_choice.pairs.tolist() == [[0, 2]]
-
-
 def called(stage, function):
     """Call a stage of two images with this function."""
     config = PipelineConfig(**{stage: function})
     one, two = photographs(2)
     if stage == "features":
         return config.features.detect(one)
-    if stage == "pairs":
-        return config.pairs.select(["a", "b"], [], map_all=None, rng=None)
     if stage == "epipolar":
         xy = np.random.default_rng(0).uniform(0.0, 99.0, (2, 30, 2))
         return config.epipolar.estimate(*xy, None)
@@ -150,10 +141,6 @@ F = np.diag([1.0, 1.0, 0.0])
         ("matching", (POINT, np.ones((2, 2))), r"xy1 \(N, 2\), xy2 \(N, 2\); got \(1, 2\), \(2, 2\)"),
         ("matching", (POINT, POINT, [np.inf]), "finite numbers"),
         ("matching", (POINT, -POINT), r"xy2 with \(-5, -5\) outside the image"),
-        ("pairs", [(0, 0)], "with itself"),
-        ("pairs", [("a", "c")], "no pair of the 2 images"),
-        ("pairs", [(0, 1, 2)], "no pair of the 2 images"),
-        ("pairs", [], "no pairs"),
         ("epipolar", F, "ndarray"),
         ("epipolar", (F, np.ones(29)), r"inliers of shape \(29,\) for 30 matches"),
         ("epipolar", (np.ones((9, 3)), np.ones(30)), r"F \(3, 3\); got \(9, 3\)"),

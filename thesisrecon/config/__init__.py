@@ -307,7 +307,7 @@ class PipelineConfig:
         How images are read, and prior knowledge of the cameras.
     features, pairs, matching, ... : Detector, PairSelector, Matcher, ...
         The method of each stage: any object with the methods of its ``Protocol``; a ``UsageError`` if it does
-        not fit. ``features``, ``pairs``, ``matching`` and ``epipolar`` also take a plain function
+        not fit. ``features``, ``matching`` and ``epipolar`` also take a plain function
         (:mod:`thesisrecon.config.plug_ins`).
 
     Examples

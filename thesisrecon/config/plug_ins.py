@@ -20,7 +20,7 @@ from thesisrecon.epipolar._matches import PairFrame, check_matches, noise_scale
 from thesisrecon.epipolar.refinement import fundamental_covariance
 from thesisrecon.errors import Notice, StageFailure, UsageError, in_words, unknown_word
 from thesisrecon.geometry.two_view import enforce_rank_two, sampson_residuals
-from thesisrecon.records import Features, FundamentalFit, Image, Matches, PairChoice
+from thesisrecon.records import Features, FundamentalFit, Image, Matches
 
 # ruff: noqa: ARG002 (all methods of a stage have the same arguments)
 
@@ -130,30 +130,6 @@ class FunctionDetector(FunctionAdapter):
 
 
 @dataclass(frozen=True)
-class FunctionPairs(FunctionAdapter):
-    """Image pairs by a function ``f(names) -> pairs`` of file names, or of numbers in the list of names."""
-
-    def select(
-        self, names: Sequence[str], features: Sequence[Features], *, map_all: Any, rng: np.random.Generator
-    ) -> PairChoice:
-        """See `thesisrecon.config.PairSelector.select`."""
-        number: dict[Any, int] = {name: i for i, name in enumerate(names)} | {i: i for i in range(len(names))}
-        chosen = set()
-        for pair in self.function(list(names)):
-            try:
-                i, j = sorted(number[end.item() if isinstance(end, np.generic) else end] for end in pair)
-            except (KeyError, TypeError, ValueError):
-                what = f"{in_words(pair)}, which is no pair of the {len(names)} images"
-                raise _wrong("pairs", self.who, what) from None
-            if i == j:
-                raise _wrong("pairs", self.who, f"{in_words(pair)}, a pair of an image with itself")
-            chosen.add((i, j))
-        if not chosen:
-            raise _wrong("pairs", self.who, "no pairs")
-        return PairChoice(np.array(sorted(chosen), dtype=np.int64), f"pairs by {name_of(self)}")
-
-
-@dataclass(frozen=True)
 class FunctionView:
     """Pixels at working size and features of an image, as prepared for a matching function."""
 
@@ -220,7 +196,6 @@ class FunctionFundamental(FunctionAdapter):
 
 FUNCTIONS: Mapping[str, tuple[type[FunctionAdapter], tuple[str, ...], str]] = {
     "features": (FunctionDetector, ("image",), "xy (N, 2) px, or xy, scale (N,), response (N,)"),
-    "pairs": (FunctionPairs, ("names",), "a list of pairs of names or of numbers from 0"),
     "matching": (FunctionMatcher, ("image1", "image2"), "xy1, xy2 (N, 2) px, or xy1, xy2, score (N,)"),
     "epipolar": (FunctionFundamental, ("xy1", "xy2"), "F (3, 3) and a mask (N,) of inliers"),
 }

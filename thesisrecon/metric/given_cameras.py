@@ -113,7 +113,7 @@ def metric_from_given(
         return result
     start = result.reconstruction
     assert start.K is not None
-    calibration = records.SelfCalibration.of_metric(start.K, records.GIVEN)
+    calibration = records.calibration_of_metric(start.K, records.GIVEN)
     wide = prior if given.of_images else _prior_of_stds(given, prior)
     refined = MetricRefinement().refine(start, calibration, prior=wide, rng=rng, threads=threads)
     return _in_given_frame(given, refined)

@@ -309,6 +309,5 @@ def as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> record
     norms = _model.residual_norms(model)
     sigma = noise_from_distances(norms) if len(norms) else model.sigma_px
     seen = (registered, model.valid, model.inlier, model.tracks, model.sizes)
-    return records.Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion).with_reasons(
-        MIN_POINTS
-    )
+    found = records.Reconstruction("metric", P, X, *seen, sigma, reasons, K, distortion)
+    return records.with_reasons(found, MIN_POINTS)

@@ -23,8 +23,8 @@ from thesisrecon.records import (
     IntrinsicsPrior,
     MetricResult,
     Reconstruction,
-    SelfCalibration,
     Similarity,
+    calibration_of_metric,
 )
 
 MAX_ROLL_DEG = 15.0
@@ -137,7 +137,7 @@ def constrained(
     assert r.K is not None
     spread = upgrade_points(r.X, r.valid, np.eye(4))[2]
     unit = moved(found.result, Similarity.scaling(1.0 / spread)).reconstruction
-    start = SelfCalibration.of_metric(r.K, "positions")
+    start = calibration_of_metric(r.K, "positions")
     # Positions that a domed model contradicts may be right.
     for _ in range(3):
         index = np.flatnonzero(found.used)

@@ -17,7 +17,7 @@ from thesisrecon.optimize.bundle.partial import refine_points, triangulate_point
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.optimize.least_squares import noise_from_distances
-from thesisrecon.records import Reconstruction, Tracks, TwoView
+from thesisrecon.records import Reconstruction, Tracks, TwoView, with_reasons
 
 # Homography inlier ratio beyond which a pair shows no parallax: the rest may be undetected wrong matches.
 NO_PARALLAX = 0.95
@@ -377,7 +377,8 @@ def to_reconstruction(model: ProjectiveModel, min_points: int) -> Reconstruction
     valid = model.valid
     X = np.where(valid[:, None], model.X, 0.0)
     P = np.where(model.registered[:, None, None], model.P, 0.0)
-    return Reconstruction(
+    found = Reconstruction(
         "projective", P, X, model.registered, valid, model.used & valid[model.tracks.point_index],
         model.tracks, model.sizes, model.sigma_px, tuple(model.reasons),
-    ).with_reasons(min_points)  # fmt: skip
+    )  # fmt: skip
+    return with_reasons(found, min_points)

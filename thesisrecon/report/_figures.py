@@ -1,4 +1,4 @@
-"""Figures of the report: plotly.js mappings, data of the model for ``viewer.js``, histograms, drawings.
+"""Figures of the report: plotly.js mappings, data of the model for ``viewer.js``, drawings.
 
 The scene is drawn upright and without outliers. Plain mappings instead of plotly's classes work with every
 version of plotly. Drawings are thumbnails, image pairs, depth maps and the held-out comparison.
@@ -274,28 +274,6 @@ def lens_figure(cameras: Mapping[str, Camera]) -> Figure:
         "yaxis": {**axis, "title": {"text": "angle from the axis (degrees)"}},
     }  # fmt: skip
     return {"data": traces, "layout": layout}
-
-
-def histograms(distances: Sequence[F64], *, width: float, height: float) -> tuple[float, list[str]]:
-    """Upper end of the distances (px, 98 % of them) and their histograms as SVG paths in equal boxes."""
-    everything = np.concatenate([np.zeros(0), *distances])
-    needed = float(np.quantile(everything, 0.98)) if len(everything) else 1.0
-    round_px = (0.1, 0.2, 0.3, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 10.0, 15.0, 20.0, 50.0, 100.0)
-    limit_px = next((limit for limit in round_px if limit >= needed), float(np.ceil(needed)))
-    shares = []
-    for d in distances:
-        counts, _ = np.histogram(np.minimum(d, limit_px), bins=28, range=(0.0, limit_px))
-        shares.append(counts / max(len(d), 1))
-    tallest, step = max((float(s.max()) for s in shares), default=1.0), width / 28
-    bars = [np.minimum(s / max(tallest, 1e-12), 1.0) * height for s in shares]
-    return limit_px, [
-        "".join(
-            f"M{n * step:.1f} {height:.1f}v-{bar:.1f}h{0.86 * step:.2f}v{bar:.1f}z"
-            for n, bar in enumerate(own.tolist())
-            if bar > 0
-        )
-        for own in bars
-    ]
 
 
 def _xyz(points: F64, digits: int) -> Figure:

@@ -132,9 +132,6 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     working = _data.reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
     overall = _data.summarize_distances(np.concatenate([np.zeros(0), *distances]))
-    size = {"width": 200.0, "height": 44.0}
-    drawn = pictures.make("the histograms of the residuals", figures.histograms, distances, **size)
-    limit_px, bars = drawn or (1.0, [""] * len(distances))
     plotted, shown = _figures(data, names, pictures)
     model = None
     held_out = None
@@ -157,7 +154,7 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
         straight = pictures.make("the straight image", figures.draw_straight, *of_first)
     scripts, content = _figure_content(plotted)
     model_scripts = [page_resource("viewer.js")] if model is not None else []
-    cards = _cards(data, distances, bars, pictures)
+    cards = _cards(data, distances, pictures)
     estimated = {"focal_px", "principal_x_px", "principal_y_px", "k1"}.union(
         name for view in data.original_intrinsics for name, found in view.items() if found.std != 0.0
     )
@@ -169,12 +166,11 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
         filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
         text=words, data=data, version=__version__, overall=overall, cards=cards, depths=depths, model=model,
         intrinsic_columns=[(name, heading) for name, heading in _INTRINSICS.items() if name in estimated],
-        limit_px=limit_px, held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), **content,
+        held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), **content,
         difference_limit=round(figures.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
-        shown_points=shown, most_points=figures.MAX_POINTS, limit_known=drawn is not None,
+        shown_points=shown, most_points=figures.MAX_POINTS,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
         warnings=_warnings(data, pictures.warnings), straight=straight, model_scripts=model_scripts,
-        histogram_size=tuple(size.values()),
         summary_text=json.dumps({**data.summary, **long}, indent=2, ensure_ascii=False, default=str),
     )  # fmt: skip
 
@@ -209,9 +205,7 @@ def _figures(data: _data.ReportData, names: Sequence[str], pictures: _Pictures) 
     return {name: figure for name, figure in found.items() if figure is not None}, points
 
 
-def _cards(
-    data: _data.ReportData, distances: list[F64], bars: list[str], pictures: _Pictures
-) -> list[dict[str, Any]]:
+def _cards(data: _data.ReportData, distances: list[F64], pictures: _Pictures) -> list[dict[str, Any]]:
     """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
     cards, intrinsics, count = [], data.original_intrinsics, len(data.images)
     shown = _data.pictured(count)
@@ -225,7 +219,7 @@ def _cards(
             picture = pictures.make("a thumbnail", figures.thumbnail, image, _sharing(count))
         card = {"number": i + 1, "name": image.name, "state": state, "level": level, "reason": reason}
         card |= {"size": f"{width} × {height} px{processed}{masked}", "picture": picture}
-        card |= {"residuals": _data.summarize_distances(distances[i]), "bars": bars[i]}
+        card |= {"residuals": _data.summarize_distances(distances[i])}
         estimated = {name: words.plus_minus(v.value, v.std) for name, v in intrinsics[i].items()}
         cards.append({**card, "intrinsics": estimated})
     return cards
