@@ -5,11 +5,10 @@ order, ``tuple_of("module.Class", ...)`` a named tuple. A kernel that it lacks i
 """
 
 import importlib
+import os
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import wait
 from contextlib import suppress
 from pathlib import Path
 from platform import node
@@ -18,7 +17,7 @@ from typing import Any
 import numba
 from numba import types
 
-from thesisrecon._numba import ThreadPool, cache_folder, copy_to
+from thesisrecon._numba import cache_folder, copy_to
 from thesisrecon.runtime._executors import package_key
 from thesisrecon.runtime._run_folder import key_of
 from thesisrecon.runtime._signals import kill_on_exit, starting_processes
@@ -81,64 +80,46 @@ def precompile(until: str, workers: int, progress: Callable[[str, int, int], Non
 
 
 def _compile_in_processes(lines: Sequence[str], count: int, progress: Callable[[str, int, int], None]) -> int:
-    waiting, taking, finished = iter(lines), threading.Lock(), list[str]()
-
-    def feed(worker: subprocess.Popen[str]) -> None:
-        assert worker.stdin is not None
-        assert worker.stdout is not None
-        with suppress(OSError):
-            while True:
-                with taking:
-                    line = next(waiting, None)
-                if line is None:
-                    break
-                worker.stdin.write(line + "\n")
-                worker.stdin.flush()
-                if not (answer := worker.stdout.readline()):
-                    return
-                if answer == COMPILED:
-                    finished.append(line)
-            worker.stdin.close()
-
-    workers = list[subprocess.Popen[str]]()
-    # An embedded Python has no executable, and processes and threads may be limited. A worker takes a second
-    # to start and 150 MB, a kernel on average less than a second to compile.
+    """Compile lines in processes, which take numbers from one pipe and answer in another; those done."""
+    # A worker takes a second to start and 150 MB, a kernel on average less than a second to compile.
+    count, finished = min(count, -(-len(lines) // 8)), 0
+    workers, (waiting, numbers), (answers, answer) = list[subprocess.Popen[bytes]](), os.pipe(), os.pipe()
+    os.write(numbers, bytes(range(len(lines))))
+    # An embedded Python has no executable, and processes and threads may be limited.
     with suppress(OSError), starting_processes():
-        for _ in range(min(count, -(-len(lines) // 8))):
-            workers.append(_started())
+        workers += (_started(lines, waiting, answer) for _ in range(count))
+    for end in (waiting, numbers, answer):
+        os.close(end)
 
     def kill() -> None:
         for worker in workers:
             worker.kill()
 
-    with kill_on_exit(kill), ThreadPool(len(workers)) as threads:
+    with kill_on_exit(kill), os.fdopen(answers) as answered:
         try:
-            feeding = [threads.submit(feed, worker) for worker in workers]
-            while wait(feeding, 0.1).not_done:
-                progress("kernels", len(finished), len(lines))
-            progress("kernels", len(finished), len(lines))
+            for said in answered:
+                finished += said == COMPILED
+                progress("kernels", finished, len(lines))
         finally:
             kill()
             for worker in workers:
-                with suppress(OSError), worker:  # closes its pipes
-                    pass
-    return len(finished)
+                worker.wait()
+    return finished
 
 
-def _started() -> subprocess.Popen[str]:
+def _started(lines: Sequence[str], waiting: int, answer: int) -> subprocess.Popen[bytes]:
     # multiprocessing would import the script of the user again. In a session of its own the process does not
-    # get the Ctrl-C of the terminal; without its input it ends. -P: no imports from the current folder.
-    pipe, command = subprocess.PIPE, [sys.executable or "python3", "-P", "-c", WORKER]
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=quiet, text=True, start_new_session=True)
+    # get the Ctrl-C of the terminal; without its pipe it ends. -P: no imports from the current folder.
+    command, quiet = [sys.executable or "python3", "-P", "-c", WORKER, *lines], subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=waiting, stdout=answer, stderr=quiet, start_new_session=True)
 
 
 def compile_requested() -> None:
-    """In a worker: compile the kernels that are named on standard input, and answer with one line each."""
-    for line in sys.stdin:
+    """In a worker: compile kernels of its arguments by their numbers, and answer with one line each."""
+    while number := os.read(0, 1):
         answer = "failed\n"
         with suppress(Exception):
-            kernel, arguments = kernel_and_types(line.strip())
+            kernel, arguments = kernel_and_types(sys.argv[1 + number[0]])
             kernel.compile(arguments)
             answer = COMPILED
         print(answer, end="", flush=True)
