@@ -35,6 +35,28 @@ def test_rectified_rows_correspond_and_Q_gives_the_points():
     refuses(ValueError, "two camera centres", rectify_cameras, [rig[0], rig[0]])
 
 
+@pytest.mark.parametrize(("lens", "k"), [
+    ("fisheye", [0.02, -0.01, 0.003, 0.001]), ("brown", [-0.1, 0.02, 0.003, 0.002, 0.001]),
+    ("division", [-0.1]),
+])  # fmt: skip
+def test_every_lens_is_removed_from_points_images_and_pairs(lens, k):
+    X = np.random.default_rng(0).uniform(-1, 1, (50, 3)) + np.array([0.0, 0, 3])
+    poses = np.zeros(3), np.array([-0.5, 0.05, 0.0])
+    rig = [Camera(K, np.eye(3), t, SIZE, np.array(k), lens=lens) for t in poses]
+    for camera, t in zip(rig, poses, strict=True):
+        straight = Camera(K, np.eye(3), t, SIZE).project(X)
+        np.testing.assert_allclose(undistort_points(camera.project(X), camera), straight, atol=1e-6)
+    found = rectify_cameras(rig)
+    rectified = found.rectified_from_original(1, rig[1].project(X))
+    np.testing.assert_allclose(rectified, found.cameras[1].project(X), atol=1e-6)
+    np.testing.assert_allclose(found.original_from_rectified(1, rectified), rig[1].project(X), atol=1e-6)
+    # Levels tell the column.
+    shown = undistort_image(np.tile((np.arange(640) // 3).astype(np.uint8), (480, 1)), rig[0])
+    y, x = np.nonzero(shown.seen[::20, ::20])
+    place = rig[0].project(shown.camera.unproject(20.0 * np.column_stack([x, y]), np.ones(len(x))))
+    assert np.abs(3.0 * shown.image[20 * y, 20 * x, 0] + 1.0 - place[:, 0]).max() < 4.0
+
+
 def test_rectified_images_show_the_same_rows():
     rig = [Camera(K, np.eye(3), t, (640, 480)) for t in (np.zeros(3), np.array([-0.5, 0.1, 0.0]))]
     y, x = np.mgrid[:480, :640]

@@ -28,7 +28,7 @@ class UndistortedImage(NamedTuple):
 def undistort_points(xy: F64, camera: Camera, K: F64 | None = None) -> F64:
     """Remove the lens distortion of pixels.
 
-    The inverse of (x, y) (1 + k1 r^2 + k2 r^4 + ...) for any number of coefficients, by Newton's method.
+    The inverse of the lens, such as (x, y) (1 + k1 r^2 + k2 r^4 + ...), by Newton's method.
 
     Parameters
     ----------
@@ -65,9 +65,8 @@ def undistort_points(xy: F64, camera: Camera, K: F64 | None = None) -> F64:
     if camera.is_pinhole:
         rays = given
     else:
-        assert camera.distortion is not None
-        rays = undistort(given, camera.distortion)
-        back = np.abs(distort(rays, camera.distortion) - given).max(axis=1, initial=0.0)
+        rays = undistort(given, camera.lens_row)
+        back = np.abs(distort(rays, camera.lens_row) - given).max(axis=1, initial=0.0)
         rays = np.where((back <= 1e-6 * (1.0 + np.abs(given).max(axis=1)))[:, None], rays, np.nan)
     return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
 
@@ -109,8 +108,7 @@ def undistort_image(
     K, (pixels,) = _calibration("undistort_image", camera, K), read_pixels(image)
     _require_size("undistort_image", pixels, camera)
     pinhole = Camera(K, camera.R, camera.t, camera.size if size is None else size)
-    distortion = np.zeros(1) if camera.distortion is None else camera.distortion
-    rgb, seen = resampled(pixels, camera.K, distortion, K, pinhole.size)
+    rgb, seen = resampled(pixels, camera.K, camera.lens_row, K, pinhole.size)
     return UndistortedImage(rgb, seen, pinhole)
 
 
@@ -147,10 +145,8 @@ class RectifiedCameras:
     def original_from_rectified(self, side: int, xy: F64) -> F64:
         """Map pixels (N, 2) of a rectified image (side 0 or 1) to the original one, with distortion."""
         xy, camera = map_in_front(np.linalg.inv(self.H[side]), xy), self.given[side]
-        if camera.distortion is None:
-            return xy
         rays = dehomogenize(homogenize(xy) @ np.linalg.inv(camera.K).T)
-        return np.asarray(distort(rays, camera.distortion) @ camera.K[:2, :2].T + camera.K[:2, 2])
+        return np.asarray(distort(rays, camera.lens_row) @ camera.K[:2, :2].T + camera.K[:2, 2])
 
     def images(self, image1: ImageInput, image2: ImageInput) -> tuple[F32, F32]:
         """Resample two images (H, W, 3), NaN outside, for :func:`thesisrecon.match_rectified`."""
