@@ -67,7 +67,7 @@ def test_minimum_and_covariance_are_those_of_the_cost_as_written(loss):
     given["positions"][1] = np.nan
     found = bundle_adjust(
         true, X + 0.02 * rng.normal(size=X.shape), loss=loss, sigma_px=0.5, loss_px=1.5, fixed_cameras=[3],
-        fixed_points=np.arange(18) == 7, max_iterations=400, **given,
+        fixed_points=np.arange(18) == 7, max_iterations=400, joint=True, **given,
     )  # fmt: skip
     given["width"] = 3.0
     free = np.ones(6 * 4 + 2 + 3 * 18, dtype=bool)
@@ -92,6 +92,14 @@ def test_minimum_and_covariance_are_those_of_the_cost_as_written(loss):
         focal = found.cameras[0].std["focal_px"] / found.cameras[0].K[0, 0]
         assert focal**2 == pytest.approx(C[18, 18], rel=1e-4)
         assert not found.pose_covariance[3].any()
+        whole, K = found.joint_covariance, found.cameras[0].K
+        n = (len(whole) - 24) // 4
+        for view in range(4):
+            moves = [*range(18), 24 + n * view, 24 + n * view + 5]
+            units = np.append(np.ones(18), [K[0, 0], 1.0])
+            expected = C[:20, :20] * units * units[:, None]
+            np.testing.assert_allclose(whole[np.ix_(moves, moves)], expected, rtol=1e-3, atol=1e-9)
+        assert not whole[18:24].any()
         assert not found.point_covariance[7].any()
 
 

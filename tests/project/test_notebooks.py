@@ -22,6 +22,9 @@ def package(tmp_path_factory):
     subprocess.run(build, check=True)
     (wheel,) = place.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(place / "installed")
+    compiled = Path("thesisrecon", "__pycache__", "kernels")
+    (place / "installed" / compiled).parent.mkdir()
+    (place / "installed" / compiled).symlink_to(ROOT / compiled)
     return place / "installed"
 
 

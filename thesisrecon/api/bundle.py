@@ -91,6 +91,9 @@ class BundleAdjustment(Record):
     point_covariance: F64  #: (N, 3, 3), infinite for points in fewer than two views
     #: distance of the cameras from the minimum in standard deviations, by the gradient: none is farther
     sigmas_to_minimum: float
+    #: with ``joint``: (6 V + C V, 6 V + C V) of all poses, then all intrinsics, each as above; zero where
+    #: nothing moves; shared intrinsics are repeated
+    joint_covariance: F64 | None = None
 
     @property
     def converged(self) -> bool:
@@ -114,7 +117,7 @@ def bundle_adjust(
     sigma_px: float | None = None, covariances: F64 | None = None, fixed_cameras: Chosen = (),
     fixed_points: Chosen = (), gauge: Literal["inner", "two-cameras"] = "inner",
     positions: F64 | None = None, position_std: float | F64 = 1.0, control_points: F64 | None = None,
-    control_std: float | F64 = 1.0, max_iterations: int = 200,
+    control_std: float | F64 = 1.0, max_iterations: int = 200, joint: bool = False,
 ) -> BundleAdjustment:  # fmt: skip
     """Refine cameras and points together, with their covariances (6.7, HZ 18.1 and A6.3).
 
@@ -165,6 +168,8 @@ def bundle_adjust(
         initial model is first moved to at least three known positions by a similarity.
     max_iterations : int
         Maximum number of linear solves; if they do not suffice, ``converged`` is false.
+    joint : bool
+        Whether to return ``joint_covariance``, that of all poses and intrinsics together.
 
     Returns
     -------
@@ -233,7 +238,8 @@ def bundle_adjust(
     _check(start, X, observed, chosen, bool(prior), known)
     start, X, known = _placed(start, X, known, gauge)
     _check_convention(start, X, observed)
-    fit, scale = _adjusted(start, X, observed, (chosen, expected, known), (sigma_px, loss_px), max_iterations)
+    unknown = chosen, expected, known
+    fit, scale = _adjusted(start, X, observed, unknown, (sigma_px, loss_px), max_iterations, joint)
     _warn_of_implausible(views, fit)
     assert fit.pose_covariance is not None
     assert fit.point_covariance is not None
@@ -245,19 +251,25 @@ def bundle_adjust(
     poses = np.where(unseen[:, None, None], np.diag([np.inf] * POSE_DOF), fit.pose_covariance)
     stds = [dict(zip(STD_NAMES, row, strict=False)) for row in std.tolist()]
     R, t = fit.cameras.R, fit.cameras.t
+    joined = fit.joint_covariance
+    if joined is not None:
+        kept = np.arange(rows.shape[1]) < LENS
+        chosen = np.append(np.ones(POSE_DOF * len(views), dtype=bool), np.tile(kept, len(views)))
+        joined = joined[np.ix_(chosen, chosen)]
     refined = tuple(
         camera_of_row((K[i], R[i], t[i]), view.size, rows[i, 5:], std=stds[i], as_stored=view.as_stored)
         for i, view in enumerate(views)
     )
     return BundleAdjustment(
         refined, fit.X, residual, fit.sigma_px, fit.cost, poses, fit.intrinsics_covariance[:, :LENS, :LENS],
-        fit.point_covariance, fit.sigmas_to_minimum * scale,
+        fit.point_covariance, fit.sigmas_to_minimum * scale, joined,
     )  # fmt: skip
 
 
 def _adjusted(
     start: MetricCameras, X: F64, observed: Observations,
     unknown: tuple[B8, IntrinsicsPrior, BundleKnowledge], noise: tuple[float | None, float | None], most: int,
+    joint: bool,
 ) -> tuple[metric.MetricBundleResult, float]:  # fmt: skip
     """The adjustment, and the weight of its last pass over the noise found."""
     # First passes estimate noise that is not given: the weight of the prior and the width depend on it. For a
@@ -277,7 +289,7 @@ def _adjusted(
             loss_px = np.inf if plain else found
         options = metric.BundleOptions(
             sigma_px=found, loss_px=loss_px, max_iterations=most, settled=1e-6, covariance=last,
-            point_covariance=last,
+            point_covariance=last, joint_covariance=last and joint,
         )  # fmt: skip
         fit = metric.refine_metric_bundle(
             start, X, observed, free=free, prior=prior, options=options, knowledge=None if plain else known

@@ -109,6 +109,26 @@ def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: 
     return intrinsics, poses
 
 
+def joint_covariance(blocks: F64, width: int, number: I64, views: I64, focal: F64, scale: float) -> F64:
+    """Covariance (6 V + G C, 6 V + G C) of all poses, then all intrinsics, of the ``blocks`` of all pairs.
+
+    ``views`` (V,) are the numbers of the poses among the blocks, -1 for those that do not move.
+    """
+    b, e = int(np.sqrt(2 * len(blocks))), blocks.shape[1] - width
+    edge, (i, j) = b * width, np.triu_indices(b)
+    whole = np.empty((edge + e, edge + e))
+    by_view = whole[:edge, :edge].reshape(b, width, b, width)
+    by_view[i, :, j], by_view[j, :, i] = blocks[:, :width, :width], blocks[:, :width, :width].swapaxes(1, 2)
+    whole[:edge, edge:] = blocks[i == j, :width, width:].reshape(edge, e)
+    whole[edge:, :edge], whole[edge:, edge:] = whole[:edge, edge:].T, blocks[0, width:, width:]
+    poses = np.where(views[:, None] < 0, -1, width * views[:, None] + np.arange(POSE_DOF))
+    units = np.where(np.arange(number.shape[1]) == FOCAL, focal[:, None], 1.0)
+    units = np.append(np.tile([1.0, 1.0, 1.0, 1.0 / scale, 1.0 / scale, 1.0 / scale], len(views)), units)
+    index = np.append(poses, number)
+    units[index < 0] = 0.0
+    return np.asarray(whole[index[:, None], index] * units * units[:, None])
+
+
 def point_covariances(blocks: F64, index: BlockIndex, J: Jacobians, inverse: F64) -> F64:
     """Covariance (N, 3, 3) of the points in the gauge of the cameras' ``blocks`` S: V^-1 + V^-1 W' S W V^-1.
 

@@ -39,7 +39,7 @@ MAX_ITERATIONS = 300
 MAX_SIGMAS_TO_MINIMUM = 0.1
 """Distance of the cameras from the minimum, in standard deviations, up to which it counts as reached."""
 
-_Covariances = tuple[F64, F64 | None, F64 | None]
+_Covariances = tuple[F64, F64 | None, F64 | None, F64 | None]
 """Covariances of intrinsics (G, C, C), poses (V, 6, 6) and points (N, 3, 3)."""
 
 
@@ -58,6 +58,7 @@ class BundleOptions:
     settled: float = 0.0
     covariance: bool = False
     point_covariance: bool = False
+    joint_covariance: bool = False
     noise_floor_px: float = 0.0
     threads: int = 1
 
@@ -85,6 +86,7 @@ class MetricBundleResult:
     sigma_px: float
     point_covariance: F64 | None
     sigmas_to_minimum: float
+    joint_covariance: F64 | None = None  #: of all poses, then all intrinsics
 
 
 @dataclass(frozen=True)
@@ -231,15 +233,16 @@ def refine_metric_bundle(
     )
     residual = project_metric(end, o.seen)
     sigma = problem.sigma(state, residual)
-    covariances: _Covariances = (np.zeros((*table.shape, table.shape[1])), None, None)
+    covariances: _Covariances = (np.zeros((*table.shape, table.shape[1])), None, None, None)
     if options.covariance:
         noise = max(sigma or options.sigma_px, options.noise_floor_px)
-        covariances = _covariances(problem, state, noise, scale, points=options.point_covariance)
+        covariances = _covariances(problem, state, noise, scale, options)
     if knowledge is not None and knowledge.fixed_points is not None:
         seen_points &= ~knowledge.fixed_points
     return MetricBundleResult(
         refined, np.where(seen_points[:, None], end.X / scale + origin, X), o.unsort(residual)[:given], cost,
         *covariances[:2], sigma, covariances[2], float(np.sqrt(2.0 * max(found.remaining, 0.0))),
+        covariances[3],
     )  # fmt: skip
 
 
@@ -305,7 +308,7 @@ def _metric_problem(
 
 
 def _covariances(
-    problem: _MetricProblem, state: _State, sigma_px: float, scale: float, *, points: bool
+    problem: _MetricProblem, state: _State, sigma_px: float, scale: float, options: BundleOptions
 ) -> _Covariances:
     """Return the covariances, lengths in the caller's unit."""
     problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
@@ -314,7 +317,7 @@ def _covariances(
     m, seen, layout = state.model, problem.moves, problem.layout
     number = problem.columns.columns_of(problem.values.number)
     own = np.arange(int(seen.sum()))
-    row, column = (layout.row, layout.column) if points else (own, own)
+    row, column = (layout.row, layout.column) if options.point_covariance else (own, own)
     if (solve := None if layout.coarse is None else system.iterative_solver(1e-10, reduced, sums)) is None:
         blocks = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], row, column, problem.gauge)
     else:
@@ -325,10 +328,17 @@ def _covariances(
     intrinsics, poses[seen] = covariance.bundle_covariances(
         blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
     )
-    poses[problem.columns.pinned[:, 0]] = 0.0
-    if not points:
-        return intrinsics, poses, None
+    pinned, joint = problem.columns.pinned[:, 0], None
+    poses[pinned] = 0.0
+    if options.joint_covariance and len(own):
+        pairs = np.triu_indices(len(own))
+        blocks_of_pairs = covariance.camera_blocks(reduced, m.R[seen], m.t[seen], *pairs, problem.gauge)
+        views = np.where(seen & ~pinned, np.cumsum(seen) - 1, -1)
+        sizes = m.intrinsics[:, 0], scale
+        joint = covariance.joint_covariance(blocks_of_pairs, layout.width, number, views, *sizes)
+    if not options.point_covariance:
+        return intrinsics, poses, None, joint
     of_points = covariance.point_covariances(blocks, layout.index, problem.jacobians, sums.inverse)
     if problem.known is not None and problem.known.fixed_points is not None:
         of_points[problem.known.fixed_points] = 0.0
-    return intrinsics, poses, of_points / scale**2
+    return intrinsics, poses, of_points / scale**2, joint
