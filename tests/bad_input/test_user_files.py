@@ -191,8 +191,9 @@ def add_file(rng, path, outside, own):
 
 
 def lost(own):
-    """The files of the user that changed."""
-    return [str(path) for path, what in own.items() if what != of(path)]
+    """The files of the user that changed and are not kept beside their place either."""
+    beside = {path: path.with_name(f"{path.name}.other") for path in own}
+    return [str(path) for path, what in own.items() if what not in (of(path), of(beside[path]))]
 
 
 def of(path):

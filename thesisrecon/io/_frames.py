@@ -7,12 +7,12 @@ contrast do not change it.
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,7 @@ class FrameSource:
                     more = f" and {len(damaged) - 1} more" if len(damaged) > 1 else ""
                     first = f"{FRAMES_FOLDER}/{damaged[0]}{more}"
                     warnings = [f"{first}: missing, damaged or exchanged, and extracted again"]
+                    self._move_aside(outputs, [home / name for name in damaged])
                 if self.video:
                     known = self._write_frames(outputs, threads, progress)
                 else:
@@ -112,6 +113,17 @@ class FrameSource:
         best = [max(range(n, min(n + self.every, len(paths))), key=sharpness.__getitem__) for n in starts]
         return {"names": [paths[n].name for n in best], "total": len(paths), "warnings": []}
 
+    @staticmethod
+    def _move_aside(outputs: OutputFolder, frames: Sequence[Path]) -> None:
+        """Rename files in the place of frames, perhaps of the user, to NAME.other."""
+        there = [frame for frame in frames if os.path.lexists(frame)]
+        for frame in there:
+            if frame.is_symlink() or not frame.is_file():
+                outputs.require_own(frame)
+        for frame in there:
+            others = (frame.with_name(f"{frame.name}.other{n or ''}") for n in count())
+            frame.rename(next(other for other in others if not os.path.lexists(other)))
+
     def _write_frames(self, outputs: OutputFolder, threads: int, progress: Progress) -> dict[str, Any]:
         """Write the best frame of each window of a video, two in memory at a time, and remove older ones."""
         names, warnings, total = list[str](), list[str](), 0
@@ -127,7 +139,6 @@ class FrameSource:
             turn = _UPRIGHT.get(frame.rotation)
             image = frame.to_image()
             names.append(f"{self.path.stem}-{number:06d}.png")
-            outputs.damaged.add(f"{FRAMES_FOLDER}/{names[-1]}")
             upright = image if turn is None else image.transpose(turn)
             write_image(outputs.path / FRAMES_FOLDER / names[-1], np.array(upright))
             progress("frames", total, max(total, stated))

@@ -71,7 +71,6 @@ class OutputFolder:
         self.root = _absolute(path)
         self.digests: dict[str, set[str]] = {}  #: of the files that thesisrecon wrote
         self.written: dict[str, str] = {}  #: those of this command
-        self.damaged: set[str] = set()  #: own files that may be replaced whatever their content is now
         self.kept = False  #: whether the work of a command that fails is kept
         self._created: list[Path] = []
         self._stored: set[Path] = set()
@@ -90,9 +89,7 @@ class OutputFolder:
         """Whether a file may be replaced or removed."""
         if self._link_above(path) is not None or stat.S_ISDIR(os.lstat(path).st_mode):
             return False
-        name = self.name_of(path)
-        damaged = name in self.damaged & self.digests.keys() and stat.S_ISREG(path.lstat().st_mode)
-        return bool(self.overwrite) or damaged or self.has_written(path)
+        return bool(self.overwrite) or self.has_written(path)
 
     def has_written(self, path: Path) -> bool:
         """Whether thesisrecon wrote the content of a file."""
