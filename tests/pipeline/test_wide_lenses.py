@@ -168,6 +168,24 @@ def test_cameras_of_a_room_without_a_prior(lens: str, views: int, given: str) ->
         assert (np.abs(camera.distortion[2:4] - k[2:4]) < 3.5 * np.array(stds)).all()
 
 
+def test_the_angle_of_corners_without_points_contains_that_of_other_lenses() -> None:
+    rng, views, k = np.random.default_rng([5, 810]), 12, np.array([-0.2, 0.04])
+    X = rng.uniform(-1.0, 1.0, (900, 3)) * [2.5, 2.5, 1.5]
+    angles = np.linspace(-1.3, 1.3, views)
+    C = np.column_stack([6.0 * np.cos(angles), 6.0 * np.sin(angles), 1.5 + 0.7 * np.sin(4.0 * angles)])
+    turn = np.column_stack([270.0 - np.degrees(angles), rng.normal(0.0, 8.0, views)])
+    R = Rotation.from_euler("yx", turn, degrees=True).inv().as_matrix()
+    R = R @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    xy = np.stack([image_of_directions((X - c) @ r.T, k) for r, c in zip(R, C, strict=True)]) * 560.0 + CENTRE
+    xy[~((xy > 0) & (xy < np.array(SIZE) - 1.0)).all(axis=2)] = np.nan
+    result = reconstruct_from_tracks(xy + rng.normal(0.0, 0.3, xy.shape), [SIZE] * views)
+    K = np.array([[560.0, 0.0, CENTRE[0]], [0.0, 560.0, CENTRE[1]], [0.0, 0.0, 1.0]])
+    true, camera = Camera(K, np.eye(3), np.zeros(3), SIZE, k), result.cameras[0]
+    assert camera.std is not None
+    stds = [camera.std[name] for name in ("angle_of_view_deg", "corner_deg")]
+    assert (np.abs(np.subtract(camera.angles_of_view, true.angles_of_view)) < 3.0 * np.array(stds)).all()
+
+
 def test_points_in_the_middle_leave_the_corners_uncertain() -> None:
     rng, views = np.random.default_rng(4), 10
     X = rng.uniform(-2.0, 2.0, (1200, 3))

@@ -67,7 +67,8 @@ class MetricAdjustment:
     ``lens_std`` is the prior standard deviation of k2 and k3 about 0 (0 fixes them), ``noise_floor_px`` the
     lower bound of the estimated noise, ``inflation`` a factor on the noise in the weights, for correlated
     residuals. Lenses in tables of twelve columns may be ``decentred``; ``centres`` are known positions
-    of cameras. The result does not depend on ``threads``.
+    of cameras; angles of view change by ``lens_change`` degrees with another lens that predicts as well. The
+    result does not depend on ``threads``.
     """
 
     prior: IntrinsicsPrior
@@ -78,6 +79,7 @@ class MetricAdjustment:
     threads: int = 1
     decentred: bool = False
     centres: PositionPrior = NO_PRIOR
+    lens_change: tuple[float, float] = (0.0, 0.0)
 
     def options(
         self, model: MetricEstimate, *, iterations: int = MAX_ITERATIONS, settled: float = SETTLED
@@ -257,16 +259,20 @@ def predicts_better(
     return bool(gain.mean() > 3.0 * gain.std() / np.sqrt(len(gain)))
 
 
-def best_predictor(models: Sequence[MetricEstimate], adjustment: MetricAdjustment) -> MetricEstimate:
-    """The model that predicts held-out observations best: some of the inliers of any of the models.
+def best_predictors(models: Sequence[MetricEstimate], adjustment: MetricAdjustment) -> list[MetricEstimate]:
+    """The model that predicts held-out observations best, and those worse by three standard errors at most.
 
-    Models that image less of the scene do not choose the observations by which they are judged.
+    The observations are some of the inliers of any of the models: those that image less of the scene do not
+    choose by which they are judged.
     """
     unit = min(models, key=lambda model: model.sigma_px)
     if len(models) == 1:
-        return unit
+        return [unit]
     held = held_out_observations(replace(unit, inlier=np.any([m.inlier for m in models], axis=0)))
-    return min(models, key=lambda m: float(_held_out_cost(m, adjustment, held, unit).sum()))
+    costs = [_held_out_cost(m, adjustment, held, unit) for m in models]
+    best = int(np.argmin([cost.sum() for cost in costs]))
+    worse = [(cost - costs[best]).sum() / (np.linalg.norm(cost - costs[best]) + 1e-300) for cost in costs]
+    return [models[best], *(m for k, m in enumerate(models) if k != best and worse[k] <= 3.0)]
 
 
 def _held_out_costs(

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from thesisrecon.arrays import B8
+from thesisrecon.arrays import B8, F64
+from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
 from thesisrecon.lens import ANGLE, DIVISION, directions_of_image
 from thesisrecon.metric import _model
-from thesisrecon.metric._adjustment import MetricAdjustment, best_predictor, predicts_better
+from thesisrecon.metric._adjustment import MetricAdjustment, best_predictors, predicts_better
 from thesisrecon.metric._model import BASES, FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
 from thesisrecon.optimize.bundle.identifiability import TOLERANCES
 from thesisrecon.optimize.bundle.projection import LENS
@@ -37,7 +38,11 @@ def with_best_lens(
     if given != "auto":
         bends = np.ones_like(bends)
     models = [_settled(with_lens(start, bends, base), adjustment) for base in BASES[given]]
-    best = best_predictor(models, adjustment)
+    best, *equal = best_predictors(models, adjustment)
+    changes = [np.abs(_angles(other) - _angles(best)).max(axis=0) for other in equal]
+    if changes := [change for change in changes if np.isfinite(change).all()]:
+        view, corner = np.max(changes, axis=0).tolist()
+        adjustment = replace(adjustment, lens_change=(view, corner))
     if given not in ("auto", "brown") or (best.cameras.intrinsics[:, LENS] == DIVISION).any():
         return best, adjustment
     free = replace(adjustment, decentred=True)
@@ -45,6 +50,15 @@ def with_best_lens(
     if given == "brown" or predicts_better((best, adjustment), (decentred, free)):
         return decentred, free
     return best, adjustment
+
+
+def _angles(model: MetricEstimate) -> F64:
+    """Angles of view (V, 2) of the registered images."""
+    rows, K = model.cameras.intrinsics[model.cameras.group], model.cameras.K
+    return np.array([
+        angles_of_view(K[v], (int(model.sizes[v, 0]), int(model.sizes[v, 1])), rows[v, K1:])
+        for v in np.flatnonzero(model.registered)
+    ])  # fmt: skip
 
 
 def with_decentring(

@@ -318,12 +318,14 @@ def pose_std(
 
 
 def with_angles_of_view(
-    model: MetricEstimate, poses: PoseUncertainty, scatter: BlockScatter, intervals: Intervals
-) -> tuple[Mapping[str, IntrinsicInterval], ...]:
+    model: MetricEstimate, poses: PoseUncertainty, scatter: BlockScatter, intervals: Intervals,
+    change: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Mapping[str, IntrinsicInterval], ...]:  # fmt: skip
     """The intervals with those of the angle of view along the long side and at the farthest corner.
 
     Scatter, and the step by which the prior moves the intrinsics; errors of the camera model are those by
-    which the stated interval of the focal length exceeds its scatter.
+    which the stated interval of the focal length exceeds its scatter, and the ``change`` of the angles by
+    another lens.
     """
     inflation = _common_inflation(scatter, lack_of_fit(scatter, model.tail))
     covariance = inflation**2 * poses.covariance
@@ -342,6 +344,7 @@ def with_angles_of_view(
             if FOCAL in columns:
                 more = (focal.std / focal.value) ** 2 - covariance[number[FOCAL], number[FOCAL]]
                 variance += slopes[0] ** 2 * max(more, 0.0)
+            variance += np.square(change)
             angles = zip(("angle_of_view_deg", "corner_deg"), value, np.sqrt(variance), strict=True)
             how = "by the intervals of the intrinsics and their correlations"
             found[g, width, height] = {

@@ -139,7 +139,8 @@ def _assess(
         intervals = _uncertainty.widen_by_camera_model(intervals, expected, 1.0)
     report = check_returned(model, adjustment, motion, intervals)
     poses = _uncertainty.pose_std(model, uncertainty, scatter, intervals)
-    intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
+    change = adjustment.lens_change
+    intervals = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals, change)
     model = complete
     checked = self_check(model, calibration.K, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.

@@ -90,8 +90,12 @@ def sampled(pair: Any, solver: Callable[..., Candidates], size: int, trials: int
     scored = [(np.inf, np.nan)]
     for rows in draw_samples(rng, trials, pair.places.shape[1], size):
         k, F = solver(*pair.places[:, rows])
-        lens = [np.array([one, 0.0, DIVISION]) for one in k]
-        scored += [(division._score(*one, pair), one[1][0]) for one in zip(F, lens, strict=True)]
+        near = [
+            (matrix, np.array([one, 0.0, DIVISION]))
+            for one, matrix in zip(k, F, strict=True)
+            if abs(one) < MOST
+        ]
+        scored += [(division._score(matrix, lens, pair), lens[0]) for matrix, lens in near]
     return float(min(scored)[1])
 
 
