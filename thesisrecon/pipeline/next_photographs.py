@@ -30,9 +30,11 @@ def next_photographs(
     view, point = t.view_index[model.used], t.point_index[model.used]
     for v in np.unique(view):
         middle[v] = np.median(X[point[view == v]], axis=0)
-    angles = [_angle_deg(C[[p.i, p.j]] - middle[p.i]) for p in accepted if here[p.i] and here[p.j]]
-    if not angles or here.all():
+    joined = [p for p in accepted if here[p.i] and here[p.j]]
+    if not joined or here.all():
         return
+    angles = [_angle_deg(C[[p.i, p.j]] - middle[p.i]) for p in joined]
+    usual = np.quantile([p.inliers for p in joined], 0.1)
     label = connected_groups(len(here), [(p.i, p.j) for p in accepted if not (here[p.i] or here[p.j])])
     chance = np.median([p.inliers for p in pairs if not p.accepted] or [0])
     parts = sorted(np.unique(label[~here]), key=lambda part: -np.count_nonzero(label == part))
@@ -40,6 +42,9 @@ def next_photographs(
         inside = label == part
         links = [p for p in pairs if (inside[p.i] and here[p.j]) or (here[p.i] and inside[p.j])]
         best = max(links, key=lambda p: p.inliers, default=None)
+        # Matched like images of the model: their reasons tell why they are left out.
+        if best is not None and best.accepted and best.inliers >= usual:
+            continue
         if best is not None and best.inliers > CHANCE * max(chance, 1.0):
             ends, why = (best.i, best.j), f"{best.inliers} of their matches agree, too few to join them"
         else:
