@@ -192,12 +192,13 @@ def _of_call(node):
 def _of_index(node):
     """Other indices and shifted slices, and the columns of U for the rows of V' of an SVD."""
     if isinstance(node.slice, ast.Slice):
-        upper, lower = node.slice.upper, node.slice.lower
+        lower, upper = node.slice.lower, node.slice.upper
         if lower is None and isinstance(upper, ast.Constant):
-            yield (
-                ast.Subscript(node.value, ast.Slice(ast.Constant(1), _expression("A + 1", upper)), node.ctx),
-                "shifted",
-            )
+            shifted = ast.Slice(ast.Constant(1), _expression("A + 1", upper))
+            yield ast.Subscript(node.value, shifted, node.ctx), "shifted"
+        if upper is None and isinstance(lower, ast.UnaryOp):
+            shifted = ast.Slice(_expression("A - 1", lower), ast.Constant(-1))
+            yield ast.Subscript(node.value, shifted, node.ctx), "shifted"
         return
     several = isinstance(node.slice, ast.Tuple)
     parts = node.slice.elts if several else [node.slice]
@@ -209,6 +210,9 @@ def _of_index(node):
         if type(index) is not int:
             continue
         for other in dict.fromkeys((0, index - 1, index + 1, -1)):
+            if k and ast.dump(parts[k - 1]) == ast.dump(part) and other != index:
+                both = [*parts[: k - 1], ast.Constant(other), ast.Constant(other), *parts[k + 1 :]]
+                yield ast.Subscript(node.value, ast.Tuple(both, ast.Load()), node.ctx), "other indices"
             changed = [*parts[:k], ast.Constant(other), *parts[k + 1 :]]
             place = ast.Tuple(changed, ast.Load()) if several else changed[0]
             if other != index:

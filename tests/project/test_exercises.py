@@ -180,6 +180,26 @@ def test_wrong_solutions_are_told_why(grader, tmp_path):
     assert len(missed) <= 4 * len(NAMES) // 10, missed
 
 
+# Mistakes that no table lists.
+UNLISTED = {
+    "homography": ("np.linalg.inv(T2) @ H", "T2.T @ H", "transposed, not inverted"),
+    "triangulation": ("x1 * P1[2] - P1[0]", "x1 * P1[2] + P1[0]", "a sign"),
+    "factorisation": ("Vt[:3]", "Vt[1:4]", "shifted"),
+    "dual_quadric": ("w[..., 1, 1]]", "w[..., 2, 2]]", "other indices"),
+}
+
+
+@pytest.mark.parametrize("name", UNLISTED)
+def test_a_mistake_that_is_not_listed_is_a_changed_expression_of_the_solution(name, grader, tmp_path):
+    line, wrong, words = UNLISTED[name]
+    path = tmp_path / "my.py"
+    assert line in source(name)
+    path.write_text(source(name).replace(line, wrong), "utf-8")
+    passed, lines = grader.grade(name, grader.read(path, name), path)
+    assert not passed
+    assert lines[-1].startswith(f"reason: {words}")
+
+
 HEAD = "import numpy as np\n\n\ndef triangulation(P1, P2, xy1, xy2):\n    "
 
 
