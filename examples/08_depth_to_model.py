@@ -54,4 +54,4 @@ for axis, title in zip(
 ):
     axis.set(title=title, xticks=[], yticks=[])
 print(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles")
-# thesisrecon.write_mesh("model.glb", mesh) saves the model.
+# thesisrecon.write_mesh("model.glb", mesh) saves the model, mesh.show() turns it in a notebook.
