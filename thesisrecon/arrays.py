@@ -106,6 +106,11 @@ def number_or_numbers(caller: str, name: str, value: Any) -> F64:
 _LARGEST = 1e100  # Squares and products of a few such numbers are finite
 
 
+def are_finite(*values: Any) -> bool:
+    """Whether all numbers of a file are finite, and their squares and products, too."""
+    return all(bool((np.abs(one) <= _LARGEST).all()) for one in values)
+
+
 def _real(caller: str, name: str, value: Any, missing: bool) -> F64:
     if isinstance(value, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in value):
         value = np.ma.stack(value) if len({np.shape(one) for one in value}) == 1 else value

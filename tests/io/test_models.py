@@ -225,6 +225,8 @@ def test_a_damaged_text_model_is_refused(tmp_path, file, old, new, words):
         ("1 SIMPLE_RADIAL 128 96 -100 64 48 0", "positive focal lengths"),
         ("1 PINHOLE 128 96 inf 100 64 48", "finite parameters"),
         ("1 PINHOLE 128 96 100 100 nan 48", "finite parameters"),
+        ("1 PINHOLE 128 96 1e300 1e300 64 48", "finite parameters"),
+        ("1 PINHOLE 128 96 1e-300 1e-300 64 48", "finite parameters"),
         ("1 PINHOLE 128 96 100 100 64", "another number of parameters"),
     ],
 )

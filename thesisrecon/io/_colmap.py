@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64, I64, U8, resizing_transform, rows_of_views
+from thesisrecon.arrays import B8, F64, I64, U8, are_finite, resizing_transform, rows_of_views
 from thesisrecon.camera import project_camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.io._files import first_repeated, read_bytes, require_image_name, write_atomically
@@ -86,7 +86,7 @@ def read_colmap_model(folder: Path) -> SparseModel:
     known = {camera.number: camera for camera in cameras}
     view, point, xy = _observations(images, np.array([number for number, *_ in points], np.int64))
     X = np.array([xyz for _, xyz, _ in points], np.float64).reshape(-1, 3)
-    if not (np.isfinite(X).all() and np.isfinite(xy).all()):
+    if not are_finite(X, xy):
         raise UsageError(f"the COLMAP model in {folder} has coordinates that are not finite; export it again")
     colors = np.frombuffer(b"".join(rgb for *_, rgb in points), np.uint8).reshape(-1, 3)
     views = [_view(image, known) for image in images]
@@ -106,7 +106,7 @@ def _camera(number: int, kind: int, size: tuple[int, int], params: Sequence[floa
         raise ValueError(f"camera {number} is of an unknown kind, or has another number of parameters")
     if not 1 <= min(size) <= max(size) <= MAX_SIDE_PX:
         raise ValueError(Notice("camera-sides", *map(in_words, (number, *size)), MAX_SIDE_PX))
-    if not (np.isfinite(params).all() and min(params[: _last_focal(name) + 1]) > 0.0):
+    if not (are_finite(params) and min(params[: _last_focal(name) + 1]) > 1e-100):
         raise ValueError(f"camera {number} needs finite parameters and positive focal lengths")
     return _Camera(number, name, size, np.array(params, np.float64))
 
@@ -117,7 +117,7 @@ def _last_focal(kind: str) -> int:
 
 
 def _image(camera: int, name: str, pose: Sequence[float], xy: F64, point: I64) -> _Image:
-    if not (np.isfinite(pose).all() and 1e-9 < math.hypot(*pose[:4]) < 1e9):
+    if not (are_finite(pose) and 1e-9 < math.hypot(*pose[:4]) < 1e9):
         raise ValueError(f"image {name!r} has no valid pose")
     return _Image(camera, name, np.array(pose, np.float64), xy, point)
 
@@ -340,7 +340,7 @@ def _read_tables(base: sqlite3.Connection, path: Path, size: int) -> Database:
             i = number[image]
             values = _array(f"the keypoints of {in_words(names[i])}", rows, cols, data, "<f4")
             keypoints[i] = values.astype(np.float64) - PIXEL_CENTRE
-            if not np.isfinite(values).all():
+            if not are_finite(values):
                 raise ValueError(f"the keypoints of {in_words(names[i])} are not finite")
     for table in ("two_view_geometries", "matches"):
         found: dict[tuple[int, int], I64] = {}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F64, I64, U8, distinct_corners
+from thesisrecon.arrays import F64, I64, U8, are_finite, distinct_corners
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, as_mesh
@@ -133,14 +133,14 @@ def _checked(
 ) -> TexturedMesh:
     """A mesh with texture coordinates of vertices from 0 to 1, v down; ``ValueError`` if it is invalid."""
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
-    if len(faces) == 0 or not np.isfinite(vertices).all():
+    if len(faces) == 0 or not are_finite(vertices):
         raise ValueError("it holds no surface")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("its faces refer to missing vertices")
     if texture is None:
         return TexturedMesh(vertices, faces, None if colors is None else np.array(colors, dtype=np.uint8))
     corners = (np.asarray(uv, dtype=np.float64) * texture.shape[1::-1] - 0.5)[faces]
-    if not np.isfinite(corners).all():
+    if not are_finite(corners):
         raise ValueError("its texture coordinates are not finite")
     vertices, faces = _merged(vertices, faces)
     return TexturedMesh(vertices, faces, uv=corners, texture=texture)

@@ -18,7 +18,7 @@ import numpy as np
 import PIL.Image
 import scipy
 
-from thesisrecon.arrays import F64, require_calibration
+from thesisrecon.arrays import F64, are_finite, require_calibration
 from thesisrecon.camera import Camera, decompose_camera
 from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.geometry.strata import nearest_rotation
@@ -152,7 +152,7 @@ def _read_trajectory(path: Path) -> list[SparseView]:
 
 def _pose(row: F64) -> tuple[F64, F64]:
     """R (3, 3), world to camera, and centre (3,) of a row of TUM (8,) or KITTI (12,), or ``ValueError``."""
-    if not np.isfinite(row).all():
+    if not are_finite(row):
         raise ValueError("a number is not finite")
     if len(row) == 8:
         if not 1e-9 < math.hypot(*row[4:]) < 1e9:
@@ -201,7 +201,7 @@ def read_positions(path: Path) -> Positions:
         try:
             name, *values = places
             x, y, z = map(float, values)
-            if name in found or not all(map(math.isfinite, (x, y, z))):
+            if name in found or not are_finite((x, y, z)):
                 raise ValueError
             if header.degrees and (abs(x) > 90.0 or abs(y) > 360.0):
                 raise ValueError
@@ -346,7 +346,7 @@ def read_other(path: Path) -> SparseModel | None:
 def checked_pose(R: F64, t: F64) -> tuple[F64, F64]:
     """A finite pose with the rotation nearest to R, which printed digits may leave inexact."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
-    if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
+    if R.shape != (3, 3) or t.shape != (3,) or not are_finite(R, t):
         raise ValueError("a pose needs 3 x 4 finite numbers")
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0.0:
         raise ValueError("a pose is no rotation")
@@ -371,7 +371,7 @@ def _size_of(folder: Path, file: str) -> tuple[int, int] | None:
 
 def _calibration(fx: float, fy: float, cx: float, cy: float) -> F64:
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=np.float64)
-    if not (np.isfinite(K).all() and min(fx, fy) > 0.0):
+    if not (are_finite(K) and min(fx, fy) > 1e-100):
         raise ValueError("a calibration needs positive focal lengths")
     return K
 
