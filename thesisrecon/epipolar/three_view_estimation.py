@@ -21,10 +21,6 @@ NEEDED_EQUATIONS = 26  # seven points, thirteen lines, or a mixture (HZ 16.1)
 # Largest relative standard deviation of T. Planes, rotations and random matches give 0.5 to 1.5 at any noise;
 # scenes with depth and noise of a hundredth of the parallax below 0.1.
 WEAK = 0.4
-# A fit is refused if noise of 1.25 times its own explains six tensors of the linear equations. Points or
-# lines of a plane and rotations leave 6 to 12, parallel lines 13 or more, three walls at most 5, which the
-# constraints of the cameras resolve.
-SAME_NOISE, FAMILY = 1.25, 6
 _SEARCHED = 12  # minimum number of points for the search for wrong ones
 NO_POINTS, NO_SEGMENTS = np.zeros((0, 2)), np.zeros((3, 0, 2, 2))
 _State = tuple[F64, F64]
@@ -82,7 +78,7 @@ def fit_trifocal(
         raise StageFailure.of("undetermined-tensor", "they are in a degenerate configuration") from error
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
     fit = _minimize_reprojection_error(problem, equations)
-    _require_determined(fit, equations, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
+    _require_determined(fit, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
     residuals = np.full((3, len(inliers)), np.nan)
     residuals[:, inliers] = fit.point_residuals_px
     return replace(fit, point_residuals_px=residuals, inliers=inliers)
@@ -222,18 +218,11 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
     )
 
 
-def _require_determined(fit: TrifocalFit, equations: _TensorEquations, xy: F64) -> None:
+def _require_determined(fit: TrifocalFit, xy: F64) -> None:
     """Raise StageFailure if the noise alone decides a fit to points and segment ends xy (3, K, 2)."""
-    family = int(np.sum(equations.noise_levels_px() <= SAME_NOISE * fit.sigma_px))
     across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
     narrowest = float(across.min()) / np.sqrt(xy.shape[1])
     sigma, found = fit.sigma_px, []
-    if family >= FAMILY:
-        found.append(
-            f"{family} independent tensors satisfy the linear equations of the matches to within their noise "
-            f"of {sigma:.2g} px, so that the matches cannot decide between them (matches of a scene with "
-            f"depth, from three positions, leave at most {FAMILY - 1})"
-        )
     if not fit.relative_std <= WEAK:
         found.append(
             f"noise of {sigma:.2g} px changes the tensor by {fit.relative_std:.0%} of its size (at most "
@@ -252,13 +241,11 @@ def _require_determined(fit: TrifocalFit, equations: _TensorEquations, xy: F64) 
 class _TensorEquations:
     """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates.
 
-    ``A`` (27, 27): triangular factor of all equations; ``noise`` (27, 27): that of their derivatives by the
-    pixels, |noise t|^2 is the mean of |A t|^2 for the true t and noise of 1 px; ``transforms`` (3, 3, 3):
-    from pixels to conditioned coordinates.
+    ``A`` (27, 27): triangular factor of all equations; ``transforms`` (3, 3, 3): from pixels to conditioned
+    coordinates.
     """
 
     A: F64
-    noise: F64
     transforms: F64
 
     def solve(self) -> F64:
@@ -267,12 +254,6 @@ class _TensorEquations:
         if not s[25] > 1e-10 * s[0]:
             raise ValueError("the matches leave the tensor free; they need to be in general position")
         return np.asarray(Vt[26].reshape(3, 3, 3))
-
-    def noise_levels_px(self) -> F64:
-        """Noise (27,) that explains each of 27 solutions of the equations (Kanatani's renormalisation)."""
-        values, vectors = np.linalg.eigh(self.noise.T @ self.noise)
-        whitening = vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
-        return np.asarray(np.linalg.svd(self.A @ whitening, compute_uv=False)[::-1])
 
     def solve_with_epipoles(self, e2: F64, e3: F64) -> F64:
         """The unit tensor of cameras with these epipoles (3,) in views 2 and 3 and least |A t| (HZ 16.3)."""
@@ -300,37 +281,11 @@ def _tensor_equations(points: F64, segments: F64) -> _TensorEquations:
     lines = unit_normals(np.cross(y[:, :, 0], y[:, :, 1]))[:, :, None]
     # The lines x = u and y = v (N, 2, 3) through the points.
     axes2, axes3 = np.eye(3)[:2] - x[1:, :, :2, None] * np.eye(3)[2]
-    scales = transforms[:, 0, 0]
-    moves = np.eye(3)[:2], -np.eye(3)[2:], -np.eye(3)[2:]
-    exact = [_products(x[0][:, None], axes2, axes3), _products(y[0], lines[1], lines[2])]
-    noise = [
-        _products(moves[0] * scales[0], axes2, axes3),
-        _products(x[0][:, None], moves[1] * scales[1], axes3, times=2),
-        _products(x[0][:, None], axes2, moves[2] * scales[2], times=2),
-        _products(moves[0] * scales[0], lines[1], lines[2], times=2),
-        _products(y[0], _line_moves(y[1]) * scales[1], lines[2]),
-        _products(y[0], lines[1], _line_moves(y[2]) * scales[2]),
-    ]
-    return _TensorEquations(_triangular(exact), _triangular(noise), transforms)
+    rows = [_products(x[0][:, None], axes2, axes3), _products(y[0], lines[1], lines[2])]
+    A = np.asarray(np.linalg.qr(np.concatenate([*rows, np.zeros((27, 27))]), mode="r"))
+    return _TensorEquations(A, transforms)
 
 
-def _products(x: F64, l2: F64, l3: F64, *, times: int = 1) -> F64:
-    """Rows x^i l2_j l3_k of every choice of one of (n or 1, a, 3), (n or 1, b, 3), (n or 1, c, 3)."""
-    n = max(len(l2), len(l3)) if l2.ndim == 3 and l3.ndim == 3 else len(l2 if l2.ndim == 3 else l3)
-    x, l2, l3 = (np.broadcast_to(a, (n, *a.shape[-2:])) for a in (x, l2, l3))
-    rows = np.einsum("nai,nbj,nck->nabcijk", x, l2, l3).reshape(-1, 27)
-    return np.asarray(np.sqrt(times) * rows)
-
-
-def _triangular(rows: list[F64]) -> F64:
-    """The triangular factor (27, 27) of the stacked rows."""
-    return np.asarray(np.linalg.qr(np.concatenate([*rows, np.zeros((27, 27))]), mode="r"))
-
-
-def _line_moves(ends: F64) -> F64:
-    """Derivatives (M, 2, 3) of the unit-normal lines through ends (M, 2, 3) by a move of each across them."""
-    along = (ends[:, 1] - ends[:, 0])[:, :2]
-    along = along / np.sum(along**2, axis=1, keepdims=True)
-    # Weight of the other end in a point of the line, as a function of the point.
-    share = np.column_stack([along, -np.sum(along * ends[:, 0, :2], axis=1)])
-    return np.stack([np.eye(3)[2] - share, share], axis=1)
+def _products(x: F64, l2: F64, l3: F64) -> F64:
+    """Rows x^i l2_j l3_k of every choice of one of (n, a, 3), (n, b, 3), (n, c, 3)."""
+    return np.asarray(np.einsum("nai,nbj,nck->nabcijk", x, l2, l3).reshape(-1, 27))
