@@ -15,16 +15,16 @@ from thesisrecon.imaging.resampling import gaussian_taps, smooth
 from thesisrecon.records import Features, Image
 
 
-def corner_response(channels: F32, sigma_px: float, trace_weight: float) -> F32:
+def corner_response(gray: F32, sigma_px: float, trace_weight: float) -> F32:
     """Compute the corner response R (H, W) of section 4.2.1, zero where windows leave the image.
 
-    M holds the products of the gradients of ``channels`` (C, H, W), their mean smoothed by a Gaussian;
-    ``trace_weight``: 0 for det M / trace M, else k of det M - k (trace M)^2.
+    M holds the products of the gradients, smoothed by a Gaussian; ``trace_weight``: 0 for det M / trace M,
+    else k of det M - k (trace M)^2.
     """
-    gx, gy = np.zeros((2, *channels.shape), np.float32)
-    gx[:, :, 1:-1] = np.float32(0.5) * (channels[:, :, 2:] - channels[:, :, :-2])
-    gy[:, 1:-1] = np.float32(0.5) * (channels[:, 2:] - channels[:, :-2])
-    moments = [smooth((p * q).mean(axis=0), sigma_px) for p, q in ((gx, gx), (gx, gy), (gy, gy))]
+    gx, gy = np.zeros((2, *gray.shape), np.float32)
+    gx[:, 1:-1] = np.float32(0.5) * (gray[:, 2:] - gray[:, :-2])
+    gy[1:-1] = np.float32(0.5) * (gray[2:] - gray[:-2])
+    moments = [smooth(p * q, sigma_px) for p, q in ((gx, gx), (gx, gy), (gy, gy))]
     response: F32 = _measure(np.stack(moments), trace_weight, len(gaussian_taps(sigma_px)) // 2 + 1)
     return response
 
@@ -154,7 +154,6 @@ class CornerMeasure:
 
     formula: Literal["noble", "harris"] = "noble"  #: det / trace, or det - k trace^2
     integration_sigma_px: float = 1.5  #: Gaussian of M, three sigma to each side; the thesis has sigma 1
-    colour: bool = False  #: mean of M over red, green and blue, else M of the grey values
     subpixel: bool = True  #: fit a quadratic surface to the 3 x 3 pixels of each maximum, else keep the pixel
 
     # k of Harris and Stephens.
@@ -167,27 +166,17 @@ class CornerMeasure:
     def __post_init__(self) -> None:
         require_range(self, integration_sigma_px="(0, inf)")
 
-    def _channels(self, image: Image) -> F32:
-        """(C, H, W) grey values or three colours."""
-        if not self.colour:
-            return image.gray[None]
-        return np.ascontiguousarray(np.moveaxis(image.rgb, 2, 0), dtype=np.float32)
-
-    def _response(self, channels: F32) -> F32:
-        """R (H, W), zero near the border."""
-        channels = np.stack([smooth(channel, self.derivative_sigma_px) for channel in channels])
-        weight = self.harris_k if self.formula == "harris" else 0.0
-        return corner_response(channels, self.integration_sigma_px, weight)
-
-    def _find(self, channels: F32) -> tuple[F64, F32]:
+    def _find(self, gray: F32) -> tuple[F64, F32]:
         """Corners (N, 2) above the noise and their responses (N,), strongest first; none in tiny images."""
-        if min(channels.shape[1:]) < 2 * len(gaussian_taps(self.integration_sigma_px)):
+        if min(gray.shape) < 2 * len(gaussian_taps(self.integration_sigma_px)):
             return np.empty((0, 2)), np.empty(0, np.float32)
-        limit = self.noise_response
+        limit, weight = self.noise_response, 0.0
         if self.formula == "harris":
             # R of an isotropic corner with this det / trace.
-            limit = (2.0 * limit) ** 2 * (1.0 - 4.0 * self.harris_k)
-        xy, value = fit_maxima(self._response(channels), limit, self.subpixel)
+            limit, weight = (2.0 * limit) ** 2 * (1.0 - 4.0 * self.harris_k), self.harris_k
+        smoothed = smooth(gray, self.derivative_sigma_px)
+        response = corner_response(smoothed, self.integration_sigma_px, weight)
+        xy, value = fit_maxima(response, limit, self.subpixel)
         # Equal responses keep the reading order.
         order = np.argsort(-value, kind="stable")
         return xy[order], value[order]
@@ -211,7 +200,7 @@ class HarrisCorners:
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
-        xy, response = self.measure._find(self.measure._channels(image))
+        xy, response = self.measure._find(image.gray)
         if len(xy):
             strong = response >= self.threshold_rel * float(response[0])
             xy, response = xy[strong], response[strong]

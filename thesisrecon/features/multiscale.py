@@ -87,9 +87,8 @@ def simulate_view(gray: F32, tilt: float, direction: float, enlargement: float =
 
 @dataclass(frozen=True)
 class _PyramidLevel:
-    """One image size: ``channels`` (C, h, w), ``gray`` (h, w) and image pixels per pixel in x and y (2,)."""
+    """One image size: ``gray`` (h, w), and image pixels per pixel in x and y (2,)."""
 
-    channels: F32
     gray: F32
     scale: F64
 
@@ -134,7 +133,7 @@ class MultiScaleCorners:
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
         levels = self._pyramid(image)
-        found = [self.measure._find(level.channels) for level in levels]
+        found = [self.measure._find(level.gray) for level in levels]
         parts = []
         for index, count in ((0, self.full_corners), (2, self.half_corners)):
             if index < len(levels):
@@ -153,14 +152,8 @@ class MultiScaleCorners:
         return np.arange(min(count, len(xy)), dtype=np.int64)
 
     def _pyramid(self, image: Image) -> list[_PyramidLevel]:
-        doubled = self._is_small(image)
-        grays, scales = _image_pyramid(image.gray, self.levels, doubled=doubled)
-        colours = [grays]
-        if self.measure.colour:
-            planes = self.measure._channels(image)
-            colours = [_image_pyramid(plane, self.levels, doubled=doubled)[0] for plane in planes]
-        channels = [np.stack(size) for size in zip(*colours, strict=True)]
-        return [_PyramidLevel(*level) for level in zip(channels, grays, scales, strict=True)]
+        sizes = _image_pyramid(image.gray, self.levels, doubled=self._is_small(image))
+        return [_PyramidLevel(*level) for level in zip(*sizes, strict=True)]
 
     def _is_small(self, image: Image) -> bool:
         return max(image.size) < self.upsample_below_px * max(image.scale, 1.0)
@@ -196,8 +189,8 @@ class MultiScaleCorners:
         parts, to_image = [], np.linalg.inv(view.to_view)
         grays, scales = _image_pyramid(view.gray, self.levels, doubled=False)
         for index, (gray, scale) in enumerate(zip(grays, scales, strict=True)):
-            corners, response = self.measure._find(gray[None])
-            xy = (_PyramidLevel(gray[None], gray, scale).to_image(corners) - view.offset) @ to_image.T
+            corners, response = self.measure._find(gray)
+            xy = (_PyramidLevel(gray, scale).to_image(corners) - view.offset) @ to_image.T
             spacing = np.sqrt(np.prod(scale))
             # Half a patch: beyond the border of the image the view repeats border pixels.
             margin = PATCH_SIDE * spacing * np.sqrt(np.linalg.det(to_image))
