@@ -5,17 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
-from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
 from thesisrecon.epipolar._sampling import squared_distances
-from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine_essential
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry import relative_pose
-from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
-from thesisrecon.geometry.small_matrices import solve_damped
+from thesisrecon.geometry.homogeneous import (
+    cross_matrix,
+    dehomogenize,
+    directions_across,
+    homogenize,
+    unit_norm,
+)
 from thesisrecon.geometry.two_view import homography_linear
-from thesisrecon.optimize.bundle.projection import move_poses
 from thesisrecon.optimize.least_squares import INLIER_SIGMAS, trimmed_noise_scale
 from thesisrecon.optimize.ransac import CHANCE, Budget, log10_false_alarms, search_models
 
@@ -35,8 +38,6 @@ _EXACT = 1e-9
 # squares, which are other parts of the same noise, if nearly all points are in front. Essential matrices of
 # unit norm this close are the same.
 _AS_GOOD, _IN_FRONT, _SAME = 6.0, 0.95, 0.02
-
-Pose = tuple[F64, F64]
 
 
 @dataclass(frozen=True)
@@ -95,15 +96,25 @@ class _Pair:
         """Squared Sampson distances (B, M) of some matches."""
         return squared_distances(self.fundamental(E).reshape(-1, 9), self.points[rows].T.copy())
 
-    def pose(self, E: F64, rows: I64) -> Pose:
+    @property
+    def of_essential(self) -> F64:
+        """Matrix (9, 9) from vec(E) to vec(F) in the frame, row by row."""
+        return np.asarray(np.kron(self.inverse2.T, self.inverse1.T))
+
+    def pose(self, E: F64, rows: I64) -> tuple[F64, F64]:
         """R and t of E that place most matches in front of both cameras."""
         return relative_pose.pose_in_front(E, self.x1[rows], self.x2[rows])[:2]
 
+    def tangent(self, R: F64, t: F64) -> F64:
+        """Derivatives (5, 9) of F by w and by d of x -> exp(w) x + D'd, D the directions across t."""
+        # exp(w) turns E as a whole; d changes t alone.
+        of_turn = cross_matrix(np.eye(3)) @ relative_pose.essential_from_pose(R, t)
+        by_pose = np.concatenate([of_turn, cross_matrix(directions_across(t)) @ R])
+        return np.asarray(by_pose.reshape(5, 9) @ self.of_essential.T)
+
     def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
         """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
-        f, D, T = np.empty(9), np.empty((2, 3)), np.empty((5, 9))
-        _tangent(self.inverse1, self.inverse2, R, t, f, D, T)
-        F = f.reshape(3, 3)
+        F, T = self.fundamental(relative_pose.essential_from_pose(R, t)), self.tangent(R, t)
         a, b = homogenize(self.points[:, :2]), homogenize(self.points[:, 2:])
         slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
         J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ T.T / slope[:, None]
@@ -123,8 +134,7 @@ def fit_essential(
     pair, every = _Pair.of(frame, xy1, xy2, K1, K2), np.arange(n)
     # Without a search the noise of all matches is the threshold.
     gate = frame.scale * threshold_px if threshold_px is not None else 1e3
-    E, samples, rows = _search(pair, gate, budget, rng)
-    pose = pair.pose(E, rows)
+    E, samples, _ = _search(pair, gate, budget, rng)
     inliers = np.ones(n, dtype=bool) if threshold_px is None else pair.squared(E[None], every)[0] < gate**2
     if threshold_px is not None:
         _require_more_than_chance(xy1, xy2, inliers, threshold_px, samples)
@@ -135,17 +145,17 @@ def fit_essential(
                 "undetermined-essential",
                 f"{inliers.sum()} of {n} matches agree with the best of {samples} samples",
             )
-        pose = _refined(pair, pose, np.flatnonzero(inliers))
-        distance = np.sqrt(pair.squared(relative_pose.essential_from_pose(*pose)[None], every)[0])
+        E = _refined(pair, E, np.flatnonzero(inliers))
+        distance = np.sqrt(pair.squared(E[None], every)[0])
         if threshold_px is None:
             break
         near = distance[distance < max(2.0 * gate, float(np.median(distance[inliers])))]
         noise = trimmed_noise_scale(near, float(np.median(near)) / 0.6745, parameters=_UNKNOWN)
         limit = max(INLIER_SIGMAS * noise, _EXACT)
-        before, inliers = inliers, _without_apart(pair, pose, distance <= limit, noise, share * limit / gate)
+        before, inliers = inliers, _without_apart(pair, E, distance <= limit, noise, share * limit / gate)
         if np.array_equal(inliers, before):
             break
-    return _finished(pair, pose, inliers, frame.scale)
+    return _finished(pair, E, inliers, frame.scale)
 
 
 def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F64, int, I64]:
@@ -155,16 +165,13 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
     def refit(E: F64, rows: I64) -> F64:
         if len(rows) <= _SAMPLE:
             return E
-        # All poses of E have the same distances.
-        R, t = relative_pose.poses_from_essential(E)
-        pose = R[0], t[0]
+        refined = E
         for wide in _GATES:
-            distance = pair.squared(relative_pose.essential_from_pose(*pose)[None], some)[0]
-            inside = some[distance < (wide * gate) ** 2]
+            inside = some[pair.squared(refined[None], some)[0] < (wide * gate) ** 2]
             if len(inside) <= _SAMPLE:
                 return E
-            pose = _refined(pair, pose, inside, iterations=3)
-        return unit_norm(relative_pose.essential_from_pose(*pose))
+            refined = _refined(pair, refined, inside, iterations=3)
+        return refined
 
     found = search_models(
         lambda samples: relative_pose.essential_five_points(pair.x1[samples], pair.x2[samples]),
@@ -176,122 +183,19 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
     return found
 
 
-def _refined(pair: _Pair, pose: Pose, rows: I64, *, iterations: int = 50) -> Pose:
-    """R and t of least squared Sampson distances of some matches, over the five freedoms of a pose."""
-    R, t = pose[0][None].copy(), pose[1][None] / np.linalg.norm(pose[1])
-    _refine_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, iterations)
-    return R[0], t[0]
+def _refined(pair: _Pair, E: F64, rows: I64, *, iterations: int = 50) -> F64:
+    """E of least squared Sampson distances of some matches."""
+    e = E.ravel() / np.linalg.norm(E)
+    refine_essential(e, pair.of_essential, pair.points[rows], iterations)
+    return e.reshape(3, 3)
 
 
-@kernel
-def _refine_pose(points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, most: int) -> None:
-    """Move R (1, 3, 3) and unit t (1, 3) to least squared Sampson distances by Levenberg and Marquardt."""
-    H, g, D, step = empty((5, 5)), empty(5), empty((2, 3)), empty(5)
-    H_new, g_new, D_new = empty((5, 5)), empty(5), empty((2, 3))
-    R_new, t_new, move = empty((1, 3, 3)), empty((1, 3)), empty((1, 6))
-    cost, damping = _linearize_pose(points, inverse1, inverse2, R[0], t[0], D, H, g), 1e-4
-    for _ in range(most):
-        before, gain = cost, 0.0
-        while damping < 1e10:
-            if solve_damped(H, g, damping, step):
-                gain = 0.0
-                for a in range(5):
-                    gain -= step[a] * g[a]
-                    for b in range(5):
-                        gain -= 0.5 * step[a] * H[a, b] * step[b]
-                for i in range(3):
-                    move[0, i], move[0, 3 + i] = step[i], step[3] * D[0, i] + step[4] * D[1, i]
-                move_poses(R, t, move, R_new, t_new)
-                t_new /= np.sqrt(t_new[0, 0] ** 2 + t_new[0, 1] ** 2 + t_new[0, 2] ** 2)
-                cost = _linearize_pose(points, inverse1, inverse2, R_new[0], t_new[0], D_new, H_new, g_new)
-                if cost < before or gain <= 1e-12 * before:
-                    break
-            damping *= 10.0
-        if not cost < before:
-            return
-        R[:], t[:], D[:], H[:], g[:] = R_new, t_new, D_new, H_new, g_new
-        # The gain of a damped step says nothing about the minimum.
-        if damping <= 1e-3 and gain <= 1e-10 * before:
-            return
-        damping = max(0.1 * damping, 1e-9)
-
-
-@kernel(forceinline=True)
-def _linearize_pose(
-    points: F64, inverse1: F64, inverse2: F64, R: F64, t: F64, D: F64, H: F64, g: F64
-) -> float:
-    """Fill D as :func:`_tangent` does, and the normal equations over x -> exp(w) x + D'd; the cost."""
-    f, T, G, h = empty(9), empty((5, 9)), empty((9, 9)), empty(9)
-    _tangent(inverse1, inverse2, R, t, f, D, T)
-    cost: float = normal_equations(f, points, SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
-    for a in range(5):
-        g[a] = 0.0
-        for i in range(9):
-            g[a] += T[a, i] * h[i]
-        for b in range(5):
-            H[a, b] = 0.0
-            for i in range(9):
-                for j in range(9):
-                    H[a, b] += T[a, i] * G[i, j] * T[b, j]
-    return cost
-
-
-@kernel(forceinline=True)
-def _tangent(inverse1: F64, inverse2: F64, R: F64, t: F64, f: F64, D: F64, T: F64) -> None:
-    """Fill F (9,) of a pose, two directions D (2, 3) across t, and the derivatives T (5, 9) of F."""
-    E, axis, change = empty((3, 3)), empty(3), empty((3, 3))
-    _directions_across(t, D)
-    _cross_times(t, R, E)
-    _in_frame(E, inverse1, inverse2, f)
-    for a in range(5):
-        for i in range(3):
-            axis[i] = D[a - 3, i] if a >= 3 else 1.0 if i == a else 0.0
-        # exp(w) turns E as a whole; d changes t alone.
-        _cross_times(axis, E if a < 3 else R, change)
-        _in_frame(change, inverse1, inverse2, T[a])
-
-
-@kernel
-def _directions_across(t: F64, D: F64) -> None:
-    """Fill D (2, 3) with unit vectors across the unit vector t and across each other."""
-    least = 0
-    for i in range(1, 3):
-        if abs(t[i]) < abs(t[least]):
-            least = i
-    for i in range(3):
-        D[0, i] = (1.0 if i == least else 0.0) - t[least] * t[i]
-    D[0] /= np.sqrt(D[0, 0] ** 2 + D[0, 1] ** 2 + D[0, 2] ** 2)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        D[1, i] = t[j] * D[0, k] - t[k] * D[0, j]
-
-
-@kernel
-def _cross_times(v: F64, M: F64, out: F64) -> None:
-    """Fill ``out`` with [v]x M."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for c in range(3):
-            out[i, c] = v[j] * M[k, c] - v[k] * M[j, c]
-
-
-@kernel
-def _in_frame(E: F64, inverse1: F64, inverse2: F64, f: F64) -> None:
-    """Fill f (9,) with inverse2' E inverse1, row by row."""
-    for i in range(3):
-        for j in range(3):
-            f[3 * i + j] = 0.0
-            for a in range(3):
-                for b in range(3):
-                    f[3 * i + j] += inverse2[a, i] * E[a, b] * inverse1[b, j]
-
-
-def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: float) -> B8:
+def _without_apart(pair: _Pair, E: F64, inliers: B8, noise: float, share: float) -> B8:
     """Inliers without those behind a camera, and without those of high leverage if chance explains these."""
     # A wrong match near its epipolar line, as a `share` of them is, has any parallax. It stands apart from
     # the right ones, and pulls the fit to itself (high leverage: Hoaglin and Welsch, The American
     # Statistician 32, 1978). Where the parallax is within the noise, depths have any sign.
-    R, t = pair.pose(relative_pose.essential_from_pose(*pose), np.flatnonzero(inliers))
+    R, t = pair.pose(E, np.flatnonzero(inliers))
     with np.errstate(divide="ignore", invalid="ignore"):
         parallax = np.linalg.norm(dehomogenize(pair.x1 @ R.T) - pair.x2[:, :2], axis=1) / pair.inverse2[0, 0]
     front = (relative_pose.depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1)
@@ -303,16 +207,17 @@ def _without_apart(pair: _Pair, pose: Pose, inliers: B8, noise: float, share: fl
     return inliers & ~high if wrong > _DOUBT * high.sum() else inliers
 
 
-def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFit:
+def _finished(pair: _Pair, E: F64, inliers: B8, scale: float) -> EssentialFit:
     """The fit with noise, covariance and the matches in front of both cameras."""
     rows = np.flatnonzero(inliers)
-    R, t = pair.pose(relative_pose.essential_from_pose(*pose), rows)
-    D, H, g = np.empty((2, 3)), np.empty((5, 5)), np.empty(5)
-    cost = _linearize_pose(pair.points[rows], pair.inverse1, pair.inverse2, R, t, D, H, g)
+    R, t = pair.pose(E, rows)
+    G, h, T = np.empty((9, 9)), np.empty(9), pair.tangent(R, t)
+    f = pair.fundamental(relative_pose.essential_from_pose(R, t)).ravel()
+    cost = normal_equations(f, pair.points[rows], SAMPSON, UNBOUNDED, UNBOUNDED, G, h)
     sigma = float(np.sqrt(2.0 * cost / max(len(rows) - _UNKNOWN, 1)))
-    values, vectors = np.linalg.eigh(H)
+    values, vectors = np.linalg.eigh(T @ G @ T.T)
     half = np.zeros((6, 5))
-    half[:3, :3], half[3:, 3:] = np.eye(3), D.T
+    half[:3, :3], half[3:, 3:] = np.eye(3), directions_across(t).T
     half = half @ vectors * (sigma / np.sqrt(np.maximum(values, 1e-14 * values[-1])))
     front = np.asarray((relative_pose.depths_of_matches(R, t, pair.x1, pair.x2) > 0.0).all(axis=1))
     return EssentialFit(
@@ -321,7 +226,7 @@ def _finished(pair: _Pair, pose: Pose, inliers: B8, scale: float) -> EssentialFi
     )  # fmt: skip
 
 
-def _competing_poses(pair: _Pair, pose: Pose, rows: I64, sigma: float) -> F64:
+def _competing_poses(pair: _Pair, pose: tuple[F64, F64], rows: I64, sigma: float) -> F64:
     """Other poses (C, 3, 4), from the plane nearest to the points, whose distances are as small."""
     x1, x2, found = pair.x1[rows], pair.x2[rows], list[F64]()
     known = [unit_norm(relative_pose.essential_from_pose(*pose))]
@@ -330,7 +235,7 @@ def _competing_poses(pair: _Pair, pose: Pose, rows: I64, sigma: float) -> F64:
     H = homography_linear(dehomogenize(x1), dehomogenize(x2))
     R, t, _ = (each[::2] for each in relative_pose.poses_from_homography(H))
     for start in zip(R[t.any(axis=1)], t[t.any(axis=1)], strict=True):
-        E = unit_norm(relative_pose.essential_from_pose(*_refined(pair, start, rows)))
+        E = _refined(pair, relative_pose.essential_from_pose(*start), rows)
         R, t, depths = relative_pose.pose_in_front(E, x1, x2)
         same = any(min(np.linalg.norm(E - one), np.linalg.norm(E + one)) < _SAME for one in known)
         right = (depths > 0.0).all(axis=1).mean() > _IN_FRONT
