@@ -225,23 +225,6 @@ def test_crossings_are_those_of_all_pairs():
     assert 0 < plain.sum() < plain.size
 
 
-def test_guesses_become_medians_of_pixels_of_their_colour():
-    rng, shape, x = np.random.default_rng(6), (20, 31), np.arange(31)
-    d = (np.where(x < 15, 4.0, 12.0) + rng.uniform(0, 0.3, shape)).astype(np.float32)
-    d[rng.random(shape) < 0.1] = np.nan
-    sure = rng.choice([0.0, 0.7], shape).astype(np.float32)
-    levels = np.where(x < 18, 60.0, 200.0)[None, :, None] + rng.uniform(0, 40, (*shape, 3))
-    levels, out = levels.astype(np.float32), np.empty_like(d)
-    for rows in ((0, 9), (9, 20)):
-        kernels.filter_extrapolated_by_colour(levels, d, sure, rows, (30.0, 0.5), out)
-    known = (sure > 0.0) | np.isnan(d)
-    np.testing.assert_array_equal(out[known], d[known])
-    # Guesses are depths that occur; between 15 and 18 the colours are those of the left surface.
-    assert np.isin(out[~known], d).all()
-    assert np.median(out[:, 15:18][~known[:, 15:18]]) < 5.0
-    assert (out[:, 21:][~known[:, 21:]] > 11.0).all()
-
-
 def test_two_pictures_become_one_by_the_rules():
     rng = np.random.default_rng(5)
     shape, s = (12, 15), 0.3

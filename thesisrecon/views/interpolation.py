@@ -5,60 +5,20 @@ from functools import cached_property
 
 import numpy as np
 
-from thesisrecon._numba import empty, kernel
 from thesisrecon.arrays import B8, F32, F64, U8, Record
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, map_in_front
 from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.imaging.raster import run_in_strips
-from thesisrecon.imaging.resampling import bilinear_samples, weighted_median
+from thesisrecon.imaging.resampling import bilinear_samples
 from thesisrecon.records import DisparityMap
 from thesisrecon.views._warping import fill_holes, forward_map, sample
 
 ONE_SURFACE_PX = 1.0  #: neighbouring disparities that differ by more belong to different surfaces
-REACH, STEP = 12, 3  #: radius and step of the search for the disparity of a guessed pixel
-WINDOW = 2 * REACH // STEP + 1
 NEAR = 2  #: radius of the median over guessed pixels
 MIN_DEPTH = 0.2  #: minimum third coordinate of its corners, in units of that of its centre
 SPARSE = 7  #: subsampling step for medians
 UNKNOWN_WEIGHT, MIN_KNOWN_WEIGHT, EDGE_FACTOR = 0.01, 0.2, 0.2
 """Blending weight of guessed pixels, minimum of known ones, and factor beside a depth discontinuity."""
-
-
-@kernel
-def filter_extrapolated_by_colour(
-    levels: F32, disparity: F32, sure: F32, rows: tuple[int, int], limits: tuple[float, float], out: F32
-) -> None:
-    """Replace disparities of confidence 0 by a colour-weighted median of their surroundings.
-
-    ``limits``: colour difference of weight 1 / e; weight of guesses relative to known values.
-    """
-    height, width = disparity.shape
-    values, weights = empty(WINDOW * WINDOW, np.float32), empty(WINDOW * WINDOW)
-    for y in range(rows[0], rows[1]):
-        for x in range(width):
-            out[y, x] = disparity[y, x]
-            if sure[y, x] > 0.0 or np.isnan(disparity[y, x]):
-                continue
-            n, total = 0, 0.0
-            least, most = disparity[y, x], disparity[y, x]
-            for v in range(max(y - REACH, y % STEP), min(y + REACH + 1, height), STEP):
-                for u in range(max(x - REACH, x % STEP), min(x + REACH + 1, width), STEP):
-                    d = disparity[v, u]
-                    if np.isnan(d):
-                        continue
-                    apart = 0.0
-                    for c in range(levels.shape[2]):
-                        apart += abs(levels[y, x, c] - levels[v, u, c])
-                    weight = np.exp(-apart / limits[0])
-                    if sure[v, u] <= 0.0:
-                        weight *= limits[1]
-                    values[n], weights[n] = d, weight
-                    least, most = min(least, d), max(most, d)
-                    total += weight
-                    n += 1
-            # On one surface there is nothing to choose.
-            if most - least > ONE_SURFACE_PX:
-                out[y, x] = weighted_median(values[:n], weights[:n], np.argsort(values[:n]), 0.5 * total)
 
 
 def filter_extrapolated_by_median(disparity: F32, sure: F32) -> F32:
@@ -254,10 +214,6 @@ def _shifted(places: F64, disparity: F32 | F64) -> F64:
 
 
 def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
-    preparing = 2  # Number of threads that prepare an image
-    # Difference of colour (sum over channels) at which weights of guessed disparities fall to 1 / e.
-    colour = 30.0
-    guess_weight = 0.5  # Weight of guessed disparities relative to known ones in the median
     # Without any known disparity the views are cross-dissolved.
     field, shape = np.nan_to_num(_with_all_rows(found.filled())), image.shape[:2]
     places = map_in_front(H, np.moveaxis(np.indices(shape, dtype=np.float64)[::-1], 0, -1))
@@ -269,14 +225,8 @@ def _side(image: U8, H: F64, found: DisparityMap) -> _Side:
     disparity = np.where(spread <= ONE_SURFACE_PX, between, field[nearest]).astype(np.float32)
     disparity[np.isnan(places[..., 0])] = np.nan
     sure = np.where(inside, found.confidence[nearest], 0.0).astype(np.float32)
-    levels, filtered = image.astype(np.float32), np.empty_like(disparity)
-
-    def by_colour(rows: tuple[int, int]) -> None:
-        filter_extrapolated_by_colour(levels, disparity, sure, rows, (colour, guess_weight), filtered)
-
-    run_in_strips(by_colour, shape[0], preparing)
-    disparity = filter_extrapolated_by_median(filtered, sure)
-    return _Side(levels, places, disparity, _blending_weights(disparity, sure))
+    disparity = filter_extrapolated_by_median(disparity, sure)
+    return _Side(image.astype(np.float32), places, disparity, _blending_weights(disparity, sure))
 
 
 def _with_all_rows(disparity: F32) -> F32:
