@@ -68,9 +68,9 @@ def stated(model, **std):
 
 
 def doubts_of(model, scene, *, K=None, **std):
-    """Values, failed checks and limitations of the self-check."""
+    """Values and failed checks of the self-check."""
     calibration = SelfCalibration(np.eye(4), scene.K if K is None else K, 0.0 * scene.K, True, ())
-    return self_check(model, calibration.K, stated(model, **std), sigmas=SIGMAS)[:3]
+    return self_check(model, calibration.K, stated(model, **std), sigmas=SIGMAS)[:2]
 
 
 def setting(**known):
@@ -81,11 +81,10 @@ def setting(**known):
 
 def test_a_right_model_is_not_doubted_whatever_its_start_was():
     scene, _, model = setting()
-    check, failed_checks, _ = doubts_of(model, scene)
+    check, failed_checks = doubts_of(model, scene)
     assert failed_checks == []
     assert check["confirmed_share_worst_view"] > 0.95
-    assert check["noise_ratio_worst_view"] < 1.5
-    check, failed_checks, _ = doubts_of(model, scene, K=0.6 * scene.K)
+    check, failed_checks = doubts_of(model, scene, K=0.6 * scene.K)
     assert failed_checks == []
     assert check["focal_change_since_calibration"] > 0.4
     assert doubts_of(model, scene, aspect=0.04)[1] == []
@@ -105,7 +104,7 @@ def test_cameras_that_stand_elsewhere_are_named_in_one_sentence(views):
     t = model.cameras.t.copy()
     t[views] += [0.4, -0.3, 0.2]
     spoiled = replace(model, cameras=replace(model.cameras, t=t))
-    check, failed_checks, _ = doubts_of(found_again(spoiled), scene)
+    check, failed_checks = doubts_of(found_again(spoiled), scene)
     assert len(views) > 1 or check["confirmed_share_worst_view"] < 0.5
     named = "Images #1 and #6:" if len(views) > 1 else f"Image #{views[0]}:"
     assert any(doubt.startswith(named) for doubt in failed_checks)
@@ -155,25 +154,9 @@ def test_a_contradicted_known_focal_is_reported_once_without_advice_on_weights()
 @pytest.mark.parametrize(("far", "fails"), [(0.09, False), (0.11, True), (np.inf, True)])
 def test_an_adjustment_that_has_not_converged_is_not_trusted(far, fails):
     scene = make_scene(points=400, sigma_px=0.5, seed=3)
-    check, failed_checks, _ = doubts_of(replace(unshared(scene), sigmas_to_minimum=far), scene)
+    check, failed_checks = doubts_of(replace(unshared(scene), sigmas_to_minimum=far), scene)
     assert check["sigmas_to_minimum"] == far
     assert any("not converged" in doubt for doubt in failed_checks) == fails
-
-
-def test_the_middle_one_of_three_cameras_keeps_the_residuals_of_all_and_is_not_doubted():
-    row = make_scene(views=3, points=400, seed=1)
-    centres = row.centres[0] + np.outer([0.0, 1.0, 2.0], [1.0, 0.05, 0.0])
-    row = with_poses(row, np.repeat(row.R[:1], 3, axis=0), centres)
-    noise = np.random.default_rng(0).normal(0.0, 0.5, row.tracks.xy.shape)
-    scene = with_xy(row, row.tracks.xy + noise)
-    model = unshared(scene)
-    assert check_views(model, sigmas=SIGMAS).noise_px == pytest.approx(0.5, rel=0.2)
-    view, point = model.tracks.view_index[model.inlier], model.tracks.point_index[model.inlier]
-    xy, _ = _model.reproject_observations(model, view, point)
-    left = np.linalg.norm(xy - model.tracks.xy[model.inlier], axis=1)
-    kept = [np.median(left[view == v]) for v in range(3)]
-    assert kept[1] > 1.3 * min(kept[0], kept[2])
-    assert not any("noise" in doubt for doubt in doubts_of(model, scene)[1])
 
 
 def test_two_images_from_one_place_are_not_rejected_for_points_only_they_share():
@@ -189,7 +172,7 @@ def test_two_images_from_one_place_are_not_rejected_for_points_only_they_share()
     seen = [values[keep] for values in (t.view_index, t.point_index, xy)]
     scene = replace(scene, tracks=Tracks(*seen, t.n_views, t.n_points))
     model = unshared(scene)
-    check, failed_checks, _ = doubts_of(model, scene)
+    check, failed_checks = doubts_of(model, scene)
     assert failed_checks == []
     assert check["explained_share_worst_view"] > 0.9
     assert 0.2 < triangulable_observations(model).mean() < 0.9
@@ -316,9 +299,7 @@ def test_blurred_images_and_crops_that_determine_their_principal_point_are_trust
     blurred = scene.tracks.view_index == 4
     noise = np.random.default_rng(0).normal(0.0, 1.5, scene.tracks.xy.shape)
     scene = with_xy(scene, scene.tracks.xy + blurred[:, None] * noise)
-    _, failed_checks, (only,) = doubts_of(found_again(replace(unshared(scene), sigma_px=1.0)), scene)
-    assert failed_checks == []
-    assert only.startswith("Image #4: reprojection noise")
+    assert doubts_of(found_again(replace(unshared(scene), sigma_px=1.0)), scene)[1] == []
     scene = make_scene(sigma_px=0.5, seed=3, principal_shift=(300.0, 0.0))
     model = unshared(scene)
     assert doubts_of(model, scene)[1] == []

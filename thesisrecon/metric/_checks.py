@@ -25,7 +25,7 @@ from thesisrecon.optimize.bundle.identifiability import CalibrationProblem, Upgr
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
 from thesisrecon.optimize.bundle.partial import refine_pose
 from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
-from thesisrecon.optimize.least_squares import MAD_FACTOR, noise_from_distances
+from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, common_points
 
 MIN_OBSERVATIONS = 30
@@ -42,23 +42,15 @@ class PerViewChecks(NamedTuple):
 
     ``inlier_ratio`` of the triangulable observations; ``confirmed`` the same for points that two or more
     other views determine (two-view points fit any two cameras along their epipolar lines); ``behind`` the
-    share of their observations whose point lies behind the camera; ``noise_px`` of one coordinate,
-    corrected for the redundancy of the points; ``focal_off`` the log ratio of the view's own focal length,
-    from its points alone, to the model's.
+    share of their observations whose point lies behind the camera; ``focal_off`` the log ratio of the view's
+    own focal length, from its points alone, to the model's.
     """
 
     inlier_ratio: F64
     confirmed: F64
     behind: F64
-    noise_px: F64
     focal_off: F64
     focal_off_std: F64
-
-    @property
-    def noise_ratio(self) -> F64:
-        """Noise of each view over the median of all."""
-        known = self.noise_px[np.isfinite(self.noise_px)]
-        return np.asarray(self.noise_px / max(float(np.median(known)), 1e-9) if len(known) else self.noise_px)
 
     @property
     def focal_off_sigmas(self) -> F64:
@@ -81,7 +73,7 @@ def check_views(model: _model.MetricEstimate, *, sigmas: float) -> PerViewChecks
     own = [_own_camera(model, view, k[agree[k]]) for view, k in enumerate(rows)]
     return PerViewChecks(
         _share(t.view_index, agree, near, n), _share(t.view_index, agree, near & fixed, n),
-        _share(t.view_index, depth <= 0, known, n), _noise_per_view(model, agree),
+        _share(t.view_index, depth <= 0, known, n),
         *(np.array(column) for column in zip(*own, strict=True)),
     )  # fmt: skip
 
@@ -134,13 +126,10 @@ class Join(NamedTuple):
 
 
 class SelfCheck(NamedTuple):
-    """``numbers`` by name, sentences for ``failed`` checks (none: trusted) and ``limitations``, which leave
-    the cameras right, and the join of the images that is ``doubtful``.
-    """
+    """``numbers`` by name, sentences for ``failed`` checks (none: trusted), and the ``doubtful`` join."""
 
     numbers: dict[str, float]
     failed: list[str]
-    limitations: list[str]
     doubtful: Join | None
 
 
@@ -176,31 +165,6 @@ def weakest_join(model: _model.MetricEstimate, near: B8) -> Join | None:
 def _on_both_sides(side: B8, point: I64) -> int:
     here, there = (np.bincount(point[of], minlength=int(point.max()) + 1) > 0 for of in (side, ~side))
     return int((here & there).sum())
-
-
-def _noise_per_view(model: _model.MetricEstimate, agree: B8) -> F64:
-    """Estimate the noise of one coordinate in each view."""
-    t, cameras = model.tracks, model.cameras
-    k = np.flatnonzero(agree)
-    view, point = t.view_index[k], t.point_index[k]
-    seen, depth = _model.reproject_observations(model, view, point)
-    R = cameras.R[view]
-    x = np.einsum("kab,kb->ka", R[:, :2], model.X[point]) + cameras.t[view, :2]
-    B = (R[:, :2] - (x / depth[:, None])[:, :, None] * R[:, 2:]) / depth[:, None, None]
-    B *= cameras.intrinsics[cameras.group[view], 0][:, None, None]
-    V = np.zeros((t.n_points, 3, 3))
-    np.add.at(V, point, np.einsum("kca,kcb->kab", B, B))
-    # The ridge keeps V of one-view points regular; their redundancy is 0 all the same.
-    V += (1e-12 * np.trace(V, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
-    left = 1.0 - np.einsum("kca,kab,kcb->kc", B, np.linalg.inv(V)[point], B)
-    usable = left > 0.1
-    size = np.abs(seen - t.xy[k])[usable] / np.sqrt(left[usable])
-    whose = np.repeat(view[:, None], 2, axis=1)[usable]
-    noise = np.full(t.n_views, np.nan)
-    for v, rows in enumerate(rows_of_views(whose, t.n_views)):
-        if len(rows) >= MIN_OBSERVATIONS:
-            noise[v] = MAD_FACTOR * np.median(size[rows])
-    return noise
 
 
 def _own_camera(model: _model.MetricEstimate, view: int, index: I64) -> tuple[float, float]:
@@ -259,7 +223,6 @@ def self_check(
         "explained_share_worst_view": (each.inlier_ratio, np.nanmin),
         "confirmed_share_worst_view": (each.confirmed, np.nanmin),
         "behind_share_worst_view": (each.behind, np.nanmax),
-        "noise_ratio_worst_view": (each.noise_ratio, np.nanmax),
         "own_focal_off_worst_view": (np.abs(each.focal_off), np.nanmax),
         "own_focal_sigmas_worst_view": (each.focal_off_sigmas, np.nanmax),
     }
@@ -267,15 +230,15 @@ def self_check(
         check[name] = float(edge(values)) if np.isfinite(values).any() else np.nan
     join = weakest_join(model, near)
     check["joined_share_weakest"] = np.nan if join is None else join.share
-    failed, limitations = _failed_views(each, model)
+    failed = _failed_views(each, model)
     doubtful = None if join is None or join.share >= MIN_JOINED_SHARE else join
     if doubtful is not None:
         failed.append(doubtful.sentence)
-    return SelfCheck(check, [*failed, *_failed_model(check)], limitations, doubtful)
+    return SelfCheck(check, [*failed, *_failed_model(check)], doubtful)
 
 
-def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> tuple[list[str], list[str]]:
-    """A sentence for the views with each failure, the most severe one of each view, and for noisy views."""
+def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> list[str]:
+    """A sentence for the views with each failure, the most severe one of each view."""
     left = model.registered.copy()
 
     def take(bad: B8) -> I64:
@@ -293,12 +256,7 @@ def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> tuple[l
     for view in take((np.abs(views.focal_off) > 0.03) & (views.focal_off_sigmas > 5.0)):
         off = float(np.expm1(views.focal_off[view]))
         failed.append(Notice("own-focal", view, abs(off), "longer" if off > 0.0 else "shorter"))
-    limitations: list[str] = []
-    if len(noisy := take(views.noise_ratio > 3.0)):
-        # Blur and motion cause noise as well; a wrong camera loses matches or needs another focal length.
-        ratio = views.noise_ratio[noisy].max()
-        limitations.append(Notice("noisy-view", _named(noisy), ratio))
-    return failed, limitations
+    return failed
 
 
 def _named(views: I64) -> str:

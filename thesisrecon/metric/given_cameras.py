@@ -202,7 +202,7 @@ def _finished(
     reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
     return records.MetricResult(
         as_reconstruction(model, reasons), intervals, checked.numbers, not failed, tuple(failed),
-        limitations=tuple(checked.limitations), pose_std=poses,
+        pose_std=poses,
     )  # fmt: skip
 
 

@@ -155,7 +155,7 @@ def _assess(
     warnings += undetermined_lens(model, intervals, motion) + deviations.warnings
     result = records.MetricResult(
         as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
-        tuple(failed_checks), warnings, (*enlarged, *checked.limitations), report, poses,
+        tuple(failed_checks), warnings, enlarged, report, poses,
     )  # fmt: skip
     return result, checked.doubtful
 
