@@ -14,7 +14,7 @@ from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.camera_matrix import calibration_matrix, camera_from_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras
-from thesisrecon.imaging.resampling import STRIP_ROWS, _sample_image, warp_image
+from thesisrecon.imaging.resampling import STRIP_ROWS, sample_cubic, warp_image
 from thesisrecon.stereo import rectification
 from thesisrecon.stereo._epipolar_pair import (
     MAX_GROWTH,
@@ -332,7 +332,7 @@ def test_strips_do_not_show_and_grey_is_one_channel():
     H = np.array([[0.8, 0.1, 3.0], [-0.1, 0.7, 20.0], [1e-4, 0.0, 1.0]])
     rectified = planar_frame(H, (150, 2 * STRIP_ROWS + 1))
     whole = np.empty((rectified.size[1], 150, 1), np.float32)
-    _sample_image(image[:, :, None], rectified._lookup(0, range(rectified.size[1])), whole)
+    sample_cubic(image[:, :, None], rectified._lookup(0, range(rectified.size[1])), True, whole)
     grey = rectified.warp(image, 0)
     np.testing.assert_array_equal(grey, whole[:, :, 0])
     colour = rectified.warp(np.repeat(image[:, :, None], 3, axis=2), 1)

@@ -163,10 +163,10 @@ def _spread(xy: F64, i: int, j: int, axis: int) -> float:
 
 
 @kernel
-def _sample_image(image: F32, xy: F64, out: F32) -> None:
+def sample_cubic(image: F32, xy: F64, widen: bool, out: F32) -> None:
     """Cubic samples of ``image`` (H, W, C) at ``xy`` (>= n, m, 2) px into ``out`` (n, m, C)."""
-    # The kernel is widened along each axis of the image where adjacent positions are more than a pixel apart.
-    # NaN outside the pixel centres, or beside a NaN pixel; other NaN pixels are left out.
+    # With ``widen`` the kernel is wider along each axis of the image where adjacent positions are more than a
+    # pixel apart. NaN outside the pixel centres, or beside a NaN pixel; other NaN pixels are left out.
     height, width, channels = image.shape
     wx, wy = empty(MAX_TAPS), empty(MAX_TAPS)
     total = empty(channels)
@@ -181,7 +181,8 @@ def _sample_image(image: F32, xy: F64, out: F32) -> None:
             x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
             if np.isnan(image[y0, x0, 0] + image[y0, x1, 0] + image[y1, x0, 0] + image[y1, x1, 0]):
                 continue
-            spread_x, spread_y = _spread(xy, i, j, 0), _spread(xy, i, j, 1)
+            spread_x = _spread(xy, i, j, 0) if widen else 1.0
+            spread_y = _spread(xy, i, j, 1) if widen else 1.0
             inner = x0 >= 1 and x0 + 2 < width and y0 >= 1 and y0 + 2 < height
             if inner and spread_x == 1.0 and spread_y == 1.0:
                 cubic_weights(x - x0, wx)
@@ -231,7 +232,7 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
         start = first - 1 if last == height and last - first == 1 and first > 0 else first
         places = lookup(range(start, min(last + 1, height)))
         strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
-        _sample_image(pixels, places, strip)
+        sample_cubic(pixels, places, True, strip)
         out[first:last] = strip[first - start :]
     return out[:, :, 0] if image.ndim == 2 else out
 

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from thesisrecon._numba import empty, kernel
+from thesisrecon._numba import kernel
 from thesisrecon.arrays import F32, F64, I16, I32, I64
 from thesisrecon.imaging.raster import run_in_strips
-from thesisrecon.imaging.resampling import cubic_weights
+from thesisrecon.imaging.resampling import sample_cubic
 
 SLACK = 1e-7
 """Barycentric distance by which a triangle extends beyond its edges, so that rounding leaves no gaps."""
@@ -161,50 +161,6 @@ def _draw_surface(
 
 
 @kernel
-def _sample_at(image: F32, source: F32, rows: tuple[int, int], out: F32) -> None:
-    """Sample rows of an image by cubic convolution; bilinear beside the border, NaN beside NaN."""
-    height, width, channels = image.shape
-    wx, wy = empty(4, np.float32), empty(4, np.float32)
-    for y in range(rows[0], rows[1]):
-        for x in range(source.shape[1]):
-            u, v = source[y, x, 0], source[y, x, 1]
-            if not (u >= -0.5 and v >= -0.5 and u <= width - 0.5 and v <= height - 0.5):
-                out[y, x] = np.nan
-                continue
-            x0 = min(max(int(np.floor(u)), 0), max(width - 2, 0))
-            y0 = min(max(int(np.floor(v)), 0), max(height - 2, 0))
-            inner = x0 >= 1 and y0 >= 1 and x0 + 2 < width and y0 + 2 < height
-            value = np.float32(np.nan)
-            if inner:
-                cubic_weights(u - x0, wx)
-                cubic_weights(v - y0, wy)
-            for c in range(channels):
-                if inner:
-                    value = np.float32(0.0)
-                    for k in range(4):
-                        row = image[y0 - 1 + k]
-                        value += wy[k] * (
-                            wx[0] * row[x0 - 1, c]
-                            + wx[1] * row[x0, c]
-                            + wx[2] * row[x0 + 1, c]
-                            + wx[3] * row[x0 + 2, c]
-                        )
-                if not inner or np.isnan(value):
-                    value = _linear(image, u, v, x0, y0, c)
-                out[y, x, c] = value
-
-
-@kernel
-def _linear(image: F32, u: float, v: float, x0: int, y0: int, c: int) -> np.float32:
-    """Bilinear, of the border pixel beyond it."""
-    x1, y1 = min(x0 + 1, image.shape[1] - 1), min(y0 + 1, image.shape[0] - 1)
-    s, t = min(max(u - x0, 0.0), 1.0), min(max(v - y0, 0.0), 1.0)
-    top = image[y0, x0, c] + s * (image[y0, x1, c] - image[y0, x0, c])
-    bottom = image[y1, x0, c] + s * (image[y1, x1, c] - image[y1, x0, c])
-    return np.float32(top + t * (bottom - top))
-
-
-@kernel
 def _count_steps(inverse_depth: F32, steps: I32, distance: I16) -> None:
     """Count ``steps`` (K, 2) from each pixel to the next known one: 0 at known pixels, -1 for none."""
     height, width = inverse_depth.shape
@@ -267,8 +223,14 @@ def _median_distance(target: F64) -> float:
 def sample(image: ArrayLike, source_xy: F32, *, threads: int = 1) -> F32:
     """Sample an image (h, w, C) at pixels (H, W, 2) by cubic convolution, NaN outside."""
     levels = np.ascontiguousarray(image, dtype=np.float32)
-    out = np.empty((*source_xy.shape[:2], levels.shape[2]), dtype=np.float32)
-    run_in_strips(lambda rows: _sample_at(levels, source_xy, rows, out), len(out), threads)
+    places = np.ascontiguousarray(source_xy, dtype=np.float64)
+    out = np.empty((*places.shape[:2], levels.shape[2]), dtype=np.float32)
+
+    def work(rows: tuple[int, int]) -> None:
+        # Adjacent positions may belong to different surfaces.
+        sample_cubic(levels, places[slice(*rows)], False, out[slice(*rows)])
+
+    run_in_strips(work, len(out), threads)
     return out
 
 
