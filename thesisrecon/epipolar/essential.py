@@ -8,7 +8,7 @@ from numpy.random import Generator
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.epipolar._matches import PairFrame, chance_of_agreement, multiplicity_weights
 from thesisrecon.epipolar._sampling import squared_distances
-from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine_essential
+from thesisrecon.epipolar.refinement import SAMPSON, UNBOUNDED, normal_equations, refine
 from thesisrecon.errors import StageFailure, counted
 from thesisrecon.geometry import relative_pose
 from thesisrecon.geometry.homogeneous import (
@@ -186,7 +186,7 @@ def _search(pair: _Pair, gate: float, budget: Budget, rng: Generator) -> tuple[F
 def _refined(pair: _Pair, E: F64, rows: I64, *, iterations: int = 50) -> F64:
     """E of least squared Sampson distances of some matches."""
     e = E.ravel() / np.linalg.norm(E)
-    refine_essential(e, pair.of_essential, pair.points[rows], iterations)
+    refine(e, pair.points[rows], SAMPSON, UNBOUNDED, UNBOUNDED, iterations, pair.of_essential)
     return e.reshape(3, 3)
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from thesisrecon._numba import copy_to, empty, kernel, zeros
+from thesisrecon._numba import copy_to, empty, kernel
 from thesisrecon.arrays import F64
 from thesisrecon.epipolar._matches import PairFrame, check_matches, check_start
 from thesisrecon.errors import unknown_word
@@ -211,42 +211,28 @@ def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
 
 @kernel
 def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
-    """Write H = B' G B (D, D) and g = B' h (D,), of the first columns of ``B``."""
-    GB = empty((9, len(g)))
+    """Write H = B' G B (7, 7) and g = B' h (7,)."""
+    GB = empty((9, 7))
     for i in range(9):
-        for a in range(len(g)):
+        for a in range(7):
             total = 0.0
             for j in range(9):
                 total += G[i, j] * B[j, a]
             GB[i, a] = total
-    for a in range(len(g)):
+    for a in range(7):
         g[a] = 0.0
         for i in range(9):
             g[a] += B[i, a] * h[i]
-        for b in range(a, len(g)):
+        for b in range(a, 7):
             total = 0.0
             for i in range(9):
                 total += B[i, a] * GB[i, b]
             H[a, b] = H[b, a] = total
 
 
-@kernel(forceinline=True)
-def refine(
-    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
-) -> tuple[float, int]:
-    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves."""
-    return _descend(f, empty((0, 9)), points, criterion, gate, delta, iterations)
-
-
-@kernel(forceinline=True)
-def refine_essential(E: F64, frame: F64, points: F64, iterations: int) -> None:
-    """Minimise the Sampson distances of F = ``frame`` E (9,) over essential matrices E in place."""
-    _descend(E, frame, points, SAMPSON, UNBOUNDED, UNBOUNDED, iterations)
-
-
 @kernel
 def _multiply(A: F64, B: F64, out: F64) -> None:
-    """Fill the first columns of ``out`` with A B."""
+    """Write A B, A (9, 9), to ``out``."""
     for i in range(out.shape[0]):
         for j in range(B.shape[1]):
             total = 0.0
@@ -256,29 +242,29 @@ def _multiply(A: F64, B: F64, out: F64) -> None:
 
 
 @kernel(forceinline=True)
-def _descend(
-    f: F64, frame: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int
+def refine(
+    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int, frame: F64 | None = None
 ) -> tuple[float, int]:
-    """As :func:`refine`; with a ``frame`` (9, 9) as :func:`refine_essential`."""
+    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves.
+
+    With a ``frame`` (9, 9), f is an essential matrix and stays one; the fundamental matrix is ``frame`` f.
+    """
     U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
-    B, step, trial, model, of_E = empty((9, 7)), zeros(7), empty(9), empty(9), empty((9, 7))
-    calibrated = len(frame) > 0
-    # E has equal singular values: phi stays, and a turn of U and V about their last columns has no effect.
-    unknowns = 5 if calibrated else 7
-    H, g = empty((unknowns, unknowns)), empty(unknowns)
+    B, step, trial, F, of_E = empty((9, 7)), empty(7), empty(9), empty(9), empty((9, 7))
+    H, g = empty((7, 7)), empty(7)
     phi = phi_n = orthonormal_from_fundamental(f, Un, Vn)
-    if calibrated:
+    if frame is not None:
         phi = phi_n = 0.25 * np.pi
     exact = 1e-26 * len(points)
     cost, damping, steps = np.inf, 1e-2, 0
     # The start is the first trial: one call of the normal equations takes half as long to compile.
     while True:
         fundamental_from_orthonormal(Un, Vn, phi_n, trial)
-        if calibrated:
-            _multiply(frame, trial.reshape((9, 1)), model.reshape((9, 1)))
-        else:
-            copy_to(model, trial)
+        model = trial
+        if frame is not None:
+            _multiply(frame, trial.reshape((9, 1)), F.reshape((9, 1)))
+            model = F
         new_cost = normal_equations(model, points, criterion, gate, delta, Gn, hn)
         if steps == 0 or new_cost < cost:
             gain = cost - new_cost
@@ -290,16 +276,19 @@ def _descend(
                 break
             damping = max(1e-9, 0.1 * damping)
             orthonormal_tangent(U, V, phi, B)
-            if calibrated:
+            if frame is not None:
                 _multiply(frame, B, of_E)
                 B, of_E = of_E, B
+                # E has equal singular values, and no effect of a turn of U and V about their last columns.
+                for i in range(9):
+                    B[i, 5] = B[i, 6] = 0.0
             _project(B, G, h, H, g)
         else:
             damping *= 10.0
         solved = False
         while not solved and steps < iterations and cost > exact and damping <= 1e8:
             steps += 1
-            solved = solve_damped(H, g, damping, step[:unknowns])
+            solved = solve_damped(H, g, damping, step)
             damping *= 1.0 if solved else 10.0
         if not solved:
             break
