@@ -18,6 +18,7 @@ from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
 from thesisrecon.geometry.homogeneous import cross_matrix
 from thesisrecon.records import DisparityMap, Image
+from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.depth import MultiViewStereo
 from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views.tensor import VirtualCamera, camera_at
@@ -114,7 +115,8 @@ def test_images_that_are_rolled_against_each_other_have_no_views_between(monkeyp
     turn[:2, 2] = middle - turn[:2, :2] @ middle
     known = DisparityMap(np.zeros((30, 40), np.float32), np.ones((30, 40), np.float32), 0.2)
     frame = PlanarRectification(np.stack([np.eye(3), turn]), (40, 30))
-    sideways(monkeypatch, lambda *_, **__: SimpleNamespace(frame=frame, left=known, right=known))
+    dense = RectifiedPair(frame, (known.disparity,) * 2, np.ones(3), known, known)
+    sideways(monkeypatch, lambda *_, **__: dense)
     if possible:
         assert between.prepare_pair(photograph(0), photograph(1)).view(0.5).shape == (30, 40, 3)
         return

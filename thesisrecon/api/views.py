@@ -21,13 +21,19 @@ from thesisrecon.io._images import eight_bit_images, read_image, read_levels, re
 from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, as_mesh
 from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.stereo._postprocessing import match_both_sides
-from thesisrecon.stereo.correspondence import RectifiedPair
+from thesisrecon.stereo.correspondence import RectifiedPair, brightness_gain
 from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views import tensor
-from thesisrecon.views.interpolation import InterpolatedPair, disparity_of_right, roll_between
+from thesisrecon.views.interpolation import (
+    InterpolatedPair,
+    disparity_of_right,
+    prepare_interpolation,
+    roll_between,
+)
 from thesisrecon.views.render import render_mesh
 
 _COARSE = 4  # Reduction at which the largest disparity of a rectified pair is searched, up to half its width
+_SPARSE = 7  # Subsampling step of the pixels of which the exposures are compared
 
 
 @one_blas_thread()
@@ -46,7 +52,8 @@ def interpolate_view(
         Position on the baseline, from 0 (left image) to 1 (right image).
     disparity : ndarray (H, W), DisparityMap or tuple of both sides, optional
         Disparities of the left image, x_right = x_left - d, NaN = unknown; those of the right image add the
-        regions that only it shows. None: matched by ``config.dense``.
+        regions that only it shows. Those of maps must agree with the other side unless their ``sigma_px`` is
+        0, as that of arrays. None: matched by ``config.dense``.
     config : PipelineConfig, str or path, optional
         The default configuration if None.
 
@@ -106,7 +113,23 @@ def prepare_rectified_pair(
     for shape in (found.disparity.shape for found in maps):
         if shape != shapes[0]:
             raise ValueError(f"disparities must have the shape of the images {shapes[0]}; got {shape}")
-    return InterpolatedPair((images[0], images[1]), np.stack([np.eye(3)] * 2), *maps)
+    # Exact disparities need not agree: one image may hide what the other one shows.
+    exact = all(found.sigma_px == 0.0 for found in maps)
+    fields = [found.disparity if exact else found.filled() for found in maps]
+    left_xy, right_xy = _shifted(-fields[0]), _shifted(fields[1])
+    y, x = (_SPARSE * at for at in np.nonzero(np.isfinite(maps[0].disparity[::_SPARSE, ::_SPARSE])))
+    matches = np.stack([x, y], axis=1).astype(np.float64), left_xy[y, x].astype(np.float64)
+    return prepare_interpolation(
+        (images[0], images[1]), np.stack([np.eye(3)] * 2), maps[0], (left_xy, right_xy),
+        gain=brightness_gain(images[0], images[1], *matches),
+        agree_px=np.inf if exact else tensor.AGREE_PX,
+    )  # fmt: skip
+
+
+def _shifted(by: F32) -> F32:
+    """Positions (H, W, 2) of pixels moved along their rows, NaN where ``by`` is."""
+    y, x = np.indices(by.shape, dtype=np.float32)
+    return np.stack([x + by, y], axis=-1)
 
 
 def _as_map(disparity: DisparityMap | F32) -> DisparityMap:
@@ -169,7 +192,8 @@ def prepare_pair(
     # Halfway, views then show 0.7 of the field of view.
     if abs(roll := roll_between(dense.frame.H, first.size)) > 90.0:
         raise StageFailure.of("rolled-images", abs(roll))
-    return InterpolatedPair((first.rgb, second.rgb), dense.frame.H, dense.left, dense.right)
+    places = dense.correspondences(0, first.size), dense.correspondences(1, second.size)
+    return prepare_interpolation((first.rgb, second.rgb), dense.frame.H, dense.left, places, gain=dense.gain)
 
 
 def _require_comparable_images(first: Image, second: Image) -> None:

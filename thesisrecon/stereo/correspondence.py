@@ -50,7 +50,7 @@ class PairMatching:
             frame = frame.reduced((MAX_COSTS / costs) ** (1.0 / 3.0))
             wanted = _searched_range(frame, xy1, xy2)
         left = frame.warp(_levels(reference), 0)
-        right = frame.warp(_levels(other) * _brightness_gain(reference.rgb, other.rgb, xy1, xy2), 1)
+        right = frame.warp(_levels(other) * brightness_gain(reference.rgb, other.rgb, xy1, xy2), 1)
         found = self.matcher.match(left, right, disparity_range=wanted)
         return self._map_back(frame, found, own, shapes)
 
@@ -61,7 +61,7 @@ class PairMatching:
         pair = pair_of_fundamental(F, xy1, xy2, image1.rgb.shape[1::-1], image2.rgb.shape[1::-1])
         frame = rectify(pair, PLANAR if planar else METHODS)
         wanted = _searched_range(frame, xy1, xy2)
-        gain = _brightness_gain(image1.rgb, image2.rgb, xy1, xy2)
+        gain = brightness_gain(image1.rgb, image2.rgb, xy1, xy2)
         left = frame.warp(image1.levels, 0)
         right = frame.warp(image2.levels * gain, 1)
         match = partial(self.matcher.match, disparity_range=wanted)
@@ -131,7 +131,7 @@ def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
     return d, np.where(np.isfinite(d), found.confidence[nearest], 0.0)
 
 
-def _brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
+def brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
     """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches."""
     levels = [_patch_means(rgb, xy) for rgb, xy in ((reference, xy1), (other, xy2))]
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)

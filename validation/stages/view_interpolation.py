@@ -99,6 +99,7 @@ TRUE, DISSOLVE = "true disparities", "cross-dissolve"
 THREE_WAY, HH = "SGBM 3-way", "SGBM HH"
 BY_TENSOR = " (tensor)"
 TENSOR = OURS + BY_TENSOR
+SGBM_SIGMA_PX = 0.2  # Not exact: as for ours, both sides must agree
 BORDER_PX = 50  # Border columns of extrapolated views that no input image covers
 
 
@@ -198,7 +199,9 @@ def _disparities(
     # Seen in a mirror, the right image is a left one.
     mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
     back = reference.match(mirrored[0], mirrored[1], DISPARITIES)
-    return reference.match(left, right, DISPARITIES), np.ascontiguousarray(back[:, ::-1])
+    found = reference.match(left, right, DISPARITIES), np.ascontiguousarray(back[:, ::-1])
+    first, second = (DisparityMap(d, np.isfinite(d).astype(np.float32), SGBM_SIGMA_PX) for d in found)
+    return first, second
 
 
 def _file(folder: Path, view: int) -> Path:
