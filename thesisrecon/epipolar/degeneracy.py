@@ -101,7 +101,7 @@ def _competing_model(start: F64, f: F64, points: F64, weights: F64, band: float)
     """A start (9,) refined on all points and compared with ``f``."""
     other = start.copy()
     for gate in (2.4, 1.8, 1.2):
-        refine(other, points, SAMPSON, gate * band, 0.4 * gate * band, 5)
+        refine(other, points, SAMPSON, gate * band, 0.4 * gate * band, 5, None)
     distances, own = np.asarray(sampson_distances(f, points)), np.asarray(sampson_distances(other, points))
     inside, agreeing = distances < band, own < band
     lost, gained = float(weights[inside & ~agreeing].sum()), float(weights[agreeing & ~inside].sum())

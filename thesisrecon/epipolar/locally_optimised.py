@@ -128,9 +128,9 @@ class LocallyOptimisedRansac:
         """Refine ``f`` in place; return its sum of truncated squares and itself."""
         # Huber's loss is narrow: wrong matches within the gate are not rare.
         for width in self.gates[:-1]:
-            refine(f, points[:500], SAMPSON, width * gate, 0.25 * width * gate, 5)
+            refine(f, points[:500], SAMPSON, width * gate, 0.25 * width * gate, 5, None)
         width = self.gates[-1]
-        refine(f, points, SAMPSON, width * gate, 0.25 * width * gate, 20)
+        refine(f, points, SAMPSON, width * gate, 0.25 * width * gate, 20, None)
         score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
         watched(0, score, inliers / len(points), f)
         return score * len(points), f
@@ -187,7 +187,7 @@ class _Candidate:
 def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> None:
     """Refine the best F of a search on few points with twice the gate and keep the better of the two."""
     trial = f.copy()
-    refine(trial, points[:300], SAMPSON, 2.0 * gate, gate, 4)
+    refine(trial, points[:300], SAMPSON, 2.0 * gate, gate, 4, None)
     score, inliers, _ = truncated_score(trial, columns, gate, state[0], (0.0, 0.0))
     if score < state[0]:
         state[:2] = score, inliers / len(points)
@@ -270,7 +270,7 @@ def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | N
         # The start fits few matches: heavy tails cannot be detected before the first refinement.
         width = best_huber_width(near, noise.sigma, parameters=PARAMETERS) if k > 0 else np.inf
         width = min(max(width, exact), limit)
-        refine(f, points, SAMPSON, limit, width, 15)
+        refine(f, points, SAMPSON, limit, width, 15, None)
         loss = (limit, width)
     return noise, loss
 

@@ -243,7 +243,7 @@ def _multiply(A: F64, B: F64, out: F64) -> None:
 
 @kernel(forceinline=True)
 def refine(
-    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int, frame: F64 | None = None
+    f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int, frame: F64 | None
 ) -> tuple[float, int]:
     """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves.
 
@@ -367,5 +367,5 @@ def refine_fundamental(F: F64, xy1: F64, xy2: F64, criterion: Criterion = "samps
     xy1, xy2 = check_matches(xy1, xy2, needed=7)
     frame = PairFrame.of(xy1, xy2)
     f, points = check_start(F, frame), frame.points(xy1, xy2)
-    refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS)
+    refine(f, points, _CRITERIA[criterion], np.inf, UNBOUNDED, MAX_ITERATIONS, None)
     return frame.matrix_in_pixels(f)

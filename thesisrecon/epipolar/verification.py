@@ -107,7 +107,7 @@ def classify_configuration(F: F64, xy1: F64, xy2: F64, *, inliers: B8 | None = N
     centre = 0.5 * (own.centroid1 + own.centroid2)
     frame = PairFrame(centre, centre, own.scale)
     points, f = frame.points(xy1, xy2), _matches.check_start(F, frame)
-    refine(f, points[inliers], SAMPSON, np.inf, _scale(f, points[inliers]) * 3.0, 15)
+    refine(f, points[inliers], SAMPSON, np.inf, _scale(f, points[inliers]) * 3.0, 15, None)
     sigma = _scale(f, points[inliers])
     agree = np.asarray(sampson_distances(f, points)) < BAND * sigma
     chance = _matches.chance_of_agreement(xy1, xy2, BAND * sigma / frame.scale)
@@ -229,7 +229,7 @@ def _translation_ratio(case: _InlierData) -> float:
 
 def _least_squares(f: F64, points: F64) -> float:
     f = f.copy()
-    refine(f, points, SAMPSON, np.inf, UNBOUNDED, CORRECTIONS)
+    refine(f, points, SAMPSON, np.inf, UNBOUNDED, CORRECTIONS, None)
     return float(np.sum(np.asarray(sampson_distances(f, points)) ** 2))
 
 
