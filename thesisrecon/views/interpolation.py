@@ -1,6 +1,6 @@
 """View interpolation (view morphing) between two images (thesis, section 1.2; Seitz and Dyer 1995).
 
-A view between two images is the synthesis of :mod:`thesisrecon.views.tensor` for two cameras that differ by
+A view between two images is the synthesis of ``thesisrecon.views.tensor`` for two cameras that differ by
 a translation along the rows of the rectified frame, where the inverse depth is the disparity.
 """
 
