@@ -407,9 +407,9 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     ends = i[strong], j[strong]
     graph = scipy.sparse.coo_array((np.ones(strong.sum()), ends), (n_views, n_views)).tocsr()
     group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    steps = _steps_within(graph + graph.T, np.unique(i[~strong]), MAX_STEPS)
-    weak = ~strong & (group[i] == group[j])
-    apart = {*map(tuple, np.column_stack([i, j])[weak].tolist())} - {*map(tuple, steps.tolist())}
+    weak = np.flatnonzero(~strong & (group[i] == group[j]))
+    near = _within_steps(graph + graph.T, i[weak], j[weak], MAX_STEPS)
+    apart = {*map(tuple, np.column_stack([i, j])[weak[~near]].tolist())}
     reason = (
         "its {} matches are few compared with those of each image's best pair, and "
         f"at least {MAX_STEPS + 1} strong pairs separate the images: probably repeated structure"
@@ -429,13 +429,16 @@ def strong_pairs(i: I64, j: I64, count: I64 | F64, n_views: int) -> B8:
     return np.asarray(count >= STRONG * np.minimum(most[i], most[j]))
 
 
-def _steps_within(graph: scipy.sparse.csr_array, start: np.ndarray, steps: int) -> np.ndarray:
-    """Pairs of views (M, 2), the first one from ``start``, that at most ``steps`` edges connect."""
-    reached = scipy.sparse.csr_array((np.ones(len(start)), (start, start)), (graph.shape[0], graph.shape[0]))
-    for _ in range(steps):
-        reached = reached + reached @ graph
-        reached.data[:] = 1.0
-    return np.column_stack(reached.nonzero())
+def _within_steps(graph: scipy.sparse.csr_array, i: I64, j: I64, steps: int) -> B8:
+    """Whether at most ``steps`` edges connect the views i and j (M,): steps from both ends meet."""
+    step = scipy.sparse.csr_array(graph + scipy.sparse.eye_array(graph.shape[0]))
+    near = np.zeros(len(i), dtype=bool)
+    for rows in np.array_split(np.arange(len(i)), len(i) // ROWS_AT_ONCE + 1):
+        reached = [scipy.sparse.eye_array(graph.shape[0], format="csr")[ends[rows]] for ends in (i, j)]
+        for k in range(steps):
+            reached[k % 2] = (reached[k % 2] @ step).sign()
+        near[rows] = reached[0].multiply(reached[1]).sum(axis=1) > 0
+    return near
 
 
 def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:
