@@ -45,6 +45,8 @@ from thesisrecon.api.cameras import resect as resect
 from thesisrecon.api.cameras import cheirality as cheirality
 from thesisrecon.api.decompositions import decompose_camera as decompose_camera
 from thesisrecon.api.decompositions import factorize_affine as factorize_affine
+from thesisrecon.api.averaging import average_rotations as average_rotations
+from thesisrecon.api.averaging import average_translations as average_translations
 from thesisrecon.api.bundle import bundle_adjust as bundle_adjust
 from thesisrecon.api.bundle import BundleAdjustment as BundleAdjustment
 from thesisrecon.records import Reconstruction as Reconstruction

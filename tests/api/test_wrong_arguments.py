@@ -53,6 +53,7 @@ LISTED["xy"] = XY[LISTED["view_index"], LISTED["point_index"]]
 PAIR = [tr.Camera(K, R[3], np.array([x, 0.0, 0.0]), SIZE) for x in (0.0, 1.0)]
 ROWS, SIZES = tuple((k, k) for k in range(40)), np.array([SIZE] * 6)
 E = K.T @ F @ K
+RING = np.column_stack([np.arange(6), (np.arange(6) + 1) % 6])
 SQUARE = np.array([[[0, 0], [0, 1]], [[1, 0], [1, 1]], [[0, 0], [1, 0]], [[0, 1], [1, 1]]])
 DIAGONALS = np.array([[[0, 0], [1, 1]], [[1, 0], [0, 1]]])
 SEGMENTS = np.stack([XY[0, :9], XY[0, :9] + 0.2 * (np.array([900.0, 50]) - XY[0, :9])], axis=1)
@@ -223,6 +224,11 @@ CALLS = {
         lambda **given: tr.self_calibrate(method="linear-quadric", **given),
         {"reconstruction": PROJECTIVE, "sizes": np.array(SIZE), "X": X, "xy": XY, "seed": 0},
     ),
+    "average_rotations": (
+        tr.average_rotations,
+        {"pairs": RING, "R": R[RING[:, 1]] @ R[RING[:, 0]].swapaxes(1, 2), "weights": np.arange(1.0, 7.0)},
+    ),
+    "average_translations": (tr.average_translations, {"pairs": RING, "t": X[:6], "R": R}),
     "kruppa": (tr.kruppa, {"F": KRUPPA, "sizes": SIZE}),
     "estimate_fundamental": (
         tr.estimate_fundamental,
