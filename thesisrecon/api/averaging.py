@@ -110,7 +110,7 @@ def average_translations(pairs: I64, t: F64, R: F64, *, weights: F64 | None = No
     t : array_like (E, 3)
         Relative translations of any length, x_j = R_ij x_i + t, such as those of an essential matrix.
     R : array_like (V, 3, 3)
-        Rotations of the cameras, world to camera, such as those of :func:`average_rotations`.
+        Rotations of the cameras, world to camera, such as those of :func:`thesisrecon.average_rotations`.
     weights : array_like (E,), optional
         Positive weights, such as numbers of matches.
 
