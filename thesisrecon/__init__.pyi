@@ -21,6 +21,7 @@ from thesisrecon.api.pairs import estimate_fundamental as estimate_fundamental
 from thesisrecon.api.pairs import estimate_homography as estimate_homography
 from thesisrecon.api.pairs import estimate_trifocal as estimate_trifocal
 from thesisrecon.api.relative_pose import estimate_essential as estimate_essential
+from thesisrecon.api.relative_pose import recover_pose as recover_pose
 from thesisrecon.api.relative_pose import decompose_homography as decompose_homography
 from thesisrecon.api.decompositions import essential_from_fundamental as essential_from_fundamental
 from thesisrecon.api.decompositions import decompose_essential as decompose_essential

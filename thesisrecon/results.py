@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from thesisrecon import records
-from thesisrecon.arrays import F64, I64, U8, Record, cut_text, rows_of_views
+from thesisrecon.arrays import F64, I64, U8, Record, cut_text, number, rows_of_views
 from thesisrecon.camera import POSE_STDS, Camera, camera_of_row
 
 SUMMARY = "summary.json"
@@ -308,6 +309,23 @@ class PointDistances(Record):
 
 
 @dataclass(frozen=True, eq=False)
+class RelativeErrors(Record):
+    """Errors of the motions between cameras of a trajectory."""
+
+    pairs: I64  #: (M, 2) first and last camera of each motion, as numbers in ``names``
+    translation: F64  #: (M,) in units of b
+    rotation_deg: F64  #: (M,)
+
+
+def _poses(views: Sequence[SparseView]) -> F64:
+    """Camera-to-world poses (V, 4, 4)."""
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    poses[:, :3, :3] = [view.R.T for view in views]
+    poses[:, :3, 3] = [view.centre for view in views]
+    return poses
+
+
+@dataclass(frozen=True, eq=False)
 class ModelComparison(Record):
     """Differences of model a from model b, which is the reference; one entry per common camera."""
 
@@ -338,6 +356,49 @@ class ModelComparison(Record):
                 values = np.median(errors), np.mean(errors), np.sqrt(np.mean(errors**2)), np.max(errors)
                 found[name] = dict(zip(("median", "mean", "rms", "max"), map(float, values), strict=True))
         return found
+
+    def relative_errors(self, distance: float) -> RelativeErrors:
+        """Return the errors of the motions over a distance, without a common frame (Kümmerle et al. 2009).
+
+        Parameters
+        ----------
+        distance : float
+            Length of the path of b, in units of b, between the two cameras of a motion: the cameras are
+            visited in the order of b, and a motion ends, and the next begins, when its path is this long.
+
+        Returns
+        -------
+        RelativeErrors
+            Errors of E = (B_i^-1 B_j)^-1 (A_i^-1 A_j) with camera-to-world poses A, aligned, and B.
+
+        Raises
+        ------
+        ValueError
+            If the distance is not positive, the path is shorter, or the models could not be aligned.
+        """
+        if not 0.0 < number("relative_errors", "distance", distance) < np.inf:
+            raise ValueError(f"relative_errors needs a finite distance above 0; got {distance:g}")
+        if self.similarity is None:
+            raise ValueError("relative_errors needs models that could be aligned; see notes")
+        of_a, of_b = ({view.name: view for view in model.views} for model in (self.a, self.b))
+        place = {name: i for i, name in enumerate(of_b)}
+        order = np.argsort([place[name] for name in self.names_b])
+        views = [of_a[self.names[k]] for k in order], [of_b[self.names_b[k]] for k in order]
+        (A, B), path = (_poses(some) for some in views), 0.0
+        ends, steps = [0], np.linalg.norm(np.diff(B[:, :3, 3], axis=0), axis=1)
+        for j, step in enumerate(steps.tolist(), start=1):
+            path += step
+            if path >= distance:
+                ends.append(j)
+                path = 0.0
+        if len(ends) < 2:
+            raise ValueError(f"the path of {steps.sum():.4g} is shorter than the distance {distance:g}")
+        first, last = np.array(ends[:-1]), np.array(ends[1:])
+        motion, motion_b = np.linalg.solve(A[first], A[last]), np.linalg.solve(B[first], B[last])
+        E = np.linalg.solve(motion_b, motion)
+        angle = scipy.spatial.transform.Rotation.from_matrix(E[:, :3, :3]).magnitude()
+        pairs = np.stack([order[first], order[last]], axis=1)
+        return RelativeErrors(pairs, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(angle))
 
     def as_table(self) -> dict[str, Any]:
         """Return all numbers as a table of plain types, arrays and text, for JSON.

@@ -152,10 +152,24 @@ def test_trajectories_are_paired_by_time_and_have_errors_by_distance(truth):
     assert found.notes[0] == said
     wide = compare_models(fast, fast, max_time_difference=np.inf, time_offset=0.06)
     assert wide.names_b[0] == fast.names[0]
+    # The motions by hand.
+    errors = found.relative_errors(2.0)
+    a, b = ({view.name: view for view in model.views} for model in (found.a, found.b))
+    for (i, j), translation, angle in zip(errors.pairs, errors.translation, errors.rotation_deg, strict=True):
+        motions = []
+        for views, names in ((b, found.names_b), (a, found.names)):
+            one, other = views[names[i]], views[names[j]]
+            motions.append((one.R @ other.R.T, one.R @ (other.centre - one.centre)))
+        (R, t), (R_a, t_a) = motions
+        assert translation == pytest.approx(np.linalg.norm(t_a - t))
+        assert angle == pytest.approx(np.degrees(Rotation.from_matrix(R.T @ R_a).magnitude()), abs=1e-6)
+    assert (errors.pairs[1:, 0] == errors.pairs[:-1, 1]).all()
+    refuses(ValueError, "shorter than the distance 1e", found.relative_errors, 1e6)
+    refuses(ValueError, "finite distance above 0", found.relative_errors, 0.0)
 
 
-def test_pairs_by_time_are_those_of_evo(truth):
-    """By the definition of Grupp's evo (matching_time_indices)."""
+def test_relative_errors_and_pairs_by_time_are_those_of_evo(truth):
+    """By the definition of Grupp's evo (matching_time_indices; pairs by path; E of Kuemmerle et al.)."""
     rng, fields = np.random.default_rng(3), {"K": None, "size": None}
     times = 1e9 + np.arange(14) * 0.1
     reference = renamed(truth, [f"{time:.6f}" for time in times], **fields)
@@ -170,6 +184,31 @@ def test_pairs_by_time_are_those_of_evo(truth):
             expected.append((name, reference.names[j]))
     assert list(zip(found.names, found.names_b, strict=True)) == expected
     assert 4 < len(expected) < 14
+
+    def camera_to_world(model, names):
+        views = {view.name: view for view in model.views}
+        return [
+            np.linalg.inv(np.vstack([np.column_stack([v.R, v.t]), [0, 0, 0, 1]]))
+            for v in map(views.get, names)
+        ]
+
+    P, Q = camera_to_world(found.a, found.names), camera_to_world(reference, found.names_b)
+    for distance in (0.5, 1.5, 3.0):
+        ends, path = [], 0.0
+        for k in range(1, len(Q)):
+            path += np.linalg.norm(Q[k][:3, 3] - Q[k - 1][:3, 3])
+            if path >= distance:
+                ends.append(k)
+                path = 0.0
+        # The program begins with the end of the first motion, which counts here too.
+        pairs = list(zip([0, *ends], ends, strict=False))
+        errors = found.relative_errors(distance)
+        assert errors.pairs.tolist() == [list(pair) for pair in pairs]
+        E = [np.linalg.inv(np.linalg.inv(Q[i]) @ Q[j]) @ np.linalg.inv(P[i]) @ P[j] for i, j in pairs]
+        np.testing.assert_allclose(errors.translation, [np.linalg.norm(e[:3, 3]) for e in E], rtol=1e-9)
+        angles = [np.degrees(np.linalg.norm(Rotation.from_matrix(e[:3, :3]).as_rotvec())) for e in E]
+        np.testing.assert_allclose(errors.rotation_deg, angles, rtol=1e-6)
+        assert max(angles) > 0.1
 
 
 def test_too_few_cameras_and_cameras_on_a_line_are_compared_as_far_as_possible(truth):

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
-from thesisrecon import Camera, StageFailure, decompose_essential, decompose_homography, estimate_essential
+from thesisrecon import Camera, StageFailure, decompose_homography, estimate_essential, recover_pose
 from thesisrecon.geometry.relative_pose import essential_five_points, essential_from_pose
 
 K = np.array([[800.0, 0, 319.5], [0, 780, 239.5], [0, 0, 1]])
@@ -56,8 +56,9 @@ def test_pose_of_matches_lies_within_its_covariance(wrong):
         assert fit.inliers[: int(wrong * 300)].sum() <= 0.15 * wrong * 300
         scores.append(_score(fit, R, t))
         E = essential_from_pose(R, t)
-        poses = decompose_essential(-3.0 * E, xy1[fit.inliers], xy2[fit.inliers], *cameras)
-        assert _off_deg(poses.R[0], poses.t[0], R, t) < 1e-5
+        pose = recover_pose(-3.0 * E, xy1[fit.inliers], xy2[fit.inliers], *cameras)
+        assert _off_deg(pose.R, pose.t, R, t) < 1e-5
+        assert np.median(pose.depths[:, 0]) == pytest.approx(6.0, abs=0.5)
     # Among many wrong matches a few agree by chance, and count as right ones.
     assert wrong or 0.6 < np.mean(scores) < 1.6
     assert 0.4 < np.median(scores) < 5.0
@@ -157,9 +158,9 @@ def test_poses_are_as_accurate_as_those_of_opencv(wrong):
         E, mask = cv2.findEssentialMat(xy1, xy2, K, cv2.RANSAC, 0.9999, 1.0)
         _, R_cv, t_cv, _ = cv2.recoverPose(E, xy1, xy2, K, mask=mask.copy())
         theirs.append(_off_deg(R_cv, t_cv, R, t))
-        poses = decompose_essential(E, xy1[mask.ravel() > 0], xy2[mask.ravel() > 0], K)
-        np.testing.assert_allclose(poses.R[0], R_cv, atol=1e-9)
-        np.testing.assert_allclose(poses.t[0], t_cv.ravel(), atol=1e-9)
+        pose = recover_pose(E, xy1[mask.ravel() > 0], xy2[mask.ravel() > 0], K)
+        np.testing.assert_allclose(pose.R, R_cv, atol=1e-9)
+        np.testing.assert_allclose(pose.t, t_cv.ravel(), atol=1e-9)
     assert np.median(ours) <= np.median(theirs)
     assert np.max(ours) <= np.max(theirs)
 

@@ -242,6 +242,7 @@ CALLS = {
         tr.estimate_essential,
         {"xy1": XY[0], "xy2": XY[1], "K1": K, "threshold_px": 1.0} | SEARCH,
     ),
+    "recover_pose": (tr.recover_pose, {"E": K.T @ F @ K, "xy1": XY[0], "xy2": XY[1], "K1": K}),
     "decompose_homography": (
         tr.decompose_homography,
         {"H": K @ (R[0] + np.outer(T[0], [0.0, 0.0, 0.1])) @ np.linalg.inv(K), "K1": K, "xy1": XY[0]},

@@ -49,11 +49,26 @@ def test_nerf_gives_an_angle(tmp_path):
     np.testing.assert_allclose(camera.R[2], [0, 1, 0], atol=1e-12)
 
 
+def test_kalibr_gives_a_chain(tmp_path):
+    chain = tmp_path / "camchain.yaml"
+    rows = "".join(f"  - [{', '.join(map(str, row))}]\n" for row in np.c_[np.eye(3), [-0.1, 0, 0]].tolist())
+    entry = "  camera_model: pinhole\n  distortion_coeffs: [0.1, 0.2, {p}, 0.0]\n  distortion_model: radtan\n"
+    entry += "  intrinsics: [400.0, 401.0, 320.0, 240.0]\n  resolution: [640, 480]\n"
+    own = entry.format(p=0.0)
+    chain.write_text(f"cam0:\n{own}cam1:\n  T_cn_cnm1:\n{rows}  - [0, 0, 0, 1]\n{own}")
+    np.testing.assert_allclose(read_cameras(chain)["cam1"].centre, [0.1, 0, 0])
+    chain.write_text(f"cam0:\n{entry.format(p=0.01)}")
+    assert read_cameras(chain)["cam0"].distortion.tolist() == [0.1, 0.2, 0.01, 0.0, 0.0]
+    chain.write_text(f"cam0:\n{entry.format(p=0.01)}".replace("radtan", "fov"))
+    refuses(UsageError, "an unknown kind", read_cameras, chain)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
         ("transforms.json", '{"frames": [{"file_path": "a"}]}', "must hold frames"),
         ("transforms.json", '{"frames": []}', "no camera"),
+        ("camchain.yaml", "cam0:\n  resolution: [1]\n", "camchain.yaml of pinhole"),
     ],
 )
 def test_damaged_models_get_one_sentence(tmp_path, name, content, says):

@@ -157,6 +157,7 @@ def decompose_essential(
     """Return the four poses of an essential matrix, and how many matches each has in front (HZ 9.6.2, 9.6.3).
 
     With E = U diag(1, 1, 0) V', R is U W V' or U W' V' and t is u3 or -u3.
+    :func:`thesisrecon.recover_pose` returns the one of most matches.
 
     Parameters
     ----------

@@ -299,7 +299,8 @@ def read_cameras(path: str | Path) -> dict[str, Camera]:
     path : str or Path
         Folder of a run or of a COLMAP model, or a ``cameras.json``: {"cameras": [...]} with name, K, R, t or
         C, width, height and perhaps three radial coefficients "distortion" each, or a table by name. Also a
-        ``transforms.json`` (NeRF, nerfstudio) or a ``par.txt`` (Middlebury).
+        ``transforms.json`` (NeRF, nerfstudio), a ``par.txt`` (Middlebury) or a ``camchain.yaml`` (Kalibr;
+        named cam0, cam1, ... in the frame of cam0).
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Relative poses of calibrated cameras: essential matrix, and a homography taken apart."""
+"""Relative poses of calibrated cameras: essential matrix, recovered pose, homography taken apart."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,21 @@ from thesisrecon.arrays import F64, checked, generator, numbers, require_calibra
 from thesisrecon.camera import Camera
 from thesisrecon.epipolar.essential import EssentialFit, fit_essential
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.relative_pose import poses_from_homography
+from thesisrecon.geometry.relative_pose import pose_in_front, poses_from_homography
 from thesisrecon.runtime._blas import one_blas_thread
 
 Calibration = F64 | Camera  # K (3, 3), or a camera, whose lens counts too and whose pose does not
+
+
+class RelativePose(NamedTuple):
+    """Pose of the second camera relative to the first: X in its frame is R X + t, with \\|t\\| = 1.
+
+    ``depths`` (N, 2) of the matches in both cameras, in units of the baseline, are negative behind a camera.
+    """
+
+    R: F64
+    t: F64
+    depths: F64
 
 
 class PlanePoses(NamedTuple):
@@ -92,6 +103,49 @@ def estimate_essential(
     budget = search_budget(confidence, max_samples)
     (K1, x1), (K2, x2) = _pinhole(caller, K1, x1), _pinhole(caller, K1 if K2 is None else K2, x2)
     return fit_essential(x1, x2, K1, K2, threshold_px, budget, generator(caller, seed))
+
+
+def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | None = None) -> RelativePose:
+    """Return the pose of an essential matrix that places most matches in front of both cameras (HZ 9.6.3).
+
+    With E = U diag(1, 1, 0) V', R is U W V' or U W' V' and t is u3 or -u3 (HZ 9.6.2); of the four, the one
+    with the most positive depths.
+
+    Parameters
+    ----------
+    E : ndarray (3, 3)
+        Essential matrix of any scale and sign, or K2' F K1 of a fundamental matrix.
+    xy1, xy2 : array_like (N, 2)
+        Inliers, N >= 1, px.
+    K1, K2 : ndarray (3, 3) or Camera
+        As for :func:`estimate_essential`.
+
+    Returns
+    -------
+    RelativePose
+        R, t and the depths of the matches.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a number is not finite, or K is no calibration matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from thesisrecon import recover_pose
+    >>> E = np.array([[0.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # t along x, no rotation
+    >>> pose = recover_pose(E, np.array([[0.0, 0.0]]), np.array([[-0.5, 0.0]]), np.eye(3))
+    >>> np.allclose(pose.R, np.eye(3)), np.allclose(pose.t, [-1, 0, 0]), pose.depths.round(9).tolist()
+    (True, True, [[2.0, 2.0]])
+    """
+    caller = "recover_pose"
+    (E,) = checked(caller, E=(E, (3, 3)))
+    x1, x2 = checked(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
+    if not len(x1):
+        raise ValueError("recover_pose needs at least one match, which decides between four poses; got none")
+    rays1, rays2 = calibrated_rays(caller, K1, x1), calibrated_rays(caller, K1 if K2 is None else K2, x2)
+    return RelativePose(*pose_in_front(E, rays1, rays2))
 
 
 def decompose_homography(

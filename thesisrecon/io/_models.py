@@ -1,11 +1,12 @@
 """Models of any kind as one record: runs, ``cameras.json``, models of other programs, trajectories.
 
-Of other programs: COLMAP and transforms.json (NeRF, nerfstudio); of data sets: par.txt (Middlebury),
+Of other programs: COLMAP, transforms.json (NeRF, nerfstudio) and Kalibr; of data sets: par.txt (Middlebury),
 NAME_cam.txt (MVSNet, BlendedMVS, DTU), a matrix P for each image. Known camera positions are read from CSV
 files: lengths, or latitude, longitude and height (WGS84).
 """
 
 import csv
+import json
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -33,8 +34,8 @@ def read_model(path: str | Path) -> SparseModel:
 
     A path is the folder of a run or of a COLMAP model (itself, or the parent of ``0`` or ``sparse/0``), a
     ``cameras.json`` or a trajectory, camera-to-world: TUM (time, centre and quaternion x, y, z, w per line,
-    named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000); a transforms.json
-    or par.txt; a folder with NAME_cam.txt or P of each image.
+    named by time) or KITTI (3 x 4 matrix per line, named by its number from 000000); a transforms.json,
+    camchain.yaml or par.txt; a folder with NAME_cam.txt or P of each image.
     UsageError for anything else.
     """
     path = Path(path)
@@ -52,7 +53,7 @@ def read_model(path: str | Path) -> SparseModel:
 
 _KNOWN = (
     "the folder of a run, a COLMAP model (cameras, images and points3D as .bin or .txt), a cameras.json, a "
-    "transforms.json or par.txt, a folder with NAME_cam.txt or a matrix P of each image, or a "
+    "transforms.json, camchain.yaml or par.txt, a folder with NAME_cam.txt or a matrix P of each image, or a "
     "trajectory as text with 8 (TUM) or 12 (KITTI) numbers per line"
 )
 
@@ -322,6 +323,8 @@ def read_other(path: Path) -> SparseModel | None:
     if path.suffix == ".json" and isinstance(content := read_json(path), dict) and "frames" in content:
         rule = "must hold frames with file_path and transform_matrix (nerfstudio, NeRF)"
         read = read_transforms
+    elif path.suffix in (".yaml", ".yml"):
+        read, rule = read_kalibr, "must be a camchain.yaml of pinhole cameras cam0, cam1, ..."
     elif path.name.endswith("par.txt"):
         read, rule = read_middlebury, "must have a line with the name, K, R and t of each camera"
     elif path.is_dir() and any(path.glob("*_cam.txt")):
@@ -481,3 +484,39 @@ def _upper(K: F64) -> F64:
     if not abs(K[0, 1]) <= 1e-3 * abs(K[0, 0]):
         raise ValueError("a camera has skewed pixels, which have no model here")
     return _calibration(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+
+
+def read_kalibr(path: Path) -> SparseModel:
+    """Read ``camchain.yaml`` of Kalibr: cam0, cam1, ... with ``T_cn_cnm1``, from each camera to the next."""
+    views, R, t = [], np.eye(3), np.zeros(3)
+    for i, (name, camera) in enumerate(_camchain(read_text(path)).items()):
+        if i and "T_cn_cnm1" in camera:
+            T = np.array(camera["T_cn_cnm1"], dtype=np.float64)
+            R_next, t_next = checked_pose(T[:3, :3], T[:3, 3])
+            R, t = R_next @ R, R_next @ t + t_next
+        fx, fy, cx, cy = (float(v) for v in camera["intrinsics"])
+        width, height = (int(v) for v in camera["resolution"])
+        model = camera.get("distortion_model", "none")
+        lens = np.zeros(4) if model == "none" else np.array(camera["distortion_coeffs"], dtype=np.float64)
+        kind = {"radtan": "brown", "none": "brown", "equidistant": "fisheye"}.get(model)
+        k = simplest_row(kind, lens) if kind and camera["camera_model"] == "pinhole" else None
+        views.append(SparseView(name, R, t, _calibration(fx, fy, cx, cy), (width, height), k, i))
+    return SparseModel(views)
+
+
+def _camchain(text: str) -> dict[str, dict[str, Any]]:
+    """Cameras of a camchain: keys with numbers, words, lists in brackets, and rows that begin with "-"."""
+    cameras: dict[str, dict[str, Any]] = {}
+    key = ""
+    for line in text.splitlines():
+        line = line.split("#")[0].rstrip()
+        if found := re.fullmatch(r"(cam\d+):", line):
+            cameras[found[1]] = {}
+        elif cameras and (row := re.fullmatch(r"\s+-\s*(\[.*\])", line)):
+            [*cameras.values()][-1].setdefault(key, []).append(json.loads(row[1]))
+        elif cameras and (entry := re.fullmatch(r"\s+(\w+):\s*(.*)", line)):
+            key, value = entry[1], entry[2]
+            if value:
+                value = json.loads(value) if value.startswith("[") else value.strip("'\"")
+                [*cameras.values()][-1][key] = value
+    return cameras

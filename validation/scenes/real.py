@@ -116,7 +116,7 @@ def with_known_cameras(scene: Scene, folder: Path) -> Scene:
 
 
 TRUTHS = (
-    *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "sparse/0", "sparse"),
+    *("cameras.json", "transforms.json", "par.txt", "*_par.txt", "camchain.yaml", "sparse/0", "sparse"),
     *("dslr_calibration_undistorted", "cams", "cameras", "cal18", "groundtruth.txt", "poses.txt"),
 )
 
