@@ -103,7 +103,7 @@ def number_or_numbers(caller: str, name: str, value: Any) -> F64:
         return numbers(caller, **{name: value})[0]
 
 
-_LARGEST = 1e100  # Squares and products of a few such numbers are finite
+_LARGEST = np.float64(1e100)  # Squares and products of a few such numbers are finite
 
 
 def are_finite(*values: Any) -> bool:

@@ -65,7 +65,7 @@ def elements(out):
 def test_each_output_that_fails_costs_one_warning(whole, tmp_path, monkeypatch, error):
     names, there, drawn = whole
     assert {"report.html", "points.ply", "sparse/0", "model.glb", "model-full.glb"} < set(names)
-    assert len(names) > 15
+    assert len(names) >= 15
     assert there >= RECORDS
     for k, what in enumerate(names):
         out = tmp_path / str(k)

@@ -19,7 +19,7 @@ from thesisrecon.records import DepthMap, DisparityMap, Image, PinholeView
 from thesisrecon.stereo import correspondence, depth
 from thesisrecon.stereo._depth_fusion import _concatenated, fuse_inverse_depths, inverse_depths
 from thesisrecon.stereo._epipolar_pair import pair_of_cameras
-from thesisrecon.stereo.correspondence import PairMatching, _brightness_gain, _sample_disparity
+from thesisrecon.stereo.correspondence import PairMatching, _sample_disparity, brightness_gain
 from thesisrecon.stereo.depth import (
     MultiViewStereo,
     _complete_depths,
@@ -324,9 +324,9 @@ def test_brightness_is_made_alike(walled):
     points = _sparse_points(walled.reconstruction, views)
     darker = np.rint(views[1].rgb * np.array([0.8, 0.7, 0.9])).astype(np.uint8)
     xy = _shared_projections(points, views[0], views[1])
-    gain = _brightness_gain(views[0].rgb, darker, *xy) / _brightness_gain(views[0].rgb, views[1].rgb, *xy)
+    gain = brightness_gain(views[0].rgb, darker, *xy) / brightness_gain(views[0].rgb, views[1].rgb, *xy)
     np.testing.assert_allclose(gain, 1.0 / np.array([0.8, 0.7, 0.9]), rtol=0.02)
-    assert (_brightness_gain(views[0].rgb, darker, xy[0][:3], xy[1][:3]) == 1.0).all()
+    assert (brightness_gain(views[0].rgb, darker, xy[0][:3], xy[1][:3]) == 1.0).all()
 
 
 def test_links_of_a_chain_lead_from_view_to_view():

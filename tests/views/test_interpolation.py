@@ -18,6 +18,7 @@ from thesisrecon.stereo.correspondence import RectifiedPair
 from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views._warping import DIRECTIONS, fill_holes, forward_map, sample
 from thesisrecon.views.interpolation import (
+    InterpolatedPair,
     detect_monotonicity_violations,
     disparity_of_right,
     original_from_rectified,
@@ -127,6 +128,7 @@ def psnr(a, b):
 def test_views_between_are_those_of_the_scene(stage):
     left, right = stage.left, stage.right
     pair = prepare_rectified_pair(left, right, disparity=tuple(stage.maps))
+    assert isinstance(pair, InterpolatedPair)
     for s in (0.25, 0.5, 0.8):
         truth, _ = stage.at(s)
         view = pair.view(s, threads=2)

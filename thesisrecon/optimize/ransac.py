@@ -267,8 +267,7 @@ def _cost(fit: Resection, X: F64, xy: F64) -> float:
 
 def _mirrored(fit: Resection, X: F64, xy: F64) -> list[tuple[float, Resection]]:
     """The other pose near which a flat object looks the same, with its cost; none if it has only one."""
-    centre, inside = X[fit.inliers].mean(axis=0), X[fit.inliers]
-    normal = np.linalg.eigh((inside - centre).T @ (inside - centre))[1][:, 0]
+    centre, normal = X[fit.inliers].mean(axis=0), np.linalg.eigh(np.cov(X[fit.inliers].T))[1][:, 0]
     place = fit.R @ centre + fit.t
     view = place / np.linalg.norm(place)
     # Reflected along the normal, which does not move a plane, and the line of sight: pixels hardly move.
