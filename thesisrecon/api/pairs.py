@@ -376,19 +376,23 @@ def epipolar_lines(F: F64, xy1: F64) -> F64:
 def _drawn(image: U8, lines: F64, xy: F64) -> U8:
     """An image with lines (N, 3) and points (N, 2); number k always has the same colour."""
     height, width = image.shape[:2]
-    thick = max(1, round(max(height, width) / 400))
-    # At twice the size, then reduced for smooth edges; other pixels do not change.
-    picture = PillowImage.fromarray(image).resize((2 * width, 2 * height), PillowImage.Resampling.NEAREST)
-    draw = ImageDraw.Draw(picture)
-    for k, (line, point) in enumerate(zip(lines, 2.0 * xy + 0.5, strict=True)):
-        # The golden ratio spreads hues evenly for any number of matches.
-        colour = f"hsv({222.4922 * k % 360.0:.3f}, 100%, 100%)"
-        if (ends := clip_line(line, width, height)) is not None:
-            draw.line([tuple(2.0 * end + 0.5) for end in ends], colour, 2 * thick)
-        radius = 9 * thick - 0.5
-        low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
-        draw.ellipse((*low, *high), outline=colour, width=2 * thick)
-    return np.asarray(picture.reduce(2))
+    thick, fine, strip = max(1, round(max(height, width) / 400)), 4, 256
+    drawn = np.empty_like(image)
+    # At four times the size, then reduced: edges are smooth and right to an eighth of a pixel.
+    for top in range(0, height, strip):
+        part = PillowImage.fromarray(image[top : top + strip])
+        picture = part.resize((fine * part.width, fine * part.height), PillowImage.Resampling.NEAREST)
+        draw, shift = ImageDraw.Draw(picture), np.array([0.0, fine * top]) - (fine - 1) / 2.0
+        for k, (line, point) in enumerate(zip(lines, fine * xy - shift, strict=True)):
+            # The golden ratio spreads hues evenly for any number of matches.
+            colour = f"hsv({222.4922 * k % 360.0:.3f}, 100%, 100%)"
+            if (ends := clip_line(line, width, height)) is not None:
+                draw.line([tuple(fine * end - shift) for end in ends], colour, fine * thick)
+            radius = 4.5 * fine * thick - 0.5
+            low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
+            draw.ellipse((*low, *high), outline=colour, width=fine * thick)
+        drawn[top : top + strip] = np.asarray(picture.reduce(fine))
+    return drawn
 
 
 Formula = Literal["noble", "harris"]
