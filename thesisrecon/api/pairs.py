@@ -382,14 +382,16 @@ def _drawn(image: U8, lines: F64, xy: F64) -> U8:
     for top in range(0, height, strip):
         part = PillowImage.fromarray(image[top : top + strip])
         picture = part.resize((fine * part.width, fine * part.height), PillowImage.Resampling.NEAREST)
-        draw, shift = ImageDraw.Draw(picture), np.array([0.0, fine * top]) - (fine - 1) / 2.0
-        for k, (line, point) in enumerate(zip(lines, fine * xy - shift, strict=True)):
+        draw, shift = ImageDraw.Draw(picture), np.array([0.0, fine * top])
+        for k, (line, point) in enumerate(zip(lines, fine * xy + (fine - 1) / 2.0, strict=True)):
             # The golden ratio spreads hues evenly for any number of matches.
             colour = f"hsv({222.4922 * k % 360.0:.3f}, 100%, 100%)"
             if (ends := clip_line(line, width, height)) is not None:
-                draw.line([tuple(fine * end - shift) for end in ends], colour, fine * thick)
+                # Whole numbers are drawn alike in every strip, by an even width half a pixel farther.
+                ends = np.rint(fine * np.asarray(ends) + fine / 2.0 - 1.0) - shift
+                draw.line([tuple(end) for end in ends], colour, fine * thick)
             radius = 4.5 * fine * thick - 0.5
-            low, high = np.clip([point - radius, point + radius], -1e6, 1e6)
+            low, high = np.rint(np.clip([point - radius, point + radius], -1e6, 1e6)) - shift
             draw.ellipse((*low, *high), outline=colour, width=fine * thick)
         drawn[top : top + strip] = np.asarray(picture.reduce(fine))
     return drawn
