@@ -110,10 +110,9 @@ def patched():
         yield
 
 
-FRAME = "00-frames/00-000000.png"
 KNOWN = (
     *(name for name in RESULT_FILES if "*" not in name), "config.toml", "run.json",
-    FRAME, "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
+    "00-frames/00-000000.png", "00-frames/frames.json", "group-2/summary.json", "group-2/cameras.json",
     "transforms.json", "images/00.png", "images/01.png", "scene.mvs",
 )  # fmt: skip
 """Files that --overwrite may replace; the following survive it, too."""
@@ -157,9 +156,6 @@ def make_state(rng, stock, place):
             RUN_FILES[kind](out / "run.json")
         for name in rng.choice(KNOWN + UNKNOWN, rng.integers(0, 4), replace=False).tolist():
             add_file(rng, out / name, outside, own)
-        if state in ("video", "cut video") and own.get(out / FRAME, ("link",))[0] == "file":
-            # A frame that was exchanged is extracted again.
-            del own[out / FRAME]
         for name in rng.choice(FOLDERS, int(rng.random() < 0.25)).tolist():
             if not os.path.lexists(out / name) and (out / name).parent.is_dir():
                 (out / name).symlink_to(outside)

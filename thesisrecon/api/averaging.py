@@ -90,9 +90,8 @@ def average_rotations(pairs: I64, R: F64, *, weights: F64 | None = None) -> Aver
         if k > _ROUNDS // 2 and np.abs(step).max(initial=0.0) < 1e-10:
             break
     angle = np.linalg.norm(errors(), axis=1)
-    residual, last = (np.full(len(use), np.nan) for _ in range(2))
-    residual[use], last[use] = np.degrees(angle), _loss_weights(angle, _ROUNDS)
-    return AveragedRotations(np.where(known[:, None, None], average, np.nan), residual, last)
+    agreement = _of_all_pairs(use, angle, _loss_weights(angle, _ROUNDS))
+    return AveragedRotations(np.where(known[:, None, None], average, np.nan), *agreement)
 
 
 def average_translations(pairs: I64, t: F64, R: F64, *, weights: F64 | None = None) -> AveragedCentres:
@@ -174,9 +173,7 @@ def average_translations(pairs: I64, t: F64, R: F64, *, weights: F64 | None = No
         centres[free] = _solve_positive(A, D3.T @ (w[:, None] * v).ravel()).reshape(-1, 3)
     centres -= centres[known].mean(axis=0)
     centres /= np.sqrt((centres[known] ** 2).sum(axis=1).mean()) or 1.0
-    residual, last = (np.full(len(use), np.nan) for _ in range(2))
-    residual[use], last[use] = np.degrees(angle), weight
-    return AveragedCentres(np.where(known[:, None], centres, np.nan), residual, last)
+    return AveragedCentres(np.where(known[:, None], centres, np.nan), *_of_all_pairs(use, angle, weight))
 
 
 def _graph(caller: str, pairs: I64, weights: F64 | None) -> tuple[I64, I64, F64, B8]:
@@ -195,6 +192,13 @@ def _graph(caller: str, pairs: I64, weights: F64 | None) -> tuple[I64, I64, F64,
     graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (n, n))
     label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     return i, j, given, np.asarray(label == label[0])
+
+
+def _of_all_pairs(use: B8, angle: F64, weight: F64) -> tuple[F64, F64]:
+    """Return angles in degrees and weights (E,) of all pairs, NaN where they are not used."""
+    residual, last = (np.full(len(use), np.nan) for _ in range(2))
+    residual[use], last[use] = np.degrees(angle), weight
+    return residual, last
 
 
 def _along_tree(i: I64, j: I64, relative: F64, weights: F64, n: int) -> F64:

@@ -18,6 +18,7 @@ import scipy
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.geometry.homogeneous import homogenize
+from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.lens import stacked_rows, undistort
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
@@ -199,8 +200,7 @@ def _of_resected_images(
     poses = [pose[::-1] for pose in _resected(first, second, rng)] + _resected(second, first, rng)
     answer = list[Similarity]()
     for one, two in combinations(poses, 2):
-        U, _, Vt = np.linalg.svd(sum(here[:, :3].T @ there[:, :3] for here, there in (one, two)))
-        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        R = nearest_rotation(one[0][:, :3].T @ one[1][:, :3] + two[0][:, :3].T @ two[1][:, :3])
         here, there = (np.array([-p[:, :3].T @ p[:, 3] for p in ends]) for ends in zip(one, two, strict=True))
         lengths = [float(np.linalg.norm(ends[1] - ends[0])) for ends in (here, there)]
         if min(lengths) > 0.0:
