@@ -8,6 +8,7 @@ docs/theory/projective.md compares the methods (Hartley and Sturm, "Triangulatio
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64, require_finite
@@ -267,7 +268,11 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
         )  # fmt: skip
         A1 = 4 * (-q * (1 + q) * cb + 2 * a_b * cc**2 * cb - (1 - (a2 + c2) / b2) * ca * cc)
         A0 = (1 + q) ** 2 - 4 * a_b * cc**2
-    v, sample = _real_quartic_roots(np.stack([A4, A3, A2, A1, A0], axis=1))
+    x = polynomial_roots(np.stack([A4, A3, A2, A1, A0], axis=1))
+    sample, which = np.nonzero(
+        (np.abs(x.imag) < 1e-4 * (1.0 + np.abs(x.real))) & (x.real > 0.0) & (x.real < 1e100)
+    )
+    v = x.real[sample, which]
     X, rays, q, b2, ca, cb, cc = (array[sample] for array in (X, rays, q, b2, ca, cb, cc))
     with np.errstate(divide="ignore", invalid="ignore"):
         u = ((q - 1) * v**2 - 2 * q * cb * v + 1 + q) / (2 * (cc - v * ca))
@@ -281,19 +286,21 @@ def pose_from_three_points(X: F64, rays: F64) -> F64:
     return np.asarray(np.concatenate([R, t[:, :, None]], axis=2)[np.linalg.det(R) > 0.5])
 
 
-def _real_quartic_roots(c: F64) -> tuple[F64, I64]:
-    """Positive real roots of quartics c (B, 5), highest power first, with their rows (companion matrices)."""
-    # Those of the reversed quartic are 1 / x: the larger of both ends leads.
-    small = np.abs(c[:, 0]) < np.abs(c[:, 4])
+def polynomial_roots(c: F64) -> NDArray[np.complex128]:
+    """Complex roots (N, D) of polynomials c (N, D + 1), highest power first (companion matrices).
+
+    NaN if both ends of c are nearly zero.
+    """
+    # Those of the reversed polynomial are 1 / x: the larger of both ends leads.
+    small = np.abs(c[:, 0]) < np.abs(c[:, -1])
     c = np.where(small[:, None], c[:, ::-1], c)
     good = np.isfinite(c).all(axis=1) & (np.abs(c[:, 0]) > 1e-12 * np.abs(c).max(axis=1, initial=1e-300))
-    companion = np.eye(4, k=-1) * np.ones((np.count_nonzero(good), 1, 1))
+    companion = np.eye(c.shape[1] - 1, k=-1) * np.ones((np.count_nonzero(good), 1, 1))
     companion[:, 0] = -c[good, 1:] / c[good, :1]
-    x = np.linalg.eigvals(companion) + 0j
-    x = np.where(small[good, None], 1.0 / np.where(x == 0.0, 1e-300, x), x)
-    real = (np.abs(x.imag) < 1e-4 * (1.0 + np.abs(x.real))) & (x.real > 0.0) & (x.real < 1e100)
-    sample, which = np.nonzero(real)
-    return np.asarray(x.real[sample, which], dtype=np.float64), np.flatnonzero(good)[sample]
+    x = np.full((len(c), c.shape[1] - 1), np.nan + 0j)
+    x[good] = np.linalg.eigvals(companion)
+    x[small] = 1.0 / np.where(x[small] == 0.0, 1e-300, x[small])
+    return x
 
 
 def _triad(X: F64) -> F64:

@@ -398,42 +398,15 @@ def batch_pairs(
     if workers is None:
         return [[n] for n in left.values()]
     size = min(max(len(numbers) // (BATCHES_PER_WORKER * workers), 1), MAX_BATCH)
-    near: dict[int, set[int]] = {view: set() for pair in left for view in pair}
-    for i, j in left:
-        near[i].add(j)
-        near[j].add(i)
-    batches = []
-    while left:
-        batch, room = list[int](), MAX_RESULT_BYTES
-        for i, j in _pairs_of_few_views(left, near):
-            room -= PAIR_BYTES + MATCH_BYTES * min(corners[i], corners[j])
-            if len(batch) == size or (batch and room < 0):
-                break
-            batch.append(left.pop((i, j)))
-            near[i].remove(j)
-            near[j].remove(i)
-        batches.append(batch)
+    batches, room = list[list[int]](), 0
+    for (i, j), n in left.items():
+        needed = PAIR_BYTES + MATCH_BYTES * min(corners[i], corners[j])
+        if not batches or len(batches[-1]) == size or needed > room:
+            batches.append([])
+            room = MAX_RESULT_BYTES
+        batches[-1].append(n)
+        room -= needed
     return batches
-
-
-def _pairs_of_few_views(
-    left: Mapping[tuple[int, int], int], near: Mapping[int, set[int]]
-) -> Iterator[tuple[int, int]]:
-    """Yield pairs of a growing set of views, which the caller removes from ``left`` and ``near``."""
-    views, ties = set[int](), Counter[int]()
-    while left:
-        added: tuple[int, ...]
-        if ties:
-            added = (max(ties, key=lambda view: (ties[view], -len(near[view]), -view)),)
-            for view in sorted(views & near[added[0]]):
-                yield min(view, *added), max(view, *added)
-        else:
-            added = first = next(iter(left))
-            yield first
-        views.update(added)
-        for view in added:
-            del ties[view]
-            ties.update(near[view])
 
 
 def _detect(config: PipelineConfig, image: Image, frame: lens.StraightFrame | None) -> list[Features]:
