@@ -36,29 +36,18 @@ class LocallyOptimisedRansac:
     lie just beyond that limit, the noise may exceed the threshold: the search is repeated with a wider gate,
     and its result is used if it is more likely and leaves few matches unexplained.
 
-    Parameters
-    ----------
-    threshold_px : float
-        Largest Sampson distance of an inlier during the search.
-    confidence, max_samples : float, int
-        Probability that one of six searches draws a sample without outliers, and the largest number of
-        samples of all searches together.
-    starts : int
-        Number of searches that must end at the same score.
-    inlier_sigmas : float
-        Maximum residual of an inlier in standard deviations; infinite includes the tail of the noise.
-
     References
     ----------
     .. [1] P. Torr and A. Zisserman, "MLESAC", CVIU 78, 2000.
     .. [2] O. Chum, J. Matas and J. Kittler, "Locally optimized RANSAC", DAGM 2003.
     """
 
-    threshold_px: float = 1.0
-    confidence: float = 0.9999
-    max_samples: int = 60000
-    starts: int = 3
+    threshold_px: float = 1.0  #: largest Sampson distance of an inlier during the search
+    confidence: float = 0.9999  #: probability that one of six searches draws a sample without outliers
+    max_samples: int = 60000  #: largest number of samples of all searches together
+    starts: int = 3  #: number of searches that must end at the same score
     inlier_sigmas: float = np.inf
+    """Maximum residual of an inlier in standard deviations; infinite includes the tail of the noise."""
 
     max_starts = 10  # maximum number of searches
     # Minimum number of samples of six searches together, for any inlier ratio, because a wrong F of a

@@ -159,27 +159,14 @@ class ThesisRansac:
     Differences from the thesis: the search counts inliers within a fixed threshold, since the fraction within
     a multiple of the median is the same for every F; the refinement uses the orthonormal representation,
     which reaches every epipole.
-
-    Parameters
-    ----------
-    threshold_px : float
-        Sampson distance of an inlier during the search.
-    samples : int
-        Maximum number of samples.
-    epipolar_distance : bool
-        Minimise the distances to epipolar lines (5.6) in the refinement instead of the Sampson distances
-        (5.4).
-    rounds : int
-        Rounds of refinement.
-    inlier_test : {"sampson", "epipolar-distance", "symmetric-distance"}
-        Test of a match: the default, or the first or second test of section 5.4.
     """
 
-    threshold_px: float = 1.0
-    samples: int = 1000
+    threshold_px: float = 1.0  #: Sampson distance of an inlier during the search
+    samples: int = 1000  #: maximum number of samples
     epipolar_distance: bool = False
-    rounds: int = 2
-    inlier_test: InlierTest = "sampson"
+    """Minimise the distances to epipolar lines (5.6) in the refinement instead of Sampson's (5.4)."""
+    rounds: int = 2  #: rounds of refinement
+    inlier_test: InlierTest = "sampson"  #: the default, or the first or second test of section 5.4
 
     stop_inlier_ratio = 0.95  # inlier ratio at which sampling stops
 

@@ -275,14 +275,9 @@ class PairVerification:
     A wrong F on a repetitive facade has about 30 inliers and a small inlier ratio; a right one has more. A
     plane or a pure rotation gives good tracks and an undetermined F: the pair is accepted, and its
     ``configuration``, ``degeneracy`` and ``homography_inlier_ratio`` report it.
-
-    Parameters
-    ----------
-    min_inliers : int
-        Minimum number of verified matches, at least 8.
     """
 
-    min_inliers: int = 60
+    min_inliers: int = 60  #: minimum number of verified matches, at least 8
 
     min_inlier_ratio = 0.25  # minimum fraction of the matches that are verified
     homography_px = 2.0  # distance within which a homography explains a match, or 4.3 sigma if that is more

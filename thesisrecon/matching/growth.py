@@ -255,35 +255,22 @@ class SeedsAndGrowth:
     F is estimated from the seeds whose neighbours have similar displacements, and also from all seeds if few
     of these or fewer than half agree; the F with more inliers is used. Patches rotated to their dominant
     gradient are matched if few upright ones agree with one F.
-
-    Parameters
-    ----------
-    ratio : float
-        Maximum ratio of the distances to the best and second best match of a seed.
-    neighbours : int
-        Number of matches that define a local affine map.
-    growth : bool
-        Match all corners by guided search, those of the coarser scale first, else only corners at seeds.
-    rematch : bool
-        Repeat the guided matching with the F and the maps of its own matches. If these cover a third of the
-        corners of image 1, only the other corners are matched again.
-    align : bool
-        Align positions in image 2 by least-squares matching, else keep the corners.
-    many_images : int
-        Number of images above which pairs are first matched with fewer corners and seeds, since many images
-        show each point, and with all only if these give few matches or the images form a long sequence.
-    oblique_pairs : int
-        Number of pairs of each image outside the largest group of matched images that are matched again with
-        seeds of simulated oblique views; 0 for none.
     """
 
-    ratio: float = 0.8
-    neighbours: int = 10
+    ratio: float = 0.8  #: maximum ratio of the distances to the best and second best match of a seed
+    neighbours: int = 10  #: number of matches that define a local affine map
     growth: bool = True
+    """Match all corners by guided search, those of the coarser scale first, else only corners at seeds."""
     rematch: bool = True
-    align: bool = True
+    """Repeat the guided matching with the F and the maps of its own matches. If these cover a third of the
+    corners of image 1, only the other corners are matched again."""
+    align: bool = True  #: align positions in image 2 by least-squares matching, else keep the corners
     many_images: int = 40
+    """Number of images above which pairs are first matched with fewer corners and seeds, since many images
+    show each point, and with all only if these give few matches or the images form a long sequence."""
     oblique_pairs: int = 6
+    """Number of pairs of each image outside the largest group of matched images that are matched again with
+    seeds of simulated oblique views; 0 for none."""
 
     # Minimum half width of the epipolar band, relative to the long side; three standard deviations of the
     # epipolar line if that is more.

@@ -46,18 +46,10 @@ class AllPairs:
 
 @dataclass(frozen=True)
 class SequenceWindow:
-    """Each image with the next ones in the order of the file names, with numbers compared as numbers.
+    """Each image with the next ones in the order of the file names, with numbers compared as numbers."""
 
-    Parameters
-    ----------
-    window : int
-        Number of following images.
-    loop : bool
-        Continue with the first image after the last.
-    """
-
-    window: int = 5
-    loop: bool = False
+    window: int = 5  #: number of following images
+    loop: bool = False  #: continue with the first image after the last
 
     def __post_init__(self) -> None:
         if self.window < 1:
@@ -82,14 +74,9 @@ class ListedPairs:
     """The pairs of file names listed by the user.
 
     Pairs of an image that was left out (unreadable, a copy) are dropped.
-
-    Parameters
-    ----------
-    listed : tuple of (str, str)
-        Pairs of file names, each once, in any order.
     """
 
-    listed: tuple[tuple[str, str], ...] = ()
+    listed: tuple[tuple[str, str], ...] = ()  #: pairs of file names, each once, in any order
 
     def __post_init__(self) -> None:
         seen: set[frozenset[str]] = set()
@@ -131,20 +118,13 @@ class OverlapEstimate:
     Each image is compared with a fixed number of others by bag-of-words similarity, so that the time grows
     with the number of images and not with its square. The best few pairs of each image and the best pairs
     that connect the set are added: every image is matched, and a chain of pairs connects any two.
-
-    Parameters
-    ----------
-    nearest : int
-        Pairs of each image that are always taken.
-    most, spread : int
-        Numbers of pairs taken for each image among those with enough evidence: the best ones, and further
-        ones evenly from the rest. The latter have wider baselines, so that many images from nearly the same
-        place are also connected with others.
     """
 
-    nearest: int = 3
-    most: int = 10
+    nearest: int = 3  #: pairs of each image that are always taken
+    most: int = 10  #: largest number of pairs of most evidence that are taken for each image
     spread: int = 2
+    """Number of further pairs of each image, evenly from the rest with enough evidence: they have wider
+    baselines, so that many images from nearly the same place are also connected with others."""
 
     all_up_to = 30  # number of images up to which all pairs are taken
     min_evidence = 0.5  # minimum -log10 of the number of false alarms
@@ -193,16 +173,9 @@ class OverlapEstimate:
 
 @dataclass(frozen=True)
 class PairsOfAdded:
-    """The pairs of a run, and those that add images to it: with the most overlap evidence for each new image.
+    """The pairs of a run, and those that add images to it, of most overlap evidence for each new image."""
 
-    Parameters
-    ----------
-    before : ndarray (M, 2)
-        Pairs of the first ``count`` images.
-    count : int
-    """
-
-    before: I64
+    before: I64  #: (M, 2) pairs of the first ``count`` images
     count: int
 
     def select(

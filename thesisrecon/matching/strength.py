@@ -120,39 +120,19 @@ class StrengthOfMatch:
     functions is lost; lambda is the product of direction max(0, cos), length min / max and distance 1 - d /
     radius as in the text. ``weight`` = "relative-difference" and the fields after it are not in the thesis
     and off by default.
-
-    Parameters
-    ----------
-    radius_rel : float
-        Search radius, relative to the long side.
-    candidates : int
-        K, number of corners of highest correlation whose strength is computed.
-    neighbours : int
-        M, number of neighbours of a corner in image 1; in image 2 these are 1.5 M.
-    window : int
-        K = L, side of the correlation window, px, odd.
-    colour : bool
-        Mean correlation of red, green and blue instead of grey values.
-    weight : {"product", "relative-difference"}
-        Product of figure 4.4, or exp(-1/2 (|d_m - d| / (0.3 |u_m - u| + 1 px))^2) of displacements d, which
-        also suits short displacements and deep scenes.
-    min_correlation : float
-        Correlation that a candidate must exceed.
-    min_strength : float
-        Minimum strength relative to M perfectly agreeing neighbours, in [0, 1).
-    align : bool
-        Align positions in image 2 by least-squares matching.
     """
 
-    radius_rel: float = 0.16
-    candidates: int = 10
-    neighbours: int = 10
-    window: int = _prepared.SIDE
-    colour: bool = False
+    radius_rel: float = 0.16  #: search radius, relative to the long side
+    candidates: int = 10  #: K, number of corners of highest correlation whose strength is computed
+    neighbours: int = 10  #: M, number of neighbours of a corner in image 1; in image 2 these are 1.5 M
+    window: int = _prepared.SIDE  #: K = L, side of the correlation window, px, odd
+    colour: bool = False  #: mean correlation of red, green and blue instead of grey values
     weight: Literal["product", "relative-difference"] = "product"
-    min_correlation: float = 0.0
-    min_strength: float = 0.0
-    align: bool = False
+    """Product of figure 4.4, or exp(-1/2 (|d_m - d| / (0.3 |u_m - u| + 1 px))^2) of displacements d, which
+    also suits short displacements and deep scenes."""
+    min_correlation: float = 0.0  #: correlation that a candidate must exceed
+    min_strength: float = 0.0  #: minimum strength relative to M perfectly agreeing neighbours, in [0, 1)
+    align: bool = False  #: align positions in image 2 by least-squares matching
 
     def __post_init__(self) -> None:
         require_range(self, candidates="[1, inf)", neighbours="[1, inf)")

@@ -146,16 +146,11 @@ def _affines_from_middle_view(chains: _Chains, pairs: Sequence[TwoView]) -> tupl
 
 @dataclass(frozen=True)
 class PlainTracks:
-    """Tracks with every observation at its corner.
-
-    Parameters
-    ----------
-    merge_px : float
-        Distance up to which positions of one view become one corner, px at working size; used only for
-        matches without corners.
-    """
+    """Tracks with every observation at its corner."""
 
     merge_px: float = MERGE_PX
+    """Distance up to which positions of one view become one corner, px at working size; used only for matches
+    without corners."""
 
     def __post_init__(self) -> None:
         require_range(self, merge_px="[0, inf)")

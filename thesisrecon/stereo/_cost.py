@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from thesisrecon._numba import copy_to, empty, full, kernel, zeros
+from thesisrecon._numba import empty, full, kernel, zeros
 from thesisrecon.arrays import I16, I32, U8, U16
 
 LEVELS = 4  #: integer steps of one grey level: resampled images have fractional levels
@@ -102,25 +102,17 @@ def _count_ones(word: np.int32) -> np.uint32:
     return np.uint32(np.uint32(x * np.uint32(0x01010101)) >> np.uint32(24))
 
 
-@kernel
-def _compare(centre: I16, other: I16, bits: I32) -> None:
-    for x in range(len(centre)):
-        bits[x] = np.int32(bits[x] << 1) | np.int32(other[x] < centre[x])
-
-
-@kernel
-def census(padded: I16) -> I32:
+def census(grey: I16) -> I32:
     """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre.
 
-    Of an image that is padded by two pixels: windows of 5 x 5 pixels, 24 comparisons.
+    Windows of 5 x 5 pixels, 24 comparisons; the border is repeated.
     """
-    height, width = padded.shape[0] - 4, padded.shape[1] - 4
-    bits = zeros((height, width), np.int32)
-    for y in range(height):
-        for k in range(25):
-            if k != 12:
-                beside = padded[y + k // 5, k % 5 : k % 5 + width]
-                _compare(padded[y + 2, 2 : 2 + width], beside, bits[y])
+    (height, width), padded = grey.shape, np.pad(grey, 2, mode="edge")
+    bits = np.zeros(grey.shape, np.int32)
+    for k in range(25):
+        if k != 12:
+            bits <<= 1
+            bits |= padded[k // 5 :, k % 5 :][:height, :width] < grey
     return bits
 
 
@@ -174,15 +166,11 @@ def _row_costs(
         d = first + q
         lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
         out = padded[q, margin : margin + width]
-        for x in range(lo):
-            out[x] = outside
-        for x in range(hi, width):
-            out[x] = outside
+        out[:lo], out[hi:] = outside, outside
         if hi <= lo:
             continue
         n = hi - lo
-        for x in range(n):
-            total[x] = 0
+        total[:n] = 0
         for k in range(len(a) if weights[1] != 0 else 0):
             _add_difference(a[k, y, lo:hi], b[k, y, lo - d : hi - d], total[:n])
         _hamming(bits_l[y, lo:hi], bits_r[y, lo - d : hi - d], differing[:n])
@@ -190,37 +178,21 @@ def _row_costs(
         _join(differing[:n], total[:n], known[:n], weights, outside, out[lo:hi])
 
 
-@kernel
-def _alike(a: I16, b: I16, tolerance: np.int16, mask: U8) -> None:
-    for x in range(len(mask)):
-        apart = np.int16(a[x] - b[x])
-        apart = np.int16(-apart) if apart < 0 else apart
-        before = mask[x]
-        mask[x] = before if apart <= tolerance else np.uint8(0)
+def support_masks(channels: I16, valid: U8, tolerance: np.int16) -> U8:
+    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009).
 
-
-@kernel
-def support_masks(channels: I16, valid: U8, tolerance: np.int16, masks: U8) -> None:
-    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009)."""
-    # 255 where the pixel s + 1 to the left, right, top or bottom is within `tolerance` in every channel, else
-    # 0.
+    255 where the pixel s + 1 to the left, right, top or bottom is within ``tolerance`` in each channel.
+    """
     height, width = valid.shape
-    masks[:] = 0
-    for arm in range(4):
-        for s in range(masks.shape[1]):
-            dx = (s + 1) * (-1 if arm == 0 else 1 if arm == 1 else 0)
-            dy = (s + 1) * (-1 if arm == 2 else 1 if arm == 3 else 0)
-            lo, hi = min(max(-dx, 0), width), max(min(width, width - dx), 0)
-            if hi <= lo:
-                continue
-            for y in range(max(-dy, 0), min(height, height - dy)):
-                mask = masks[arm, s, y, lo:hi]
-                if s == 0:
-                    copy_to(mask, valid[y + dy, lo + dx : hi + dx])
-                else:
-                    _both(masks[arm, s - 1, y, lo:hi], valid[y + dy, lo + dx : hi + dx], mask)
-                for k in range(len(channels)):
-                    _alike(channels[k, y, lo:hi], channels[k, y + dy, lo + dx : hi + dx], tolerance, mask)
+    levels, known = (np.pad(a, [(0, 0)] * (a.ndim - 2) + [(ARM, ARM)] * 2) for a in (channels, valid))
+    masks = np.zeros((4, ARM, height, width), np.uint8)
+    for arm, (dy, dx) in enumerate(((0, -1), (0, 1), (-1, 0), (1, 0))):
+        joined = np.full(valid.shape, 255, np.uint8)
+        for s in range(ARM):
+            beside = np.s_[..., ARM + (s + 1) * dy :, ARM + (s + 1) * dx :]
+            alike = (np.abs(levels[beside][..., :height, :width] - channels) <= tolerance).all(axis=0)
+            joined = masks[arm, s] = np.where(alike, joined & known[beside][:height, :width], 0)
+    return masks
 
 
 @kernel
@@ -239,11 +211,8 @@ def _sum_five(values: Any, masks: Any, out: U16) -> None:
 def _sum_along_row(padded: U8, masks: U8, y: int, out: U16) -> None:
     """Sums (W,) of the costs over the horizontal arms of row y; ``padded`` (W + 2 ARM,)."""
     n = len(out)
-    _sum_five(
-        (padded[:n], padded[1 : n + 1], padded[2 : n + 2], padded[3 : n + 3], padded[4 : n + 4]),
-        (masks[0, 0, y], masks[0, 1, y], masks[1, 0, y], masks[1, 1, y]),
-        out,
-    )
+    beside = padded[:n], padded[1 : n + 1], padded[2 : n + 2], padded[3 : n + 3], padded[4 : n + 4]
+    _sum_five(beside, (masks[0, 0, y], masks[0, 1, y], masks[1, 0, y], masks[1, 1, y]), out)
 
 
 @kernel

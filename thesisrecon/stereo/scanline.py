@@ -3,16 +3,18 @@
 Cox, Hingorani, Rao and Maggs, "A maximum likelihood stereo algorithm", CVIU 63(3), 1996, [26] of the thesis.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
-from thesisrecon._numba import empty, full, kernel, zeros
-from thesisrecon.arrays import F32, F64, I16, I32, I64, U8
+from thesisrecon._numba import full, kernel, zeros
+from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.errors import require_range
 from thesisrecon.records import DisparityMap
-from thesisrecon.stereo._cost import LEVELS, checked_range, estimate_noise, prepare_stereo_images
+from thesisrecon.stereo._cost import LEVELS, StereoImage, checked_range, estimate_noise, prepare_stereo_images
 from thesisrecon.stereo._postprocessing import final_confidence, texture_of
 
 OCCLUDED = -32768  #: disparity of an occluded pixel
@@ -24,33 +26,6 @@ fewer discontinuities.
 """
 MATCHED, LEFT_OCCLUDED, RIGHT_OCCLUDED = 0, 1, 2
 ROWS, WARM_UP = 96, 8  #: rows of a strip, and rows above it that are solved first to provide a previous row
-
-
-@kernel
-def _squared_differences(y: int, left: I16, right: I16, first: int, out: I32) -> None:
-    """Squared differences (D, W) of row y of (K, H, W) summed over channels, 0 outside the image."""
-    n, _, width = left.shape
-    for q in range(len(out)):
-        d = first + q
-        lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
-        out[q] = 0
-        if hi > lo:
-            for k in range(n):
-                a, b, total = right[k, y, lo - d : hi - d], left[k, y, lo:hi], out[q, lo:hi]
-                for x in range(len(total)):
-                    apart = np.int32(b[x]) - np.int32(a[x])
-                    total[x] = np.int32(total[x] + apart * apart)
-
-
-@kernel
-def _window_costs(columns: I32, lo: int, hi: int, radius: int, scale: float, out: I32) -> None:
-    """Sums of ``columns`` (W,) over 2 radius + 1 columns, border columns repeated, in steps of ``scale``."""
-    total = 0
-    for dx in range(-radius, radius + 1):
-        total += int(columns[min(max(lo + dx, lo), hi - 1)])
-    for x in range(lo, hi):
-        out[x] = np.int32(total * scale + 0.5)
-        total += int(columns[min(x + radius + 1, hi - 1)]) - int(columns[max(x - radius, lo)])
 
 
 @kernel
@@ -147,65 +122,33 @@ def _solve_row(
         _trace_back(states, last, first, left, right)
 
 
-@kernel
-def _posterior(costs: I32, first: int, found: I32, likelihood: F64, out: F32) -> None:
-    """Probability (W,) of the disparities found, or adjacent ones, among the whole range."""
-    n, width = costs.shape
-    for x in range(width):
-        out[x] = 0.0
-        if found[x] == OCCLUDED:
-            continue
-        least = costs[found[x] - first, x]
-        for q in range(n):
-            if costs[q, x] != NO_MATCH:
-                least = min(least, costs[q, x])
-        near, total = 0.0, 0.0
-        for q in range(n):
-            if costs[q, x] != NO_MATCH:
-                share = likelihood[min(costs[q, x] - least, len(likelihood) - 1)]
-                total += share
-                near += share if abs(first + q - found[x]) <= 1 else 0.0
-        out[x] = np.float32(near / total)
-
-
-@kernel
-def _solve_rows(
-    left: tuple[I16, U8], right: tuple[I16, U8], disparities: tuple[int, int],
-    model: tuple[int, float, int, int], likelihood: F64, out: tuple[I32, F32],
-) -> None:  # fmt: skip
-    """Solve the rows of a pair from the top, each with cohesion to the previous one."""
-    # `left`, `right`: channels (K, H, W), valid (H, W); `disparities`: first, last; `model`: window radius,
-    # steps per squared unit, penalties of :func:`_solve_row`; `out`: disparities (H, W) and probabilities.
-    first, last = disparities
-    radius, scale, penalties = model[0], model[1], (model[2], model[3])
+def _row_costs(
+    sides: Sequence[StereoImage], rows: slice, disparities: range, radius: int, scale: float
+) -> I32:
+    """Costs (H, D, W) of some rows: squared differences summed over channels and window, times ``scale``."""
+    left, right = [(side.channels[:, rows].astype(np.int32), side.valid[rows] > 0) for side in sides]
     height, width = left[1].shape
-    n, span = last - first + 1, 2 * radius + 1
-    ring, total = empty((span, n, width), np.int32), empty(width, np.int32)
-    costs = empty((n, width), np.int32)
-    found = full((2, 2, width), OCCLUDED, np.int32)
-    done = 0
-    for y in range(height):
-        while done < min(y + radius + 1, height):
-            _squared_differences(done, left[0], right[0], first, ring[done % span])
-            done += 1
-        for q in range(n):
-            d = first + q
-            lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
-            total[:] = 0
-            for dy in range(-radius, radius + 1):
-                row = ring[min(max(y + dy, 0), height - 1) % span, q]
-                for x in range(width):
-                    total[x] = np.int32(total[x] + row[x])
-            costs[q] = NO_MATCH
-            if hi > lo:
-                _window_costs(total, lo, hi, radius, scale, costs[q])
-            for x in range(lo, hi):
-                if left[1][y, x] == 0 or right[1][y, x - d] == 0:
-                    costs[q, x] = NO_MATCH
-        now, before = found[y & 1], found[1 - (y & 1)]
-        _solve_row(costs, first, penalties, (before[0], before[1]), now[0], now[1])
-        out[0][y] = now[0]
-        _posterior(costs, first, now[0], likelihood, out[1][y])
+    costs = np.full((height, len(disparities), width), NO_MATCH, np.int32)
+    for q, d in enumerate(disparities):
+        lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
+        if hi > lo:
+            here, there = np.s_[..., lo:hi], np.s_[..., lo - d : hi - d]
+            total = ((left[0][here] - right[0][there]) ** 2).sum(axis=0, dtype=np.int32)
+            for axis in (0, 1):
+                total = scipy.ndimage.correlate1d(total, np.ones(2 * radius + 1), axis, mode="nearest")
+            known = left[1][here] & right[1][there]
+            costs[:, q, lo:hi] = np.where(known, (total * scale + 0.5).astype(np.int32), NO_MATCH)
+    return costs
+
+
+def _posterior(costs: I32, first: int, found: I32, likelihood: F64) -> F32:
+    """Probability (W,) of the disparities found, or adjacent ones, among all of a row's costs (D, W)."""
+    known = costs != NO_MATCH
+    least = np.where(known, costs, np.iinfo(np.int32).max).min(axis=0)
+    share = np.where(known, likelihood[np.clip(costs - least, 0, len(likelihood) - 1)], 0.0)
+    near = np.abs(np.arange(first, first + len(costs))[:, None] - found) <= 1
+    total = np.where(found == OCCLUDED, 1.0, share.sum(axis=0))
+    return (np.where(near, share, 0.0).sum(axis=0) / total).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -248,26 +191,24 @@ class MaximumLikelihoodScanline:
         variance = min_variance + noise**2
         components = len(sides[0].channels) * (2 * self.radius + 1) ** 2
         occluded = _occlusion_cost(components, variance)
-        model = (
-            self.radius,
-            steps_per_nat / (4.0 * variance * LEVELS**2),
-            round(steps_per_nat * occluded),
-            round(steps_per_nat * (match_nats * components if self.out_of_view else occluded)),
-        )
+        scale = steps_per_nat / (4.0 * variance * LEVELS**2)
+        border = match_nats * components if self.out_of_view else occluded
+        penalties = round(steps_per_nat * occluded), round(steps_per_nat * border)
         likelihood = np.exp(-np.arange(int(significant * steps_per_nat) + 2) / steps_per_nat)
         likelihood[-1] = 0.0
         height, width = sides[0].valid.shape
-        disparity, confidence = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+        disparity, confidence = np.empty((2, height, width), np.float32)
         for start in range(0, height, ROWS):
-            stop, top = min(start + ROWS, height), max(start - WARM_UP, 0)
-            bottom = min(start + ROWS + self.radius, height)
-            rows = [(np.ascontiguousarray(s.channels[:, top:bottom]), s.valid[top:bottom]) for s in sides]
-            found = np.empty((bottom - top, width), np.int32)
-            probable = np.empty((bottom - top, width), np.float32)
-            _solve_rows(rows[0], rows[1], (first, last), model, likelihood, (found, probable))
-            own = slice(start - top, stop - top)
-            disparity[start:stop] = np.where(found[own] == OCCLUDED, np.float32(np.nan), found[own])
-            confidence[start:stop] = probable[own]
+            top, bottom = max(start - WARM_UP, 0), min(start + ROWS + self.radius, height)
+            costs = _row_costs(sides, slice(top, bottom), range(first, last + 1), self.radius, scale)
+            above = np.full((2, width), OCCLUDED, np.int32)
+            for y in range(top, min(start + ROWS, height)):
+                found = np.empty((2, width), np.int32)
+                _solve_row(costs[y - top], first, penalties, (above[0], above[1]), found[0], found[1])
+                if y >= start:
+                    disparity[y] = np.where(found[0] == OCCLUDED, np.float32(np.nan), found[0])
+                    confidence[y] = _posterior(costs[y - top], first, found[0], likelihood)
+                above = found
         confidence = final_confidence(confidence, disparity, disparity, texture_of(sides[0], noise))
         return DisparityMap(disparity, confidence, rounding_px)
 

@@ -172,11 +172,10 @@ class SemiGlobalMatching:
         measured = float(np.mean([_cost.estimate_noise(image) for image in images]))
         noise = float(np.hypot(min_noise, measured))
         (height, width), n = images[0].valid.shape, last - first + 1
-        bits = [_cost.census(np.pad(image.grey, 2, mode="edge")) for image in images]
-        arms = np.empty((4, _cost.ARM, height, width), np.uint8)
+        bits = [_cost.census(image.grey) for image in images]
         # The colour difference at which an arm of the support ends is five standard deviations.
         tolerance = np.int16(min(round(5.0 * noise * _cost.LEVELS), 255 * _cost.LEVELS))
-        _cost.support_masks(images[0].channels, images[0].valid, tolerance, arms)
+        arms = _cost.support_masks(images[0].channels, images[0].valid, tolerance)
         # A partner outside the image costs a share of the maximal cost.
         weights, outside = self._weights(len(images[0].channels), noise), np.uint8(round(0.4 * MAX_COST))
         edge = 14.0  # Intensity step that halves P2, in standard deviations of the noise
@@ -206,10 +205,7 @@ class SemiGlobalMatching:
             own = found[:, start:stop]
             _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
-        left, right, confidence = found
-        return self._postprocess(
-            left, right, confidence, images, _postprocessing.texture_of(images[0], measured)
-        )
+        return self._postprocess(*found, images, _postprocessing.texture_of(images[0], measured))
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
