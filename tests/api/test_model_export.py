@@ -1,7 +1,6 @@
 """Exports are read back by the programs themselves or by a reader of the format, and project known points."""
 
 import json
-import struct
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -101,66 +100,12 @@ def read_nerfstudio(folder):
     return found
 
 
-class Archive:
-    """Reader of OpenMVS's archive: little-endian values, counted texts and lists."""
-
-    def __init__(self, data):
-        self.data, self.at = data, 0
-
-    def take(self, form):
-        values = struct.unpack_from(f"<{form}", self.data, self.at)
-        self.at += struct.calcsize(f"<{form}")
-        return values if len(values) > 1 else values[0]
-
-    def text(self):
-        return self.take(f"{self.take('Q')}s").decode()
-
-    def list(self, read):
-        return [read() for _ in range(self.take("Q"))]
-
-    def matrix(self):
-        return np.array(self.take("9d")).reshape(3, 3)
-
-    def platform(self):
-        cameras = lambda: (self.text(), self.take("2I"), self.matrix(), self.matrix(), self.take("3d"))  # noqa: E731
-        return self.text(), self.list(cameras), self.list(lambda: (self.matrix(), np.array(self.take("3d"))))
-
-
-def read_openmvs(folder):
-    archive = Archive((folder / "scene.mvs").read_bytes())
-    assert (archive.take("4s"), archive.take("2I")) == (b"MVSI", (2, 0))
-    ((_, cameras, poses),) = archive.list(archive.platform)
-    images = archive.list(lambda: (archive.text(), archive.take("3I")))
-    points = archive.list(lambda: (archive.take("3f"), archive.list(lambda: archive.take("If"))))
-    assert archive.list(lambda: archive.take("3f")) == []
-    colors = archive.list(lambda: archive.take("3B"))
-    assert [archive.take("Q") for _ in range(3)] == [0, 0, 0]
-    np.testing.assert_array_equal(np.array(archive.take("16d")).reshape(4, 4), np.eye(4))
-    assert archive.at == len(archive.data)
-    expected = make_model(BARREL, PINCUSHION)
-    np.testing.assert_allclose([X for X, _ in points], expected.X, rtol=1e-6)
-    assert [[i for i, _ in seen] for _, seen in points] == [[0, 1, 2, 3]] * 40
-    np.testing.assert_array_equal(np.array(colors)[:, ::-1], expected.colors)
-    found = {}
-    for name, (_, number, pose) in images:
-        _, size, K, R, C = cameras[number]
-        np.testing.assert_array_equal(np.column_stack([R, C]), np.eye(3, 4))
-
-        def project(X, K=K, pose=poses[pose]):
-            x = (X - pose[1]) @ pose[0].T @ K.T
-            return x[:, :2] / x[:, 2:]
-
-        found[name.removeprefix("images/")] = project, size
-    return found
-
-
 @pytest.mark.parametrize(
     ("to", "read", "skew"),
     [
         pytest.param("colmap-undistorted", read_colmap, 0.0, marks=pytest.mark.references),
         pytest.param("colmap-undistorted", read_colmap, 3.0, marks=pytest.mark.references),
         ("nerfstudio", read_nerfstudio, 0.0),
-        ("openmvs", read_openmvs, 0.0),
     ],
 )
 def test_undistorted_exports_project_known_points(tmp_path, images, to, read, skew):
@@ -265,12 +210,10 @@ MASKED = np.s_[30:70, 40:90]
 """Rows and columns that the mask of one image leaves out."""
 
 
-@pytest.mark.parametrize("to", ["colmap-undistorted", "nerfstudio", "openmvs"])
+@pytest.mark.parametrize("to", ["colmap-undistorted", "nerfstudio"])
 def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path, images, to):
     """One image of four has a mask, or transparent pixels; programs want a mask for every image."""
     mask_names = {name: f"masks/{name}.png" for name in WRITTEN.values()}
-    if to == "openmvs":
-        mask_names = {name: f"masks/{name.split('/')[-1].rpartition('.')[0]}.mask.png" for name in mask_names}
     mask = np.full(SIZE[::-1], 255, np.uint8)
     mask[MASKED] = 0
     (tmp_path / "given").mkdir()
@@ -296,10 +239,6 @@ def test_masks_are_where_the_pixels_of_the_undistorted_image_come_from(tmp_path,
         table = json.loads((tmp_path / "out" / "transforms.json").read_text(encoding="utf-8"))
         found = {frame["file_path"].removeprefix("images/"): frame["mask_path"] for frame in table["frames"]}
         assert found == mask_names
-    if to == "openmvs":
-        alike = replace(model, views=[replace(model.views[0], name="c.jpg"), *model.views[1:]])
-        same = r"two images of the model would have the mask masks/c\.mask\.png"
-        refuses(UsageError, same, export, alike, tmp_path / "alike", **given)
     rgb = pixels_of(images / "sub" / "c.png").astype(np.uint8)
     for alpha, there in ((np.full_like(mask, 255), False), (mask, True)):
         PIL.Image.fromarray(np.dstack([rgb, alpha])).save(images / "sub" / "c.png")
@@ -333,7 +272,7 @@ def test_the_masks_of_a_run_are_exported_with_it(tmp_path, capsys):
     assert run_command([*command, str(tmp_path / "c")]) == 0
     assert "is gone; give --masks" in capsys.readouterr().out
     assert not (tmp_path / "c" / "masks").exists()
-    export(out, tmp_path / "d", to="openmvs", masks=tmp_path / "moved")
+    export(out, tmp_path / "d", to="colmap-undistorted", masks=tmp_path / "moved")
     assert len(list((tmp_path / "d" / "masks").iterdir())) == len(names)
 
 
@@ -417,12 +356,12 @@ def test_models_and_folders_that_cannot_be_exported_are_named(tmp_path, images):
     cases = [
         (model, "nerfstdio", images, "did you mean nerfstudio"),
         (model, "nerfstudio", None, "give it with --images"),
-        (model, "openmvs", tmp_path / "run", "4 of the 4 images of the model are not in"),
+        (model, "nerfstudio", tmp_path / "run", "4 of the 4 images of the model are not in"),
         (other, "colmap", None, "lens model of image a b.png is unknown"),
         (lost, "colmap", None, "no intrinsics"),
         (twice, "nerfstudio", images, "two images of the model would be written as a b.png"),
-        (small, "openmvs", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
-        (wild, "openmvs", images, "the camera is not plausible"),
+        (small, "nerfstudio", images, r"has \(160, 120\) pixels after EXIF rotation, but \(150, 120\)"),
+        (wild, "nerfstudio", images, "the camera is not plausible"),
         (replace(model, views=[]), "colmap", None, "no camera"),
         (make_model(PINCUSHION, BARREL, skew=3.0), "colmap", None, "colmap has no camera model with skew"),
     ]

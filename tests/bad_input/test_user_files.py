@@ -83,7 +83,7 @@ COMMANDS = {
     ) and 0,
     "demo": lambda _, out, *more: cli("demo", "-o", out, *more),
     "save": save,
-    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio", "openmvs")},
+    **{kind: export(kind) for kind in ("colmap", "colmap-undistorted", "nerfstudio")},
     "compare": lambda place, out, *more: cli(
         "compare", place / "same", place / "other", "--json", out / "summary.json", *more
     ),

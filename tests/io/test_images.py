@@ -357,7 +357,7 @@ def test_names_inside_the_folder_are_read(tmp_path, name):
 @pytest.mark.parametrize("names", [("a/x.png", "A/X.png"), ("ö.png", "o\u0308.png"), ("a//x.png", "a/x.png")])
 def test_names_that_would_be_one_file_elsewhere_are_not_exported(tmp_path, names):
     model = SparseModel([view(name) for name in names])
-    for to in ("nerfstudio", "openmvs", "colmap-undistorted"):
+    for to in ("nerfstudio", "colmap-undistorted"):
         given = {"to": to, "images": tmp_path}
         refuses(UsageError, "two images of the model would", export, model, tmp_path / to, **given)
     assert not any(tmp_path.glob("*"))

@@ -2,9 +2,8 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
-from thesisrecon.arrays import F64, I64, flag, rows_of_views
+from thesisrecon.arrays import B8, F64, I64, flag, rows_of_views
 from thesisrecon.camera import viewing_rays
 from thesisrecon.errors import UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
@@ -47,25 +46,9 @@ class ExportReport:
     notes: tuple[str, ...] = ()
 
 
-def _colmap(folder: Path, model: SparseModel, *, pinhole: bool) -> Path:
-    write_sparse_model(folder / "sparse" / "0", model, pinhole=pinhole)
-    return folder / "sparse" / "0"
-
-
 FARTHEST = 1e3  # tangent of the angle from the axis at which directions count as behind the camera
-_PINHOLE: Mapping[str, Callable[[Path, SparseModel, bool], Path]] = {
-    "colmap-undistorted": lambda folder, model, _: _colmap(folder, model, pinhole=True),
-    "nerfstudio": lambda folder, model, masked: formats.write_nerfstudio(folder, model, masked=masked),
-    "openmvs": lambda folder, model, _: formats.write_openmvs(folder, model),
-}
-"""Formats with undistorted images, perhaps with masks."""
-_FILES: Mapping[str, Sequence[str]] = {
-    **dict.fromkeys(("colmap", "colmap-undistorted"), COLMAP_FILES),
-    "nerfstudio": ("transforms.json", "points.ply"),
-    "openmvs": ("scene.mvs",),
-}
-"""Files of each format beside images and masks."""
-FORMATS = (*_PINHOLE, "colmap")
+FORMATS = ("colmap-undistorted", "nerfstudio", "colmap")
+"""All but the last have undistorted images, perhaps with masks."""
 
 
 def export(
@@ -82,10 +65,9 @@ def export(
     out : path
         Folder of the export; created if missing.
     to : str
-        ``"colmap-undistorted"``, ``"nerfstudio"`` and ``"openmvs"`` write undistorted images of pinhole
-        cameras too, up to five of 90 x 90 degrees, with masks, of an image wider than 110 degrees;
-        ``"colmap"`` keeps the distortion and needs no images, ``"nerfstudio"`` keeps it if all lenses are
-        ``"fisheye"``.
+        ``"colmap-undistorted"`` and ``"nerfstudio"`` write undistorted images of pinhole cameras too, up to
+        five of 90 x 90 degrees, with masks, of an image wider than 110 degrees; ``"colmap"`` keeps the
+        distortion and needs no images, ``"nerfstudio"`` keeps it if all lenses are ``"fisheye"``.
     images : path or mapping of str to path, optional
         Folder of the original images, or their files by name; None: those that the run was made from. Those
         of a COLMAP model are used as stored, without EXIF rotation.
@@ -140,33 +122,43 @@ def export(
     _require_cameras(model, to)
     if os.path.lexists(folder / "run.json"):
         raise UsageError(f"the folder {folder} holds a run; export to another folder")
+    sparse, nerfstudio = folder / "sparse" / "0", to == "nerfstudio"
     if to == "colmap":
         with claim_folder(folder, overwrite=overwrite, names=COLMAP_FILES):
-            return ExportReport(_colmap(folder, model, pinhole=False), tuple(lost))
-    notes = lost + (_rounding_notes(model) if to in ("nerfstudio", "openmvs") else [])
-    native = to == "nerfstudio" and formats.is_fisheye(model)
-    undistorted, pinholes = _undistorted(model, keep_lens=native)
+            write_sparse_model(sparse, model)
+            return ExportReport(sparse, tuple(lost))
+    notes = lost + (_rounding_notes(model) if nerfstudio else [])
+    undistorted, pinholes = _undistorted(model, keep_lens=nerfstudio and formats.is_fisheye(model))
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     if divided:
         gave = f"the {len(model.views)} images gave {len(undistorted.views)} pinhole images"
         notes.append(f"{gave}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees")
-    may_mask = masks is not None or any(map(_images.may_be_transparent, _image_paths(images, model)))
-    may_mask = may_mask or divided
-    names = [formats.mask_name(to, name) for name in undistorted.names if may_mask]
-    _require_distinct(names, "have the mask")
+    if images is None:
+        raise UsageError(
+            "the model does not record the folder of its images; give it with --images (images=)"
+        )
+    paths = _images.find_images(images, model.names)
+    may_mask = masks is not None or divided or any(map(_images.may_be_transparent, paths))
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
-    paths = _image_paths(images, model)
-    files = [*_FILES[to], *(f"images/{name}" for name in undistorted.names), *names]
+    files = [*(("transforms.json", "points.ply") if nerfstudio else COLMAP_FILES)]
+    for name in undistorted.names:
+        files += [f"images/{name}", f"masks/{name}.png"] if may_mask else [f"images/{name}"]
     with claim_folder(folder, overwrite=overwrite, names=files):
-        mask_name = partial(formats.mask_name, to) if may_mask else None
-        has_mask = _write_images(folder, model, pinholes, paths, found, mask_name, threads)
+        has_mask = _write_images(folder, model, pinholes, paths, found, threads)
         masked = masks is not None or any(has_mask)
         notes += [_images.USELESS_MASKS] if masked and not any(has_mask) else []
         # Programs want a mask for every image or for none.
-        for view, name, there in zip(undistorted.views, names if masked else (), has_mask, strict=False):
-            if not there:
-                write_image(folder / name, np.full(view.intrinsics[1][::-1], 255, dtype=np.uint8))
-        return ExportReport(_PINHOLE[to](folder, undistorted, masked), tuple(notes))
+        for view, there in zip(undistorted.views, has_mask, strict=True):
+            if masked and not there:
+                _write_mask(folder, view.name, np.ones(view.intrinsics[1][::-1], dtype=bool))
+        if nerfstudio:
+            return ExportReport(formats.write_nerfstudio(folder, undistorted, masked=masked), tuple(notes))
+        write_sparse_model(sparse, undistorted, pinhole=True)
+        return ExportReport(sparse, tuple(notes))
+
+
+def _write_mask(folder: Path, name: str, used: B8) -> None:
+    write_image(folder / "masks" / f"{name}.png", np.where(used, 255, 0).astype(np.uint8))
 
 
 def require_separate(
@@ -174,7 +166,7 @@ def require_separate(
     masks: str | Path | None = None,
 ) -> None:  # fmt: skip
     """Raise ``UsageError`` if an export would replace the model, images or masks that it reads."""
-    written = [folder / "images", folder / "masks"] if to in _PINHOLE else []
+    written = [folder / "images", folder / "masks"] if to != "colmap" else []
     written += [folder / "sparse" / "0"] if to.startswith("colmap") else []
     colmap = None if model is None else colmap_model_in(Path(model))
     places = images.values() if isinstance(images, Mapping) else [images]
@@ -215,7 +207,7 @@ def _rounding_notes(model: SparseModel) -> list[str]:
 
 def recorded_masks(model: Model, to: str) -> tuple[Path | None, list[str]]:
     """Return the folder of the masks of a run for formats with images, or a note that it is gone."""
-    folder = recorded(model, "masks_folder") if to in _PINHOLE else None
+    folder = recorded(model, "masks_folder") if to != "colmap" else None
     if folder is None or folder.is_dir():
         return folder, []
     return None, [f"no masks are written: the folder {folder} of the run is gone; give --masks (masks=)"]
@@ -280,7 +272,9 @@ def _undistorted(model: SparseModel, *, keep_lens: bool = False) -> tuple[Sparse
         view_index[here] = len(views)
         views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
         pinholes.append([_Pinhole(views[-1], None)])
-    _require_distinct([view.name for view in views], "be written as")
+    if (twice := first_repeated((view.name for view in views), as_files=True)) is not None:
+        rule = f"two images of the model would be written as {twice} (regardless of case)"
+        raise UsageError(f"{rule}; rename one of them")
     return replace(model, views=views, xy=xy, view_index=view_index), pinholes
 
 
@@ -306,12 +300,6 @@ def _in_faces(view: SparseView, faces: Mapping[str, SparseView], xy: F64) -> tup
     turned = np.einsum("nab,nb->na", turns[face], rays)
     own = next(iter(faces.values())).intrinsics[0]
     return dehomogenize(turned @ own.T), face
-
-
-def _require_distinct(names: Sequence[str], what: str) -> None:
-    if (twice := first_repeated(names, as_files=True)) is not None:
-        message = f"two images of the model would {what} {twice} (regardless of case); rename one of them"
-        raise UsageError(message)
 
 
 def _file_name(name: str) -> str:
@@ -362,16 +350,9 @@ def _pinhole_frame(view: SparseView) -> tuple[F64, tuple[int, int]]:
     return K, (int(size[0]), int(size[1]))
 
 
-def _image_paths(images: Images | None, model: SparseModel) -> list[Path]:
-    if images is None:
-        message = "the model does not record the folder of its images; give it with --images (images=)"
-        raise UsageError(message)
-    return _images.find_images(images, model.names)
-
-
 def _write_images(
     folder: Path, model: SparseModel, pinholes: Sequence[Sequence[_Pinhole]], paths: Sequence[Path],
-    masks: Mapping[str, Path], mask_name: Callable[[str], str] | None, threads: int,
+    masks: Mapping[str, Path], threads: int,
 ) -> list[bool]:  # fmt: skip
     """Write the pinhole images of a model's images into a folder, and their masks; return which have one."""
     whole = int(np.iinfo(np.int32).max)
@@ -401,9 +382,8 @@ def _write_images(
                         levels = mask[:, :, None].astype(np.uint8)
                         _, used = undistort_image(levels, *frames, mask=mask, turn=pinhole.turn)
                 write_image(folder / "images" / pinhole.view.name, rgb)
-                if used is not None and mask_name is not None:
-                    place = folder / mask_name(pinhole.view.name)
-                    write_image(place, np.where(used, 255, 0).astype(np.uint8))
+                if used is not None:
+                    _write_mask(folder, pinhole.view.name, used)
             return [mask is not None or pinhole.turn is not None for pinhole in pinholes[i]]
 
     with ThreadPool(threads or available_threads()) as pool:

@@ -232,7 +232,7 @@ def _limit(option: str, what: str) -> Any:
     return typer.Option(option, min=0.0, help=f"Largest error of a {what}; else exit code {BEYOND_LIMIT}.")
 
 
-_TO_HELP = "colmap, colmap-undistorted, nerfstudio or openmvs."
+_TO_HELP = "colmap, colmap-undistorted or nerfstudio."
 _ORIGINALS_HELP = "Folder of the original images (default: that of the run)."
 _MASKS_HELP = "Folder of the masks of the images (default: that of the run)."
 _SCALE_HELP = "Known distance of the cameras of two images."

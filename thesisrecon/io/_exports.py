@@ -1,16 +1,14 @@
-"""Point clouds, images, ``cameras.json``, and sparse models in the formats of other programs.
+"""Point clouds, images, ``cameras.json``, and sparse models for nerfstudio.
 
-These are nerfstudio and OpenMVS. The centre of the top-left pixel is (0, 0) here and in OpenMVS; in
-nerfstudio it is (0.5, 0.5) and cameras look along -z with y up. Each writer of a format returns its main
-file; images lie in ``images/`` beside it, masks in ``masks/``.
+The centre of the top-left pixel is (0, 0) here; in nerfstudio it is (0.5, 0.5), and cameras look along -z
+with y up. Images lie in ``images/`` beside its file, masks in ``masks/``.
 """
 
 import csv
 import io
 import math
-import struct
 from collections.abc import Mapping
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,12 +20,7 @@ from thesisrecon.io._colmap import PIXEL_CENTRE, has_skew
 from thesisrecon.io._files import write_atomically, write_json
 from thesisrecon.io._models import LOOKS_BACK
 from thesisrecon.lens import named_lens
-from thesisrecon.results import SparseModel, SparseView
-
-
-def mask_name(to: str, image: str) -> str:
-    """File name of the mask of an image as the program expects it: OpenMVS drops folders and suffix."""
-    return f"masks/{PurePath(image).stem}.mask.png" if to == "openmvs" else f"masks/{image}.png"
+from thesisrecon.results import SparseModel
 
 
 def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
@@ -46,7 +39,7 @@ def write_nerfstudio(folder: Path, model: SparseModel, *, masked: bool) -> Path:
         pose[:3, :3], pose[:3, 3] = view.R.T @ LOOKS_BACK, view.centre
         own: dict[str, Any] = {} if shared else camera
         if masked:
-            own = {**own, "mask_path": mask_name("nerfstudio", view.name)}
+            own = {**own, "mask_path": f"masks/{view.name}.png"}
         frames.append({"file_path": f"images/{view.name}", **own, "transform_matrix": pose})
     kind = "OPENCV_FISHEYE" if fisheye else "OPENCV"
     head = {"camera_model": kind, **(cameras[0] if shared else {}), "ply_file_path": "points.ply"}
@@ -59,62 +52,6 @@ def is_fisheye(model: SparseModel) -> bool:
     """Whether all lenses of a model are those of nerfstudio's fisheye cameras."""
     every = (view.intrinsics for view in model.views)
     return all(named_lens(lens)[0] == "fisheye" and not has_skew(K) for K, _, lens in every)
-
-
-def write_openmvs(folder: Path, model: SparseModel) -> Path:
-    """Write ``scene.mvs`` ("MVSI", version 2): one platform with all cameras, one pose per image."""
-    cameras, number = _distinct_cameras(model)
-    still = _matrices(np.eye(3), np.zeros(3))
-    # OpenMVS reads all versions up to its own; later ones add only optional fields.
-    parts = [b"MVSI", struct.pack("<II", 2, 0), _count(1), _text("platform"), _count(len(cameras))]
-    for i, view in enumerate(cameras):
-        K, size, _ = view.intrinsics
-        parts += [_text(f"camera{i}"), struct.pack("<II", *size), _matrices(K), still]
-    parts += [_count(len(model.views)), *(_matrices(view.R, view.centre) for view in model.views)]
-    parts.append(_count(len(model.views)))
-    for i, view in enumerate(model.views):
-        parts += [_text(f"images/{view.name}"), struct.pack("<III", 0, number[i], i)]
-    parts.append(_count(len(model.X)))
-    for X, seen in zip(model.X.tolist(), _observations_of_points(model), strict=True):
-        views = model.view_index[seen].tolist()
-        parts += [struct.pack("<3fQ", *X, len(views)), *(struct.pack("<If", view, 0.0) for view in views)]
-    colors = np.ascontiguousarray(model.point_colors[:, ::-1]).tobytes()
-    # No normals; after the colours no lines, their normals and colours; the transform of the frame.
-    parts += [_count(0), _count(len(model.X)), colors, _count(0) * 3, _matrices(np.eye(4))]
-    write_atomically(folder / "scene.mvs", b"".join(parts))
-    return folder / "scene.mvs"
-
-
-def _count(number: int) -> bytes:
-    return struct.pack("<Q", number)
-
-
-def _text(text: str) -> bytes:
-    encoded = text.encode("utf-8", "surrogateescape")
-    return _count(len(encoded)) + encoded
-
-
-def _matrices(*values: F64) -> bytes:
-    return b"".join(np.ascontiguousarray(value, dtype="<f8").tobytes() for value in values)
-
-
-def _distinct_cameras(model: SparseModel) -> tuple[list[SparseView], list[int]]:
-    """Return one view per set of intrinsics and size, and the number of each view's set."""
-    first: dict[tuple[object, ...], SparseView] = {}
-    keys = []
-    for view in model.views:
-        K, size, distortion = view.intrinsics
-        keys.append((size, K.tobytes(), distortion.tobytes()))
-        first.setdefault(keys[-1], view)
-    place = {key: number for number, key in enumerate(first)}
-    return [*first.values()], [place[key] for key in keys]
-
-
-def _observations_of_points(model: SparseModel) -> list[list[int]]:
-    """Numbers of the observations of each point, by view."""
-    order = np.lexsort((model.view_index, model.point_index))
-    counts = np.bincount(model.point_index, minlength=len(model.X))
-    return [part.tolist() for part in np.split(order, np.cumsum(counts)[:-1])] if len(model.X) else []
 
 
 def write_point_cloud(path: Path, xyz: F64, rgb: U8) -> None:

@@ -4,57 +4,22 @@ trimesh is imported on demand: it takes longer to import than the rest of the pa
 """
 
 import io
-import json
 import math
-import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import PIL.Image
 
-from thesisrecon.arrays import F64, I64, U8, are_finite, distinct_corners
+from thesisrecon.arrays import F64, I64, are_finite, distinct_corners
 from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, as_mesh
 
+_TEXTURES = ("JPEG", "PNG", "BMP", "TIFF", "TGA", "WEBP")  # Pillow opens some others by external programs
 _MAX_TEXELS = 2**26  # Many times the size of a run's texture, and within the limit of Pillow
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 """Rotation by 180 degrees about x, between the camera axes and those of glTF; its own inverse."""
-
-_HEAD = struct.Struct("<4sIIII")
-_NUMBERS = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-
-
-def _mesh_of_glb(content: bytes) -> TexturedMesh:
-    """The mesh of a GLB as a run writes it: one primitive, all data in the file; others raise any error."""
-    magic, version, _, size, kind = _HEAD.unpack_from(content)
-    if magic != b"glTF" or version != 2 or kind != 0x4E4F534A:
-        raise ValueError("it is not a GLB of version 2")
-    header, data = json.loads(content[_HEAD.size : _HEAD.size + size]), content[_HEAD.size + size + 8 :]
-    accessors, views = header["accessors"], header["bufferViews"]
-
-    def numbers(accessor: int) -> Any:
-        found = accessors[accessor]
-        start = found.get("byteOffset", 0) + views[found["bufferView"]].get("byteOffset", 0)
-        columns = _COLUMNS[found["type"]]
-        values = np.frombuffer(data, _NUMBERS[found["componentType"]], found["count"] * columns, start)
-        return values.reshape(found["count"], columns)
-
-    ((primitive,),) = (mesh["primitives"] for mesh in header["meshes"])
-    parts = {name: numbers(accessor) for name, accessor in primitive["attributes"].items()}
-    vertices = parts["POSITION"].astype(np.float64) * _HALF_TURN
-    faces = numbers(primitive["indices"]).astype(np.int64).reshape(-1, 3)
-    if "TEXCOORD_0" not in parts:
-        return _checked(vertices, faces, parts["COLOR_0"][:, :3] if "COLOR_0" in parts else None)
-    view = views[header["images"][0]["bufferView"]]
-    start = view.get("byteOffset", 0)
-    blob = io.BytesIO(data[start : start + view["byteLength"]])
-    with PIL.Image.open(blob, formats=("JPEG", "PNG")) as picture:
-        if math.prod(picture.size) > _MAX_TEXELS:
-            raise ValueError(f"its texture has more than {_MAX_TEXELS >> 20} megapixels")
-        return _checked(vertices, faces, None, parts["TEXCOORD_0"], np.asarray(picture.convert("RGB")))
 
 
 def glb_bytes(mesh: TexturedMesh) -> bytes:
@@ -100,12 +65,16 @@ def read_mesh(path: Path) -> TexturedMesh:
     kind = path.suffix.lower()[1:]
     if kind not in ("glb", "ply", "obj"):
         raise UsageError(f"a mesh is read from GLB, PLY or OBJ; got {path.name}")
-    try:
-        if kind == "glb":
-            return _mesh_of_glb(read_bytes(path, largest=2**31))
-        import trimesh
+    import trimesh
 
-        return _mesh_of(trimesh.load(path, process=False, force="mesh"))
+    try:
+        content = io.BytesIO(read_bytes(path, largest=2**31)) if kind == "glb" else path
+        loaded: Any = trimesh.load(content, file_type=kind, process=False, force="mesh")
+        turn = _HALF_TURN if kind == "glb" else np.ones(3)
+        found = _mesh_of(np.asarray(loaded.vertices, dtype=np.float64) * turn, loaded.faces, loaded.visual)
+        if kind == "glb" and found.texture is None and getattr(loaded.visual, "uv", None) is not None:
+            raise ValueError("its texture is missing or damaged")
+        return found
     except OSError as error:
         raise UsageError(f"the mesh {path} cannot be read: {error.strerror or error}") from None
     except Exception as error:
@@ -114,36 +83,29 @@ def read_mesh(path: Path) -> TexturedMesh:
         raise UsageError(f"the mesh {path} cannot be read: {what}") from None
 
 
-def _mesh_of(loaded: Any) -> TexturedMesh:
-    """Convert a mesh of trimesh."""
-    visual, colors = loaded.visual, None
-    uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if uv is not None and image is not None:
-        # From v up to v down.
-        uv = np.asarray(uv, dtype=np.float64) * [1.0, -1.0] + [0.0, 1.0]
-        return _checked(loaded.vertices, loaded.faces, None, uv, np.asarray(image.convert("RGB")))
-    if visual.kind == "vertex":
-        colors = visual.vertex_colors[:, :3]
-    return _checked(loaded.vertices, loaded.faces, colors)
-
-
-def _checked(
-    vertices: Any, faces: Any, colors: Any, uv: Any = None, texture: U8 | None = None
-) -> TexturedMesh:
-    """A mesh with texture coordinates of vertices from 0 to 1, v down; ``ValueError`` if it is invalid."""
-    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
+def _mesh_of(vertices: F64, faces: Any, visual: Any) -> TexturedMesh:
+    """A mesh with the appearance of one of trimesh; ``ValueError`` if it is invalid."""
+    faces = np.asarray(faces, dtype=np.int64)
     if len(faces) == 0 or not are_finite(vertices):
         raise ValueError("it holds no surface")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError("its faces refer to missing vertices")
-    if texture is None:
-        return TexturedMesh(vertices, faces, None if colors is None else np.array(colors, dtype=np.uint8))
-    corners = (np.asarray(uv, dtype=np.float64) * texture.shape[1::-1] - 0.5)[faces]
+    uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and image.format not in _TEXTURES:
+        raise ValueError(f"its texture is none of {', '.join(_TEXTURES)}")
+    if uv is None or image is None:
+        colors = np.array(visual.vertex_colors[:, :3], dtype=np.uint8) if visual.kind == "vertex" else None
+        return TexturedMesh(vertices, faces, colors)
+    if math.prod(image.size) > _MAX_TEXELS:
+        raise ValueError(f"its texture has more than {_MAX_TEXELS >> 20} megapixels")
+    texture = np.asarray(image.convert("RGB"))
+    # From v up to v down.
+    uv = np.asarray(uv, dtype=np.float64) * [1.0, -1.0] + [0.0, 1.0]
+    corners = (uv * texture.shape[1::-1] - 0.5)[faces]
     if not are_finite(corners):
         raise ValueError("its texture coordinates are not finite")
-    vertices, faces = _merged(vertices, faces)
-    return TexturedMesh(vertices, faces, uv=corners, texture=texture)
+    return TexturedMesh(*_merged(vertices, faces), uv=corners, texture=texture)
 
 
 def _merged(vertices: F64, faces: I64) -> tuple[F64, I64]:
