@@ -65,7 +65,11 @@ NO_MODELS = [
     ("deep", writes(DEEP), "RecursionError"),
     ("list", writes(files.glb([1, 2])), "cannot be read: AttributeError"),
     ("nothing", writes(files.glb({})), "it holds no surface"),
-    ("count", writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}] * 2)), "cannot reshape"),
+    (
+        "count",
+        writes(changed(accessors=[ACCESSOR | {"count": 10**12, "bufferView": 0}] * 2)),
+        "cannot reshape",
+    ),
     ("faces beyond", writes(numbered(np.array([0, 1, 9], "<u4"))), "faces refer to missing vertices"),
     ("corners of NaN", writes(numbered(np.full((3, 3), np.nan, "<f4"))), "it holds no surface"),
     ("program", writes(textured(b"%!PS-Adobe-3.0 EPSF-3.0\n")), "its texture is missing or damaged"),

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from thesisrecon import arrays
 from thesisrecon.api.cameras import outside_by, require_inside
 from thesisrecon.api.given import (
     CameraInput,
@@ -15,42 +16,14 @@ from thesisrecon.api.given import (
     cameras_of_model,
     lens_table,
 )
-from thesisrecon.arrays import (
-    B8,
-    F64,
-    I64,
-    Record,
-    number,
-    number_or_numbers,
-    numbers,
-    require_finite,
-    require_shapes,
-    whole_number,
-    whole_numbers,
-)
+from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.camera import Camera, camera_of_row
 from thesisrecon.errors import counted, require_word
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import ANGLE, BASE, DIVISION
-from thesisrecon.optimize.bundle import metric
-from thesisrecon.optimize.bundle.knowledge import (
-    LOSSES,
-    NO_PRIOR,
-    BundleKnowledge,
-    PositionPrior,
-    remaining_gauge,
-)
-from thesisrecon.optimize.bundle.projection import (
-    LENS,
-    POSE_DOF,
-    MetricCameras,
-    MetricModel,
-    Observations,
-    image_points,
-    pinhole_rows,
-    read_observations,
-    sort_observations,
-)
+from thesisrecon.optimize.bundle import knowledge, metric, projection
+from thesisrecon.optimize.bundle.knowledge import LOSSES, BundleKnowledge, PositionPrior
+from thesisrecon.optimize.bundle.projection import LENS, POSE_DOF, MetricCameras, Observations
 from thesisrecon.optimize.least_squares import MAD_FACTOR
 from thesisrecon.records import IntrinsicsPrior, Tracks
 from thesisrecon.results import RunResult
@@ -216,15 +189,15 @@ def bundle_adjust(
     free = tuple(free) if isinstance(free, Sequence | Set) and not isinstance(free, str) else (free,)
     chosen = _free(free)
     require_word("loss", loss, LOSSES)
-    whole_number("bundle_adjust", "max_iterations", max_iterations, 1)
-    given = {"loss_px": loss_px, "sigma_px": sigma_px}
-    loss_px, sigma_px = (None if v is None else number("bundle_adjust", name, v) for name, v in given.items())
+    arrays.whole_number("bundle_adjust", "max_iterations", max_iterations, 1)
+    loss_px = None if loss_px is None else arrays.number("bundle_adjust", "loss_px", loss_px)
+    sigma_px = None if sigma_px is None else arrays.number("bundle_adjust", "sigma_px", sigma_px)
     start = _start(views, shared, chosen)
     chosen = chosen[: start.intrinsics.shape[1]]
     prior = {} if prior is None else prior
     expected = _prior(start.intrinsics, prior, chosen, free)
     # Only for its checks of the list.
-    sort_observations(observed, len(views), len(X))
+    projection.sort_observations(observed, len(views), len(X))
     root, inside = _whitening(covariances, dense, observed), _inside(views, observed)
     inside &= _in_front_of_fisheye(start, X, observed)
     observed = observed.at(inside)
@@ -310,11 +283,11 @@ def _problem(
     views = as_cameras("bundle_adjust", cameras, sizes)
     if X is None or xy is None:
         raise ValueError("bundle_adjust needs X (N, 3) and xy, the pixels of the points; got None")
-    (X,), shape = numbers("bundle_adjust", X=X), None
+    (X,), shape = arrays.numbers("bundle_adjust", X=X), None
     if isinstance(xy, Tracks | Observations):
-        observed = read_observations("bundle_adjust", xy)
+        observed = projection.read_observations("bundle_adjust", xy)
     else:
-        (xy,) = numbers("bundle_adjust", missing=("xy",), xy=xy)
+        (xy,) = arrays.numbers("bundle_adjust", missing=("xy",), xy=xy)
         shape = (len(views), len(X), 2)
         if xy.shape != shape:
             raise ValueError(
@@ -322,7 +295,7 @@ def _problem(
             )
         point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
         observed = Observations(view, point, xy[view, point])
-    require_shapes("bundle_adjust", X=(X, ("N", 3)))
+    arrays.require_shapes("bundle_adjust", X=(X, ("N", 3)))
     return views, X, observed, shape
 
 
@@ -339,16 +312,16 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
     n = len(views)
     if isinstance(shared, bool | np.bool_):
         sizes = list(dict.fromkeys(view.size for view in views))
-        number = np.array([sizes.index(view.size) for view in views]) if shared else np.arange(n)
+        own = np.array([sizes.index(view.size) for view in views]) if shared else np.arange(n)
     else:
-        number = whole_numbers("bundle_adjust", "shared, or True or False", shared)
-        if number.shape != (n,):
-            raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {number}")
+        own = arrays.whole_numbers("bundle_adjust", "shared, or True or False", shared)
+        if own.shape != (n,):
+            raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {own}")
     lenses = lens_table("bundle_adjust", views, BASE + 1 if free[8:].any() else 3)
-    table = np.column_stack([pinhole_rows(np.array([view.K for view in views])), lenses])
+    table = np.column_stack([projection.pinhole_rows(np.array([view.K for view in views])), lenses])
     _require_free(table, free)
     R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
-    sharing = np.where(free[: table.shape[1]], number[:, None], np.arange(n)[:, None])
+    sharing = np.where(free[: table.shape[1]], own[:, None], np.arange(n)[:, None])
     return MetricCameras(R, t, table, np.arange(n), sharing)
 
 
@@ -370,7 +343,7 @@ def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequen
     for name, value in prior.items():
         if name not in COLUMNS or not free[list(COLUMNS[name])].all():
             raise ValueError(f"prior has {name!r}, which is not among the free intrinsics {tuple(names)}")
-        values = number_or_numbers("bundle_adjust", f"prior[{name!r}]", value)
+        values = arrays.number_or_numbers("bundle_adjust", f"prior[{name!r}]", value)
         if values.shape not in ((), (len(table),)):
             raise ValueError(
                 f"prior[{name!r}] must be a number or one per camera ({len(table)},); got {value}"
@@ -383,7 +356,7 @@ def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequen
 
 def _mask(name: str, chosen: Chosen, n: int, seen: I64) -> B8 | None:
     """Mask (n,) of the ``seen`` ones of numbers or of a mask; None without any."""
-    index = whole_numbers("bundle_adjust", name, chosen)
+    index = arrays.whole_numbers("bundle_adjust", name, chosen)
     if index.shape == (n,) and np.asarray(chosen).dtype == bool:
         index = np.flatnonzero(index)
     if not index.size:
@@ -397,9 +370,9 @@ def _mask(name: str, chosen: Chosen, n: int, seen: I64) -> B8 | None:
 def _positions(name: str, at: F64 | None, std: float | F64, n: int, seen: I64) -> PositionPrior:
     """The known positions (n, 3) of what is ``seen``."""
     if at is None:
-        return NO_PRIOR
-    (at,) = numbers("bundle_adjust", missing=(name,), **{name: at})
-    widths = number_or_numbers("bundle_adjust", f"standard deviation of {name}", std)
+        return knowledge.NO_PRIOR
+    (at,) = arrays.numbers("bundle_adjust", missing=(name,), **{name: at})
+    widths = arrays.number_or_numbers("bundle_adjust", f"standard deviation of {name}", std)
     if at.shape != (n, 3) or widths.shape not in ((), (3,), (n, 3)):
         form = f"({n}, 3) with a standard deviation each, (3,) or ({n}, 3)"
         raise ValueError(f"{name} must have the shape {form}; got {at.shape} and {widths.shape}")
@@ -414,7 +387,7 @@ def _whitening(covariances: F64 | None, dense: tuple[int, ...] | None, observed:
     """Roots (K, 2, 2) of the information of the observations, None if they are equal."""
     if covariances is None:
         return None
-    (Q,) = numbers("bundle_adjust", covariances=covariances)
+    (Q,) = arrays.numbers("bundle_adjust", covariances=covariances)
     shape = (len(observed.xy),) if dense is None else dense[:2]
     if Q.shape not in (shape, (*shape, 2, 2)):
         form = f"{shape} or {(*shape, 2, 2)}"
@@ -463,7 +436,7 @@ def _placed(
     """The start near known positions, and the knowledge that the gauge adds."""
     require_word("gauge", gauge, ("inner", "two-cameras"))
     centres = start.centres
-    if remaining_gauge(known, start.R, start.t, X).shape[1] < 7:
+    if knowledge.remaining_gauge(known, start.R, start.t, X).shape[1] < 7:
         if gauge == "two-cameras":
             raise ValueError('gauge="two-cameras" needs a problem without fixed or known poses and points')
         if known.fixed_poses is not None or known.fixed_points is not None:
@@ -491,8 +464,8 @@ def _placed(
 
 def _residuals(start: MetricCameras, X: F64, o: Observations) -> F64:
     """Projection minus observation (K, 2) at the start."""
-    model = MetricModel(start.R, start.t, start.intrinsics, np.asarray(start.group), X)
-    return np.asarray(image_points(model, o.view_index, o.point_index)[0] - o.xy)
+    model = projection.MetricModel(start.R, start.t, start.intrinsics, np.asarray(start.group), X)
+    return np.asarray(projection.image_points(model, o.view_index, o.point_index)[0] - o.xy)
 
 
 def _check_convention(start: MetricCameras, X: F64, o: Observations) -> None:
@@ -548,7 +521,7 @@ def _check(
 ) -> None:
     """Raise ``ValueError`` if most points are behind the cameras, or for fewer equations than unknowns."""
     view, point = observed.view_index, observed.point_index
-    require_finite("bundle_adjust, for points with observations,", X[point])
+    arrays.require_finite("bundle_adjust, for points with observations,", X[point])
     depth = _depths(start, X, observed)
     behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
     # Of most points only if the poses use another convention.

@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from thesisrecon import results
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.api.given import Model, as_sparse_model, cameras_of_model
 from thesisrecon.api.lenses import undistort_points
@@ -25,15 +26,7 @@ from thesisrecon.io._models import read_calibration, read_model, read_point_pair
 from thesisrecon.metric.world import require_width, robust_similarity
 from thesisrecon.pipeline.outputs import load_run, save_result
 from thesisrecon.records import Similarity
-from thesisrecon.results import (
-    SUMMARY,
-    THRESHOLDS,
-    ModelComparison,
-    PointDistances,
-    RunResult,
-    SparseModel,
-    SparseView,
-)
+from thesisrecon.results import ModelComparison, RunResult, SparseModel, SparseView
 from thesisrecon.runtime._run_folder import RUN_FILE, ChangedRecord
 
 
@@ -360,9 +353,11 @@ def load(out: str | Path) -> RunResult:
     True
     """
     folder = as_path("load", "out", out)
-    summary, run = read_json(folder / SUMMARY), read_json(folder / RUN_FILE)
+    summary, run = read_json(folder / results.SUMMARY), read_json(folder / RUN_FILE)
     if not isinstance(summary, dict) or not isinstance(run, dict):
-        raise UsageError(f"{folder} holds no {SUMMARY} and {RUN_FILE}; no run has finished in this folder")
+        raise UsageError(
+            f"{folder} holds no {results.SUMMARY} and {RUN_FILE}; no run has finished in this folder"
+        )
     try:
         return load_run(folder, summary, run)
     except ChangedRecord as error:
@@ -610,10 +605,10 @@ def _intrinsic_errors(a: SparseView, b: SparseView) -> tuple[float, float]:
     return float(focal / focal_b - 1.0), float(np.linalg.norm(offset))
 
 
-def _point_distances(X: F64, X_b: F64) -> PointDistances | None:
+def _point_distances(X: F64, X_b: F64) -> results.PointDistances | None:
     if not (len(X) and len(X_b)):
         return None
-    thresholds = np.array(THRESHOLDS) / scene_frame(X_b)[1]
+    thresholds = np.array(results.THRESHOLDS) / scene_frame(X_b)[1]
     there, back = (scipy.spatial.cKDTree(to).query(of)[0] for of, to in ((X, X_b), (X_b, X)))
     within = [np.mean(distances[:, None] < thresholds, axis=0) for distances in (there, back)]
-    return PointDistances(float(np.median(there)), float(np.median(back)), thresholds, *within)
+    return results.PointDistances(float(np.median(there)), float(np.median(back)), thresholds, *within)

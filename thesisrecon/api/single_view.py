@@ -12,15 +12,8 @@ from thesisrecon.api.given import checked_sizes
 from thesisrecon.arrays import F64, I64, Record, checked, generator, number, numbers, whole_number
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import (
-    directions_across,
-    homogenize,
-    normalizing_transform,
-    pixel_from_unit,
-    products,
-    symmetric,
-    unit_norm,
-)
+from thesisrecon.geometry import homogeneous
+from thesisrecon.geometry.homogeneous import homogenize, products, symmetric, unit_norm
 from thesisrecon.geometry.strata import calibration_from_image, nearest_rotation
 from thesisrecon.optimize.least_squares import central_differences, minimize_residuals
 
@@ -85,7 +78,7 @@ def vanishing_points(
     rng, limit = generator(caller, seed), number(caller, "threshold_px", threshold_px)
     whole_number(caller, "count", count, 1)
     _require_lengths(caller, segments)
-    T = normalizing_transform(segments.reshape(-1, 2))
+    T = homogeneous.normalizing_transform(segments.reshape(-1, 2))
     ends = homogenize(segments) @ T.T
     back, unit = np.linalg.inv(T), T[0, 0]
 
@@ -126,7 +119,7 @@ def _unit(v: F64) -> F64:
 
 def _refined(v: F64, ends: F64) -> tuple[F64, F64, float]:
     """The unit v (3,) of least distances from the lines of segments, its covariance and the cost."""
-    across = directions_across(_unit(v))
+    across = homogeneous.directions_across(_unit(v))
     fit = minimize_residuals(lambda x: _line_distances(_unit(v) + x @ across, ends), np.zeros(2))
     return _unit(_unit(v) + fit.x @ across), across.T @ fit.covariance @ across, fit.cost
 
@@ -185,7 +178,7 @@ def rectify_plane(parallel: Sequence[F64], orthogonal: F64 | None = None) -> Rec
     if len(groups) < 2 or min(map(len, groups)) < 2:
         raise ValueError(f"{caller} needs two groups of two parallel segments or more")
     _require_lengths(caller, *groups)
-    T = normalizing_transform(np.concatenate(groups).reshape(-1, 2))
+    T = homogeneous.normalizing_transform(np.concatenate(groups).reshape(-1, 2))
     v = []
     for group in groups:
         lines = _lines(group, T)
@@ -363,7 +356,7 @@ def calibrate_from_homographies(
         raise ValueError(f"{caller} needs two homographies or more; got {len(H)}")
     (width, height) = checked_sizes(caller, size, 1)[0].tolist()
     # About the image centre in units of the long side, so that the columns have one scale.
-    T = np.linalg.inv(pixel_from_unit(np.array([[width, height]]))[0])
+    T = np.linalg.inv(homogeneous.pixel_from_unit(np.array([[width, height]]))[0])
     G = unit_norm(T @ H)
     a, b = G[:, :, 0], G[:, :, 1]
     rows = np.concatenate([products(a, b), products(a, a) - products(b, b)])

@@ -23,13 +23,7 @@ from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.stereo._postprocessing import match_both_sides
 from thesisrecon.stereo.correspondence import RectifiedPair, brightness_gain
 from thesisrecon.stereo.rectification import PlanarRectification
-from thesisrecon.views import tensor
-from thesisrecon.views.interpolation import (
-    InterpolatedPair,
-    disparity_of_right,
-    prepare_interpolation,
-    roll_between,
-)
+from thesisrecon.views import interpolation, tensor
 from thesisrecon.views.render import render_mesh
 
 _COARSE = 4  # Reduction at which the largest disparity of a rectified pair is searched, up to half its width
@@ -90,7 +84,7 @@ def prepare_rectified_pair(
     left: Any, right: Any, *,
     disparity: DisparityMap | F32 | tuple[F32 | DisparityMap, F32 | DisparityMap] | None = None,
     config: Config | None = None,
-) -> InterpolatedPair:  # fmt: skip
+) -> interpolation.InterpolatedPair:  # fmt: skip
     """Prepare two rectified images for any number of views between them: ``view(s)`` interpolates.
 
     The arguments are those of :func:`interpolate_view`.
@@ -109,7 +103,7 @@ def prepare_rectified_pair(
     elif isinstance(disparity, tuple) and len(disparity) == 2:
         maps = _as_map(disparity[0]), _as_map(disparity[1])
     else:
-        maps = _as_map(disparity), disparity_of_right(_as_map(disparity))
+        maps = _as_map(disparity), interpolation.disparity_of_right(_as_map(disparity))
     for shape in (found.disparity.shape for found in maps):
         if shape != shapes[0]:
             raise ValueError(f"disparities must have the shape of the images {shapes[0]}; got {shape}")
@@ -119,7 +113,7 @@ def prepare_rectified_pair(
     left_xy, right_xy = _shifted(-fields[0]), _shifted(fields[1])
     y, x = (_SPARSE * at for at in np.nonzero(np.isfinite(maps[0].disparity[::_SPARSE, ::_SPARSE])))
     matches = np.stack([x, y], axis=1).astype(np.float64), left_xy[y, x].astype(np.float64)
-    return prepare_interpolation(
+    return interpolation.prepare_interpolation(
         (images[0], images[1]), np.stack([np.eye(3)] * 2), maps[0], (left_xy, right_xy),
         gain=brightness_gain(images[0], images[1], *matches),
         agree_px=np.inf if exact else tensor.AGREE_PX,
@@ -165,7 +159,7 @@ def _reduced(image: U8 | F32) -> F32:
 
 def prepare_pair(
     image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0
-) -> InterpolatedPair:
+) -> interpolation.InterpolatedPair:
     """Match and rectify two images of any pose for views between them: ``view(s)`` interpolates.
 
     Sparse matching, F, rectification by homographies and dense matching in both directions (section 1.2;
@@ -190,10 +184,11 @@ def prepare_pair(
         raise StageFailure(failure.reason, failure.evidence, advice) from None
     assert isinstance(dense.frame, PlanarRectification)
     # Halfway, views then show 0.7 of the field of view.
-    if abs(roll := roll_between(dense.frame.H, first.size)) > 90.0:
+    if abs(roll := interpolation.roll_between(dense.frame.H, first.size)) > 90.0:
         raise StageFailure.of("rolled-images", abs(roll))
+    images = first.rgb, second.rgb
     places = dense.correspondences(0, first.size), dense.correspondences(1, second.size)
-    return prepare_interpolation((first.rgb, second.rgb), dense.frame.H, dense.left, places, gain=dense.gain)
+    return interpolation.prepare_interpolation(images, dense.frame.H, dense.left, places, gain=dense.gain)
 
 
 def _require_comparable_images(first: Image, second: Image) -> None:

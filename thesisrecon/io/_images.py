@@ -25,16 +25,8 @@ from numpy.typing import NDArray
 from thesisrecon.arrays import B8, F32, F64, U8, eight_bit, image_levels
 from thesisrecon.errors import Notice, StageFailure, UsageError, require_word
 from thesisrecon.imaging.static import static_pixels
-from thesisrecon.io import _pixels
-from thesisrecon.io._files import (
-    IMAGE_NAME_RULE,
-    SPECIAL_FILE,
-    as_path,
-    is_image_name,
-    natural_key,
-    printable,
-    require_image_name,
-)
+from thesisrecon.io import _files, _pixels
+from thesisrecon.io._files import as_path, printable
 from thesisrecon.io._outputs import LOCK_FILE
 from thesisrecon.records import Image
 
@@ -168,7 +160,7 @@ def list_images(folder: Path, *others: Path | str | None, deep: bool = False) ->
             if (real := os.path.realpath(path)) not in known and not os.path.lexists(path / LOCK_FILE):
                 known.add(real)
                 pending.append(path)
-    return sorted(found, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+    return sorted(found, key=lambda path: _files.natural_key(path.relative_to(folder).as_posix()))
 
 
 def _is_listed(path: Path) -> bool:
@@ -248,8 +240,8 @@ def read_images(
         items = _named_items(source if isinstance(source, str | Path) else eight_bit_images(*source))
 
     def read(item: tuple[str, Any]) -> DecodedImage | str:
-        if not is_image_name(item[0]):
-            return Notice("file-name", IMAGE_NAME_RULE)
+        if not _files.is_image_name(item[0]):
+            return Notice("file-name", _files.IMAGE_NAME_RULE)
         try:
             return _read(*item, max_size_px, as_stored)
         except _pixels.UnusableImage as refusal:
@@ -280,13 +272,13 @@ def _named_items(source: ImageSource, *others: Path | str | None) -> list[tuple[
         if isinstance(item, str | Path):
             name = os.path.relpath(item, home) if by_path else Path(item).name
         elif isinstance(item, Image):
-            name = require_image_name(item.name, "an Image record")
+            name = _files.require_image_name(item.name, "an Image record")
         # Equal names are numbered.
         name = printable(name)
         numbered = (f"{name} ({k})" for k in count(2))
         free = next(one for one in chain([name], numbered) if one not in items)
         items[free] = Path(item) if isinstance(item, str) else item
-    return sorted(items.items(), key=lambda pair: natural_key(pair[0]))
+    return sorted(items.items(), key=lambda pair: _files.natural_key(pair[0]))
 
 
 def _read(name: str, item: Any, max_size_px: int, as_stored: bool) -> DecodedImage:
@@ -325,7 +317,7 @@ def decode_file(path: Path, use: Callable[[PIL.Image.Image], T]) -> T:
     except OSError as error:
         raise _pixels.UnusableImage(Notice("unreadable", error.strerror)) from None
     if not stat.S_ISREG(found.st_mode):
-        raise _pixels.UnusableImage(Notice("not-a-file", SPECIAL_FILE))
+        raise _pixels.UnusableImage(Notice("not-a-file", _files.SPECIAL_FILE))
     if found.st_size > MAX_FILE_BYTES:
         raise _pixels.UnusableImage(Notice("file-too-large", found.st_size / 2**30, MAX_FILE_BYTES / 2**30))
     try:

@@ -13,13 +13,7 @@ from thesisrecon.camera import rq
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.records import DisparityMap
-from thesisrecon.views.tensor import (
-    AGREE_PX,
-    CalibratedPair,
-    TensorSynthesis,
-    VirtualCamera,
-    prepare_synthesis,
-)
+from thesisrecon.views import tensor
 
 MIN_DEPTH = 0.2  #: minimum third coordinate of its corners, in units of that of its centre
 
@@ -85,7 +79,7 @@ class InterpolatedPair(Record):
 
     H: F64  #: (2, 3, 3) homographies to the rectified frame, third coordinate positive for visible pixels
     left: DisparityMap  #: of the first image in the rectified frame, x_right = x_left - d
-    synthesis: TensorSynthesis  #: of two cameras with the inverse homographies as intrinsics
+    synthesis: tensor.TensorSynthesis  #: of two cameras with the inverse homographies as intrinsics
 
     @property
     def known(self) -> float:
@@ -100,19 +94,20 @@ class InterpolatedPair(Record):
             return self.synthesis.levels[int(s)][..., :3].astype(np.uint8)
         size = self.synthesis.sizes[0]
         K, R = rq(original_from_rectified(self.H, size, s))
-        camera = VirtualCamera(R, R[:, 0] * (1.0 - s), K / K[2, 2], size)
+        camera = tensor.VirtualCamera(R, R[:, 0] * (1.0 - s), K / K[2, 2], size)
         return self.synthesis.render(camera, threads=threads)
 
 
 def prepare_interpolation(
     images: tuple[U8, U8], H: F64, left: DisparityMap, places: tuple[F32, F32], *, gain: F32,
-    agree_px: float = AGREE_PX,
+    agree_px: float = tensor.AGREE_PX,
 ) -> InterpolatedPair:  # fmt: skip
     """Prepare two images with the corresponding pixels of the other one, and the gain of the second."""
     # Cameras 1 px apart: the disparity is the inverse depth.
     K1, K2 = np.linalg.inv(H)
-    pair = CalibratedPair(K1, K2, np.eye(3), np.array([-1.0, 0.0, 0.0]))
-    return InterpolatedPair(H, left, prepare_synthesis(pair, images, places, gain=gain, agree_px=agree_px))
+    pair = tensor.CalibratedPair(K1, K2, np.eye(3), np.array([-1.0, 0.0, 0.0]))
+    synthesis = tensor.prepare_synthesis(pair, images, places, gain=gain, agree_px=agree_px)
+    return InterpolatedPair(H, left, synthesis)
 
 
 def disparity_of_right(left: DisparityMap) -> DisparityMap:
