@@ -172,18 +172,15 @@ def bundle_adjust(
     Examples
     --------
     >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, bundle_adjust
-    >>> rng, K = np.random.default_rng(0), np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> R = Rotation.from_euler("yx", rng.uniform(-0.5, 0.5, (6, 2))).as_matrix()
-    >>> true = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
-    >>> X = rng.uniform(-1, 1, (60, 3))
-    >>> xy = np.stack([camera.project(X) for camera in true]) + 0.5 * rng.normal(size=(6, 60, 2))
-    >>> found = bundle_adjust(true, X + 0.01 * rng.normal(size=X.shape), xy, prior={"k1": 0.05})
-    >>> bool(abs(found.cameras[0].K[0, 0] - 800) < 4 * found.cameras[0].std["focal_px"])
+    >>> from thesisrecon import bundle_adjust, sample
+    >>> cube, rng = np.load(sample("cube") / "cube.npz"), np.random.default_rng(0)
+    >>> t = -np.einsum("vij,vj->vi", cube["R"], cube["C"])
+    >>> xy = cube["xy"] + 0.5 * rng.normal(size=cube["xy"].shape)
+    >>> found = bundle_adjust((cube["K"], cube["R"], t), cube["X"], xy, sizes=(823, 581), prior={"k1": 0.05})
+    >>> bool(abs(found.cameras[0].K[0, 0] - 842) < 4 * found.cameras[0].std["focal_px"])
     True
     >>> found.point_covariance.shape, round(found.sigma_px, 1)
-    ((60, 3, 3), 0.5)
+    ((360, 3, 3), 0.5)
     """
     views, X, observed, dense = _problem(cameras, X, xy, sizes)
     free = tuple(free) if isinstance(free, Sequence | Set) and not isinstance(free, str) else (free,)

@@ -72,24 +72,17 @@ def self_calibrate(
 
     Examples
     --------
-    Six views of a cloud of points by one camera of unknown focal length:
+    Six cameras of one focal length in a projective frame:
 
     >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import Camera, reconstruction_from_cameras, self_calibrate
-    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> angles = np.radians([[0, -30, 5], [25, -15, 0], [-5, 0, 20], [15, 15, 0], [-20, 25, 5], [5, 40, -15]])
-    >>> R = Rotation.from_euler("xyz", angles).as_matrix()
-    >>> cameras = [Camera(K, r, np.array([0.0, 0, 5]), (640, 480)) for r in R]
-    >>> X = np.random.default_rng(0).uniform(-1, 1, (80, 3))
-    >>> xy = np.stack([camera.project(X) for camera in cameras])
-    >>> H = np.random.default_rng(1).normal(size=(4, 4))
-    >>> P = np.array([camera.P for camera in cameras]) @ np.linalg.inv(H)
-    >>> projective = reconstruction_from_cameras(P, sizes=(640, 480), xy=xy, stratum="projective")
-    >>> round(self_calibrate(projective).K[0, 0, 0])
-    800
-    >>> round(self_calibrate(P, (640, 480), method="nonlinear-quadric").K[0, 0, 0])
-    800
+    >>> from thesisrecon import sample, self_calibrate
+    >>> cube = np.load(sample("cube") / "cube.npz")
+    >>> Rt = np.concatenate([cube["R"], -cube["R"] @ cube["C"][:, :, None]], axis=2)[::4]
+    >>> P = cube["K"] @ Rt @ np.random.default_rng(1).normal(size=(4, 4))
+    >>> round(self_calibrate(P, (823, 581)).K[0, 0, 0])
+    842
+    >>> round(self_calibrate(P, (823, 581), method="nonlinear-quadric").K[0, 0, 0])
+    842
     """
     projective = _projective("self_calibrate", reconstruction, sizes, X, xy)
     calibrator, settings = _method(projective, method, config)
@@ -180,12 +173,9 @@ def upgrade_affine(
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon import Reconstruction, Tracks, upgrade_affine
-    >>> none = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 1, 2)
-    >>> projective = Reconstruction(
-    ...     "projective", np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]]), np.ones(1, bool),
-    ...     np.ones(2, bool), np.zeros(0, bool), none, np.array([[640, 480]]), 1.0, ("",),
-    ... )
+    >>> from thesisrecon import reconstruction_from_cameras, upgrade_affine
+    >>> P, X = np.eye(3, 4)[None], np.array([[1.0, 2, 4, 3], [0, 1, 2, 1]])
+    >>> projective = reconstruction_from_cameras(P, sizes=(640, 480), X=X, stratum="projective")
     >>> affine = upgrade_affine(projective, plane=np.array([0.0, 0, 0.5, 0]))
     >>> affine.stratum, bool((affine.X[:, 3] == 1).all())
     ('affine', True)
@@ -263,15 +253,13 @@ def kruppa(F: F64, sizes: I64) -> F64:
     Examples
     --------
     >>> import numpy as np
-    >>> from scipy.spatial.transform import Rotation
-    >>> from thesisrecon import kruppa
+    >>> from thesisrecon import kruppa, sample
     >>> from thesisrecon.geometry.two_view import fundamental_from_cameras
-    >>> K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> R = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.4, 0.1], [-0.3, 0.2, 0.5]]).as_matrix()
-    >>> P = K @ np.concatenate([R, [[[0], [0], [5]], [[1], [0], [6]], [[0], [2], [4]]]], axis=2)
+    >>> cube = np.load(sample("cube") / "cube.npz")
+    >>> P = cube["K"] @ np.concatenate([cube["R"], -cube["R"] @ cube["C"][:, :, None]], axis=2)[::4]
     >>> F = np.stack([fundamental_from_cameras(P[i], P[j]) for i, j in ((0, 1), (0, 2), (1, 2))])
-    >>> round(float(kruppa(F, (640, 480))[0, 0]), 3)
-    800.0
+    >>> round(float(kruppa(F, (823, 581))[0, 0]), 3)
+    842.0
     """
     (F,) = numbers("kruppa", F=F)
     (F,) = checked("kruppa", F=(F[None] if F.ndim == 2 else F, ("M", 3, 3)))

@@ -107,14 +107,12 @@ def align_to_positions(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from thesisrecon import align_to_positions
-    >>> from thesisrecon.results import SparseModel, SparseView
-    >>> centres = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    >>> model = SparseModel([SparseView(name, np.eye(3), -c) for name, c in zip("abcd", centres)])
-    >>> aligned, report = align_to_positions(model, dict(zip("abcd", 2.5 * centres + 10)))
-    >>> round(report.similarity.scale, 6), aligned.views[1].centre.round(6).tolist()
-    (2.5, [12.5, 10.0, 10.0])
+    >>> from thesisrecon import align_to_positions, read_cameras, sample
+    >>> cameras = read_cameras(sample() / "cameras.json")
+    >>> places = {name: 2.5 * camera.centre + 10 for name, camera in cameras.items()}
+    >>> aligned, report = align_to_positions(cameras, places)
+    >>> round(report.similarity.scale, 6), bool(report.distance.max() < 1e-6)
+    (2.5, True)
     """
     origin = None
     if isinstance(positions, str | PathLike):
@@ -193,12 +191,10 @@ def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from thesisrecon import scaled
-    >>> from thesisrecon.results import SparseModel, SparseView
-    >>> views = [SparseView(name, np.eye(3), np.array([x, 0.0, 0.0])) for name, x in (("a", 0.0), ("b", 0.5))]
-    >>> scaled(SparseModel(views), "a", "b", 3.0).views[1].centre.tolist()
-    [-3.0, 0.0, 0.0]
+    >>> from thesisrecon import sample, scaled
+    >>> first, second, *_ = scaled(sample() / "cameras.json", "0000.jpg", "0001.jpg", 3.0).views
+    >>> round(float(np.linalg.norm(first.centre - second.centre)), 6)
+    3.0
     """
     model = as_sparse_model(model)
     centres = {view.name: view.centre for view in model.views}
@@ -241,13 +237,13 @@ def scaled_by_points(
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon import Camera, scaled_by_points
-    >>> K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-    >>> model = {n: Camera(K, np.eye(3), np.array([x, 0.0, 4]), (640, 480)) for n, x in (("a", 0), ("b", -1))}
+    >>> from thesisrecon import read_cameras, sample, scaled_by_points
+    >>> cameras = read_cameras(sample() / "cameras.json")
     >>> ends = np.array([[0.0, 0, 0], [0.5, 0, 0]])
-    >>> pixels = {name: camera.project(ends) for name, camera in model.items()}
-    >>> round(float(np.linalg.norm(scaled_by_points(model, pixels, 2.0).views[1].centre - [0, 0, -16])), 6)
-    4.0
+    >>> pixels = {name: cameras[name].project(ends) for name in ("0000.jpg", "0005.jpg")}
+    >>> moved = scaled_by_points(cameras, pixels, 2.0).views[0].centre
+    >>> bool(np.allclose(moved, 4.0 * cameras["0000.jpg"].centre))
+    True
     """
     if isinstance(pixels, str | PathLike):
         pixels = read_point_pairs(Path(pixels))
@@ -435,17 +431,14 @@ def compare_models(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from thesisrecon import Camera, compare_models
-    >>> K, size = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), (640, 480)
-    >>> centres = {"1.jpg": [0.0, 0, 0], "2.jpg": [1, 0, 0], "3.jpg": [0, 1, 0]}
-    >>> a = {name: Camera(K, np.eye(3), -np.array(c), size) for name, c in centres.items()}
-    >>> K_b = K / [[1.01], [1.01], [1]]
-    >>> b = {name: Camera(K_b, np.eye(3), -2.0 * np.array(c), size) for name, c in centres.items()}
+    >>> from dataclasses import replace
+    >>> from thesisrecon import compare_models, read_cameras, sample
+    >>> b = read_cameras(sample() / "cameras.json")
+    >>> a = {name: replace(c, K=c.K * [[1.01], [1.01], [1]], t=0.5 * c.t) for name, c in b.items()}
     >>> comparison = compare_models(a, b)
-    >>> round(comparison.similarity.scale, 6), comparison.focal_error_rel.round(6).tolist()
-    (2.0, [0.01, 0.01, 0.01])
-    >>> bool(comparison.summary["centre_error"]["max"] < 1e-12)
+    >>> round(comparison.similarity.scale, 6), comparison.focal_error_rel[:2].round(6).tolist()
+    (2.0, [0.01, 0.01])
+    >>> bool(comparison.summary["centre_error"]["max"] < 1e-9)
     True
     """
     first, notes = _model(a, "first"), list[str]()

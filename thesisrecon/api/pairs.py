@@ -307,20 +307,16 @@ def estimate_fundamental(
 
     Examples
     --------
-    >>> import numpy as np
-    >>> import thesisrecon
-    >>> rng = np.random.default_rng(0)
-    >>> xy1 = rng.uniform(0, 500, (60, 2))
-    >>> xy2 = xy1 + np.array([[40.0, 10.0]]) / rng.uniform(1, 4, (60, 1))
-    >>> xy2[:20] = rng.uniform(0, 500, (20, 2))
-    >>> fit = thesisrecon.estimate_fundamental(xy1, xy2)
-    >>> bool(fit.inliers[20:].all()), fit.determined
+    >>> from thesisrecon import estimate_fundamental
+    >>> from thesisrecon.testing import two_views
+    >>> pair = two_views(outliers=0.3)
+    >>> fit = estimate_fundamental(pair.xy1, pair.xy2)
+    >>> bool(fit.inliers[pair.inlier].mean() > 0.95), fit.determined
     (True, True)
-    >>> plane = xy1 + rng.normal([40.0, 10.0], 0.3, (60, 2))
-    >>> thesisrecon.estimate_fundamental(xy1, plane).determined
+    >>> plane = 1.1 * pair.xy1 + [40.0, 10.0]
+    >>> estimate_fundamental(pair.xy1, plane).determined
     False
-    >>> linear = thesisrecon.estimate_fundamental(xy1[20:], xy2[20:], method="eight-point")
-    >>> linear.covariance.shape
+    >>> estimate_fundamental(pair.xy1[fit.inliers], pair.xy2[fit.inliers], method="eight-point").covariance.shape
     (9, 9)
     """
     xy1, xy2 = arrays.numbers("estimate_fundamental", xy1=xy1, xy2=xy2)

@@ -87,15 +87,13 @@ def estimate_essential(
     Examples
     --------
     >>> import numpy as np
-    >>> from thesisrecon import Camera, estimate_essential
-    >>> rng, K = np.random.default_rng(0), np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
-    >>> X = rng.uniform(-1, 1, (60, 3)) + [0, 0, 5]
-    >>> t = [np.zeros(3), np.array([-0.6, 0.0, 0.8])]
-    >>> xy1, xy2 = (Camera(K, np.eye(3), one, (640, 480)).project(X) for one in t)
-    >>> xy2[:20] = rng.uniform(0, 480, (20, 2))
-    >>> fit = estimate_essential(xy1, xy2, K)
-    >>> int(fit.inliers[20:].sum()), (fit.t.round(6) + 0.0).tolist()
-    (40, [-0.6, 0.0, 0.8])
+    >>> from thesisrecon import estimate_essential
+    >>> from thesisrecon.testing import two_views
+    >>> pair = two_views(outliers=0.3)
+    >>> fit = estimate_essential(pair.xy1, pair.xy2, *pair.cameras)
+    >>> true = pair.cameras[1].t
+    >>> bool(fit.t @ true > 0.9998 * np.linalg.norm(true))
+    True
     """
     caller = "estimate_essential"
     x1, x2 = checked(caller, xy1=(xy1, ("N", 2)), xy2=(xy2, ("N", 2)))
