@@ -316,7 +316,8 @@ def estimate_fundamental(
     >>> plane = 1.1 * pair.xy1 + [40.0, 10.0]
     >>> estimate_fundamental(pair.xy1, plane).determined
     False
-    >>> estimate_fundamental(pair.xy1[fit.inliers], pair.xy2[fit.inliers], method="eight-point").covariance.shape
+    >>> good = fit.inliers
+    >>> estimate_fundamental(pair.xy1[good], pair.xy2[good], method="eight-point").covariance.shape
     (9, 9)
     """
     xy1, xy2 = arrays.numbers("estimate_fundamental", xy1=xy1, xy2=xy2)

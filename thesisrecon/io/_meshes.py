@@ -16,7 +16,6 @@ from thesisrecon.errors import UsageError
 from thesisrecon.io._files import read_bytes
 from thesisrecon.records import TexturedMesh, as_mesh
 
-_TEXTURES = ("JPEG", "PNG", "BMP", "TIFF", "TGA", "WEBP")  # Pillow opens some others by external programs
 _MAX_TEXELS = 2**26  # Many times the size of a run's texture, and within the limit of Pillow
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 """Rotation by 180 degrees about x, between the camera axes and those of glTF; its own inverse."""
@@ -66,7 +65,10 @@ def read_mesh(path: Path) -> TexturedMesh:
     if kind not in ("glb", "ply", "obj"):
         raise UsageError(f"a mesh is read from GLB, PLY or OBJ; got {path.name}")
     import trimesh
+    from PIL import EpsImagePlugin
 
+    # A texture must not start Ghostscript.
+    program, EpsImagePlugin.gs_binary = EpsImagePlugin.gs_binary, False
     try:
         content = io.BytesIO(read_bytes(path, largest=2**31)) if kind == "glb" else path
         loaded: Any = trimesh.load(content, file_type=kind, process=False, force="mesh")
@@ -81,6 +83,8 @@ def read_mesh(path: Path) -> TexturedMesh:
         # Damaged files raise errors of any kind.
         what = f"{error}" if type(error) is ValueError else f"{type(error).__name__} {error}"
         raise UsageError(f"the mesh {path} cannot be read: {what}") from None
+    finally:
+        EpsImagePlugin.gs_binary = program
 
 
 def _mesh_of(vertices: F64, faces: Any, visual: Any) -> TexturedMesh:
@@ -92,8 +96,6 @@ def _mesh_of(vertices: F64, faces: Any, visual: Any) -> TexturedMesh:
         raise ValueError("its faces refer to missing vertices")
     uv, material = getattr(visual, "uv", None), getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and image.format not in _TEXTURES:
-        raise ValueError(f"its texture is none of {', '.join(_TEXTURES)}")
     if uv is None or image is None:
         colors = np.array(visual.vertex_colors[:, :3], dtype=np.uint8) if visual.kind == "vertex" else None
         return TexturedMesh(vertices, faces, colors)

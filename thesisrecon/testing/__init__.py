@@ -67,10 +67,12 @@ def camera_deviations(model: Any, truth: Any) -> CameraDeviations:
 
     Examples
     --------
+    >>> import numpy as np
     >>> from dataclasses import replace
     >>> from thesisrecon.testing import camera_deviations, courtyard
     >>> _, truth = courtyard()
-    >>> found = {n: replace(c, K=c.K * [[1.01], [1.01], [1]], std={"focal_px": 8.0}) for n, c in truth.items()}
+    >>> K = np.diag([1.01, 1.01, 1.0])
+    >>> found = {n: replace(c, K=K @ c.K, std={"focal_px": 8.0}) for n, c in truth.items()}
     >>> errors = camera_deviations(found, truth)
     >>> errors.focal_pct.round(6).tolist()[:2], errors.z[:2, 0].round(2).tolist()
     ([1.0, 1.0], [1.14, 1.14])
