@@ -72,16 +72,18 @@ def self_calibrate(
 
     Examples
     --------
-    Six cameras of one focal length in a projective frame:
+    Seven cameras of one focal length in a projective frame:
 
     >>> import numpy as np
-    >>> from thesisrecon import sample, self_calibrate
+    >>> from thesisrecon import reconstruction_from_cameras, sample, self_calibrate
     >>> cube = np.load(sample("cube") / "cube.npz")
     >>> Rt = np.concatenate([cube["R"], -cube["R"] @ cube["C"][:, :, None]], axis=2)[::4]
     >>> P = cube["K"] @ Rt @ np.random.default_rng(1).normal(size=(4, 4))
-    >>> round(self_calibrate(P, (823, 581)).K[0, 0, 0])
+    >>> size, xy = (823, 581), cube["xy"][::4]
+    >>> projective = reconstruction_from_cameras(P, sizes=size, xy=xy, stratum="projective")
+    >>> round(self_calibrate(projective).K[0, 0, 0])
     842
-    >>> round(self_calibrate(P, (823, 581), method="nonlinear-quadric").K[0, 0, 0])
+    >>> round(self_calibrate(P, size, method="nonlinear-quadric").K[0, 0, 0])
     842
     """
     projective = _projective("self_calibrate", reconstruction, sizes, X, xy)

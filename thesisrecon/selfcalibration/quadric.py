@@ -135,9 +135,9 @@ class LinearQuadric:
 
     >>> from thesisrecon import PipelineConfig, self_calibrate
     >>> from thesisrecon.selfcalibration.quadric import LinearQuadric
-    >>> config = PipelineConfig(selfcalibration=LinearQuadric(normalising_focal=1.25))
+    >>> config = PipelineConfig(selfcalibration=LinearQuadric(normalising_focal=842 / 823))
     >>> round(self_calibrate(projective, config=config).K[0, 0, 0])
-    800
+    842
     """
 
     normalising_focal: float = 1.67
