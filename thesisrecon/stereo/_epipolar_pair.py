@@ -170,7 +170,6 @@ class EpipolarPair:
     matches: tuple[F64, F64]  #: (N, 2) pixels, possibly none
     arc: tuple[float, float]  #: interval of phi that both images see
     regions: tuple[F64, F64]  #: (M, 2) pixels of each image inside the arc, first the corners of that polygon
-    cameras: F64 | None = None  #: (2, 3, 4) metric, if known
 
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
@@ -235,7 +234,7 @@ def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -
     P_z = _quasi_euclidean(pencil, *matches) if P_z is None else P_z
     pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, *seen))
     arc = _common_arc(pencil, matches[0])
-    return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)), P)
+    return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)))
 
 
 def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
@@ -355,7 +354,7 @@ def image_corners(size: Size) -> F64:
 
 def frame_size(extent: F64, pair: EpipolarPair) -> tuple[int, int]:
     """(width, height) of a frame of some extent (2,), rounded up; ``StageFailure`` if too large or empty."""
-    width, height = float(extent[0]), float(extent[1])
+    width, height = extent.tolist()
     most = MAX_GROWTH * max(w * h for w, h in pair.pencil.sizes)
     if not width * height <= most:
         evidence = f"they need {width * height / 1e6:.3g} million pixels, the limit is {most / 1e6:.3g}"

@@ -99,17 +99,6 @@ class PlanarRectification(Rectification):
         return np.stack([u * w, v * w], axis=-1)
 
 
-def common_orientation(pair: EpipolarPair) -> PlanarRectification:
-    """Rotate metric cameras to a common orientation: H = K R (K_i R_i)^-1, x axis of R along the baseline.
-
-    Fusiello, Trucco and Verri (MVA 2000) use the viewing direction of the first camera; here it is the mean.
-    """
-    if pair.cameras is None:
-        raise StageFailure.of("orientation-without-cameras")
-    orientation = rotation_along_baseline(pair.cameras)
-    return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(pair.cameras[:, :, :3])))
-
-
 def rotation_along_baseline(P: F64) -> F64:
     """Rotation (3, 3) with the x axis along the baseline of two cameras (2, 3, 4) and z near both views."""
     baseline = np.diff(dehomogenize(camera_centre(P)), axis=0)[0]
@@ -148,10 +137,10 @@ def hartley(pair: EpipolarPair) -> PlanarRectification:
 
 def _perpendicular(pair: EpipolarPair, phi: float) -> float:
     """Plane of the line through the epipole of view 2 perpendicular to that through its centre."""
-    e = pair.pencil.epipole(1)
-    at_infinity = abs(e[2]) < 1e-12 * np.hypot(e[0], e[1])
     # The centre is the origin. For an epipole at infinity it is the line at infinity.
-    line = np.array([0.0, 0.0, 1.0] if at_infinity else [e[0], e[1], -(e[0] ** 2 + e[1] ** 2) / e[2]])
+    x, y, w = pair.pencil.epipole(1)
+    at_infinity = abs(w) < 1e-12 * np.hypot(x, y)
+    line = np.array([0.0, 0.0, 1.0] if at_infinity else [x, y, -(x**2 + y**2) / w])
     p = np.linalg.lstsq(pair.pencil.lines[1], line, rcond=None)[0]
     return phi + float(np.mod(np.arctan2(p[1], p[0]) - phi, np.pi))
 
@@ -331,7 +320,8 @@ class PolarRectification(Rectification):
 
     def _original(self, side: int, xy: F64) -> F64:
         columns, rows = xy.T
-        return self._on_lines(side, self._angle_of(rows), columns, rows)
+        phi = np.interp(rows, *self._knots, left=np.nan, right=np.nan)
+        return self._on_lines(side, phi, columns, rows)
 
     def _on_lines(self, side: int, phi: F64, columns: F64, rows: F64) -> F64:
         lines = self.pencil.half_lines(side, phi)
@@ -342,7 +332,8 @@ class PolarRectification(Rectification):
 
     def _rectified(self, side: int, xy: F64) -> F64:
         phi = self.pencil.angles(side, xy, about=0.5 * float(self.angles[0] + self.angles[-1]))
-        lines, rows = self.pencil.half_lines(side, phi), self._row_of(phi)
+        lines, (numbers, angles) = self.pencil.half_lines(side, phi), self._knots
+        rows = np.interp(self._sign * phi, self._sign * angles, numbers, left=np.nan, right=np.nan)
         t = np.sum(self.pencil.normalized(side, xy) * lines.direction, axis=1)
         along = self._sign * self.pencil.units[side] * (t - lines.sagitta)
         columns = self.scales[side] * along + self.shears[side] * rows - self.origins[side]
@@ -362,14 +353,6 @@ class PolarRectification(Rectification):
         a, count = self.angles, len(self.angles)
         ends = 1.5 * a[[0, -1]] - 0.5 * a[[1, -2]]
         return np.clip(np.arange(-1.0, count + 1.0), -0.5, count - 0.5), np.array([ends[0], *a, ends[1]])
-
-    def _angle_of(self, rows: F64) -> F64:
-        """Angles of rows (N,), which may be fractional."""
-        return np.interp(rows, *self._knots, left=np.nan, right=np.nan)
-
-    def _row_of(self, phi: F64) -> F64:
-        rows, angles = self._knots
-        return np.interp(self._sign * phi, self._sign * angles, rows, left=np.nan, right=np.nan)
 
 
 def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
@@ -442,8 +425,7 @@ BENDING = 0.03  #: penalty of polar frames, which bend straight lines
 
 Method = Callable[[EpipolarPair], Rectification]
 PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)  #: methods from F with homographies
-METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
-"""All methods; the common orientation needs cameras."""
+METHODS: tuple[Method, ...] = (*PLANAR, polar, partial(polar, aligned=False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -556,8 +538,7 @@ def _midlines(rectification: Rectification, side: int, size: Size) -> tuple[floa
 
 def rectify(pair: EpipolarPair, methods: Sequence[Method] = METHODS) -> Rectification:
     """Return the rectification of least distortion, first of those within the angle and aspect limits."""
-    found: list[Rectification] = []
-    failure = StageFailure(Notice("no-rectification-method"))
+    found, failure = list[Rectification](), StageFailure(Notice("no-rectification-method"))
     for method in methods:
         try:
             found.append(method(pair))
