@@ -155,7 +155,7 @@ def test_strength_of_match_equals_its_brute_force_twin(tolerance):
         np.linalg.norm(xy[:, None] - xy[None], axis=2).argsort(axis=1)[:, 1:6] for xy in (xy1, xy2)
     )
     near1[3, 2:] = -1
-    index, strength = _strength_of_match(correlation, (xy1, xy2), (near1, near2), (30.0, 4, 0.1), tolerance)
+    index, strength = _strength_of_match(correlation, xy1, xy2, near1, near2, (30.0, 4, 0.1), tolerance)
 
     def agreement(u, v, m, n):
         a, b, apart = xy2[v] - xy1[u], xy2[n] - xy1[m], float(np.linalg.norm(xy1[m] - xy1[u]))

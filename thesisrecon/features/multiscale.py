@@ -4,9 +4,8 @@ Patches of simulated oblique views match those of another camera far to the side
 "ASIFT: a new framework for fully affine invariant image comparison", SIAM J. Imaging Sciences 2, 2009).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from typing import Any, ClassVar
 
 import numpy as np
@@ -54,15 +53,6 @@ class ObliqueView:
     gray: F32
     to_view: F64
     offset: F64
-
-
-def oblique_views(gray: F32, tilts: Sequence[float], enlargement: float) -> Iterator[ObliqueView]:
-    """Compress an image (H, W) by each tilt, in directions over 180 degrees; tiny images have no views."""
-    # At least two patches wide; directions of tilt 1 are 72 degrees apart.
-    for tilt in tilts if min(gray.shape) >= 64 else ():
-        count = int(np.ceil(np.pi * tilt / np.radians(72.0)))
-        for k in range(count):
-            yield simulate_view(gray, tilt, np.pi * k / count, enlargement)
 
 
 def simulate_view(gray: F32, tilt: float, direction: float, enlargement: float = 1.0) -> ObliqueView:
@@ -132,7 +122,7 @@ class MultiScaleCorners:
 
     def detect(self, image: Image) -> Features:
         """See `thesisrecon.config.Detector.detect`."""
-        levels = self._pyramid(image)
+        levels = _image_pyramid(image.gray, self.levels, doubled=self._is_small(image))
         found = [self.measure._find(level.gray) for level in levels]
         parts = []
         for index, count in ((0, self.full_corners), (2, self.half_corners)):
@@ -143,17 +133,12 @@ class MultiScaleCorners:
                 parts.append((levels[index].to_image(xy[kept]), np.full(len(kept), nominal), response[kept]))
         xy, scale, response = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(-response, kind="stable")
-        seeds = self._seeds(levels, found)
-        return Features(xy=xy[order], scale=scale[order], response=response[order], seeds=seeds)
+        return Features(xy[order], scale[order], response[order], seeds=self._seeds(levels, found))
 
     def _select(self, xy: F64, response: F32, count: int) -> I64:
         if self.spread:
             return select_spread(xy, response, count)
         return np.arange(min(count, len(xy)), dtype=np.int64)
-
-    def _pyramid(self, image: Image) -> list[_PyramidLevel]:
-        sizes = _image_pyramid(image.gray, self.levels, doubled=self._is_small(image))
-        return [_PyramidLevel(*level) for level in zip(*sizes, strict=True)]
 
     def _is_small(self, image: Image) -> bool:
         return max(image.size) < self.upsample_below_px * max(image.scale, 1.0)
@@ -166,32 +151,31 @@ class MultiScaleCorners:
             scale = np.full(len(kept), np.sqrt(np.prod(level.scale)), np.float32)
             for part, seen in zip((upright, turned), _patches(level.gray, corners[kept]), strict=True):
                 part.append((xy, scale, *seen))
-        xy, scale, angle, raw = (np.concatenate(column) for column in zip(*upright, *turned, strict=True))
-        patches, ok = _normalize_patches(raw)
-        return Seeds(xy[ok], scale[ok], angle[ok], patches[ok])
+        return _joined_seeds([*upright, *turned])
 
     def oblique_seeds(self, image: Image) -> Seeds:
         """Seeds of simulated oblique views, in the orientation of the image and rotated to their gradient."""
-        enlargement = 2.0 if self._is_small(image) else 1.0
-        views = oblique_views(image.gray, self.oblique_tilts, enlargement)
-        parts = [self._seeds_of_view(view, image.size) for view in views]
-        none = np.empty(0, np.float32)
-        empty = np.empty((0, 2)), none, none, np.empty((0, PATCH_SIDE**2), np.float32), np.empty((0, 2, 2))
-        columns = zip(empty, *chain(*parts), strict=True)
-        xy, scale, angle, raw, frame = (np.concatenate(column) for column in columns)
-        patches, ok = _normalize_patches(raw)
-        return Seeds(xy[ok], scale[ok], angle[ok], patches[ok], frame[ok])
+        enlargement, none = 2.0 if self._is_small(image) else 1.0, np.empty(0, np.float32)
+        parts: list[tuple[Any, ...]] = [
+            (np.empty((0, 2)), none, none, np.empty((0, PATCH_SIDE**2), np.float32), np.empty((0, 2, 2)))
+        ]
+        # Views are at least two patches wide, in directions over 180 degrees, 72 apart for tilt 1.
+        for tilt in self.oblique_tilts if min(image.gray.shape) >= 64 else ():
+            count = int(np.ceil(np.pi * tilt / np.radians(72.0)))
+            for direction in np.pi * np.arange(count) / count:
+                view = simulate_view(image.gray, tilt, direction, enlargement)
+                parts += self._seeds_of_view(view, image.size)
+        return _joined_seeds(parts)
 
     def _seeds_of_view(
         self, view: ObliqueView, size: tuple[int, int]
     ) -> list[tuple[F64, F32, F32, F32, F64]]:
         """Fields of the seeds of each level of one simulated view, with patches that are not normalised."""
         parts, to_image = [], np.linalg.inv(view.to_view)
-        grays, scales = _image_pyramid(view.gray, self.levels, doubled=False)
-        for index, (gray, scale) in enumerate(zip(grays, scales, strict=True)):
-            corners, response = self.measure._find(gray)
-            xy = (_PyramidLevel(gray, scale).to_image(corners) - view.offset) @ to_image.T
-            spacing = np.sqrt(np.prod(scale))
+        for index, level in enumerate(_image_pyramid(view.gray, self.levels, doubled=False)):
+            corners, response = self.measure._find(level.gray)
+            xy = (level.to_image(corners) - view.offset) @ to_image.T
+            spacing = np.sqrt(np.prod(level.scale))
             # Half a patch: beyond the border of the image the view repeats border pixels.
             margin = PATCH_SIDE * spacing * np.sqrt(np.linalg.det(to_image))
             inside = ((xy > margin) & (xy < np.array(size) - 1.0 - margin)).all(axis=1)
@@ -200,7 +184,7 @@ class MultiScaleCorners:
             count = int(0.5 * self.seeds_per_level / view.tilt / np.sqrt(2.0) ** index)
             kept = self._select(corners, response, count)
             size_px = np.full(len(kept), spacing * np.sqrt(np.linalg.det(to_image)), np.float32)
-            for turned, (angle, raw) in enumerate(_patches(gray, corners[kept], -view.direction)):
+            for turned, (angle, raw) in enumerate(_patches(level.gray, corners[kept], -view.direction)):
                 label = angle if turned else np.zeros_like(angle)
                 c, s = np.cos(angle), np.sin(angle)
                 turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2).astype(np.float64)
@@ -208,41 +192,42 @@ class MultiScaleCorners:
         return parts
 
 
-def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> tuple[list[F32], list[F64]]:
-    """Levels of a pyramid, each 1/sqrt(2) of the one before: sizes, and image pixels per pixel (x, y)."""
+def _image_pyramid(plane: F32, levels: int, *, doubled: bool) -> list[_PyramidLevel]:
+    """Levels of a pyramid, each 1/sqrt(2) of the one before."""
     height, width = plane.shape
-    sizes = [resample(plane, 2 * width, 2 * height) if doubled else plane]
-    scales = [np.array([width / sizes[0].shape[1], height / sizes[0].shape[0]])]
+    first = resample(plane, 2 * width, 2 * height) if doubled else plane
+    found = [_PyramidLevel(first, np.array([width, height]) / first.shape[::-1])]
     for index in range(1, levels):
-        finer = sizes[max(index - 2, 0)]
-        if min(finer.shape) < 32:
+        finer = found[max(index - 2, 0)]
+        h, w = finer.gray.shape
+        if min(h, w) < 32:
             break
         if index == 1:
             # A step of sqrt(2) needs a weaker low-pass than halving: sigma 0.6 avoids aliasing.
-            h, w = finer.shape
-            sizes.append(resample(smooth(finer, 0.6), round(w / np.sqrt(2.0)), round(h / np.sqrt(2.0))))
-            scales.append(scales[0] * (w, h) / sizes[1].shape[::-1])
+            gray = resample(smooth(finer.gray, 0.6), round(w / np.sqrt(2.0)), round(h / np.sqrt(2.0)))
+            found.append(_PyramidLevel(gray, finer.scale * (w, h) / gray.shape[::-1]))
         else:
-            sizes.append(halve(finer))
-            scales.append(2.0 * scales[index - 2])
-    return sizes, scales
+            found.append(_PyramidLevel(halve(finer.gray), 2.0 * finer.scale))
+    return found
 
 
 def _patches(gray: F32, corners: F64, upright: float = 0.0) -> list[tuple[F32, F32]]:
     """Angles (N,) and patches of corners: ``upright``, and rotated to their dominant direction."""
-    blurred = smooth(gray, 2.0)
-    turned = _dominant_direction(blurred, corners)
-    angles = np.full(len(corners), upright, np.float32), turned
+    blurred, straight = smooth(gray, 2.0), np.full(len(corners), upright, np.float32)
+    # The direction of the gradient, averaged with sigma of about 4 px; never exactly 0.
+    around = sample_patches(blurred, corners, np.zeros_like(straight), 7, 2.0).reshape(-1, 7, 7)
+    gx = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]).sum(axis=(1, 2))
+    gy = (around[:, 2:, 1:-1] - around[:, :-2, 1:-1]).sum(axis=(1, 2))
+    turned = np.arctan2(gy, gx).astype(np.float32)
+    angles = straight, np.where(turned == 0.0, np.float32(1e-6), turned)
     return [(angle, sample_patches(blurred, corners, angle, PATCH_SIDE, 4.0)) for angle in angles]
 
 
-def _dominant_direction(blurred: F32, xy: F64) -> F32:
-    """Direction (N,) rad of the gradient at ``xy``, averaged with sigma of about 4 px; never exactly 0."""
-    around = sample_patches(blurred, xy, np.zeros(len(xy), np.float32), 7, 2.0).reshape(-1, 7, 7)
-    gx = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]).sum(axis=(1, 2))
-    gy = (around[:, 2:, 1:-1] - around[:, :-2, 1:-1]).sum(axis=(1, 2))
-    angle = np.arctan2(gy, gx).astype(np.float32)
-    return np.where(angle == 0.0, np.float32(1e-6), angle)
+def _joined_seeds(parts: Sequence[tuple[Any, ...]]) -> Seeds:
+    """Seeds of the fields of parts, with patches that are not normalised, without those of no contrast."""
+    xy, scale, angle, raw, *frame = (np.concatenate(column) for column in zip(*parts, strict=True))
+    patches, ok = _normalize_patches(raw)
+    return Seeds(xy[ok], scale[ok], angle[ok], patches[ok], *(each[ok] for each in frame))
 
 
 def _normalize_patches(patches: F32) -> tuple[F32, B8]:

@@ -36,24 +36,34 @@ def _relative_difference_weight(a: F64, b: F64, apart: float, tolerance: float) 
 
 @kernel
 def _strength_of_match(
-    correlation: F32, xy: tuple[F64, F64], near: tuple[I64, I64], search: tuple[float, int, float],
+    correlation: F32, xy1: F64, xy2: F64, near1: I64, near2: I64, search: tuple[float, int, float],
     tolerance: float,
 ) -> tuple[I64, F32]:  # fmt: skip
     """Corner of image 2 of largest strength SM_k = c_k sum_m max_n (c_mn lambda_n) (4.1), and SM; -1: none.
 
-    ``near``: neighbours (N1, M), (N2, N) or -1; ``search``: radius px, candidates, least correlation;
-    ``tolerance`` of the relative difference, 0: product of figure 4.4.
+    ``near1``, ``near2``: neighbours (N1, M), (N2, N) or -1; ``search``: radius px, candidates, least
+    correlation; ``tolerance`` of the relative difference, 0: product of figure 4.4.
     """
-    xy1, xy2 = xy
-    index = full(len(xy1), -1, np.int64)
-    strength = zeros(len(xy1), np.float32)
-    held = empty(search[1], np.int64)
+    index, strength = full(len(xy1), -1, np.int64), zeros(len(xy1), np.float32)
+    held, moved, other = empty(search[1], np.int64), empty(2), empty(2)
     for u in range(len(xy1)):
-        count = _best_candidates(correlation[u], xy1[u], xy2, search, held)
-        for k in range(count):
-            v = held[k]
-            around, rule = (near[0][u], near[1][v]), (search[0], tolerance)
-            total = _neighbours_agree(correlation, xy, around, (u, v), rule)
+        for k in range(_best_candidates(correlation[u], xy1[u], xy2, search, held)):
+            v, total = held[k], 0.0
+            moved[0], moved[1] = xy2[v, 0] - xy1[u, 0], xy2[v, 1] - xy1[u, 1]
+            for m in near1[u]:
+                if m < 0:
+                    continue
+                apart, best = np.hypot(xy1[m, 0] - xy1[u, 0], xy1[m, 1] - xy1[u, 1]), 0.0
+                for n in near2[v]:
+                    # Weights are at most 1, so only a correlation above the best can improve it.
+                    if n >= 0 and correlation[m, n] > best:
+                        other[0], other[1] = xy2[n, 0] - xy1[m, 0], xy2[n, 1] - xy1[m, 1]
+                        if tolerance > 0.0:
+                            agreement = _relative_difference_weight(moved, other, apart, tolerance)
+                        else:
+                            agreement = _displacement_weight(moved, other, 1.0 - apart / search[0])
+                        best = max(best, correlation[m, n] * agreement)
+                total += best
             if correlation[u, v] * total > strength[u]:
                 index[u], strength[u] = v, correlation[u, v] * total
     return index, strength
@@ -79,36 +89,6 @@ def _best_candidates(
             at -= 1
         held[at] = v
     return count
-
-
-@kernel
-def _neighbours_agree(
-    correlation: F32, xy: tuple[F64, F64], near: tuple[I64, I64], pair: tuple[int, int],
-    rule: tuple[float, float],
-) -> float:  # fmt: skip
-    """sum_m max_n (c_mn lambda_n) of one pair of corners, figure 4.3 step 1 (a) i."""
-    xy1, xy2 = xy
-    u, v = pair
-    radius, tolerance = rule
-    moved, other = empty(2), empty(2)
-    moved[0], moved[1] = xy2[v, 0] - xy1[u, 0], xy2[v, 1] - xy1[u, 1]
-    total = 0.0
-    for m in near[0]:
-        if m < 0:
-            continue
-        apart = np.hypot(xy1[m, 0] - xy1[u, 0], xy1[m, 1] - xy1[u, 1])
-        best = 0.0
-        for n in near[1]:
-            # Weights are at most 1, so only a correlation above the best can improve it.
-            if n >= 0 and correlation[m, n] > best:
-                other[0], other[1] = xy2[n, 0] - xy1[m, 0], xy2[n, 1] - xy1[m, 1]
-                if tolerance > 0.0:
-                    agreement = _relative_difference_weight(moved, other, apart, tolerance)
-                else:
-                    agreement = _displacement_weight(moved, other, 1.0 - apart / radius)
-                best = max(best, correlation[m, n] * agreement)
-        total += best
-    return total
 
 
 @dataclass(frozen=True)
@@ -157,18 +137,15 @@ class StrengthOfMatch:
         radius = self.radius_rel * max(view1.long_side, view2.long_side)
         near1 = _nearest(xy1, self.neighbours, radius)
         near2 = _nearest(xy2, self.neighbours + self.neighbours // 2, radius)
-        index, strength = _strength_of_match(
-            correlation, (xy1, xy2), (near1, near2), (radius, self.candidates, self.min_correlation),
-            TOLERANCE if self.weight == "relative-difference" else 0.0,
-        )  # fmt: skip
+        search = radius, self.candidates, self.min_correlation
+        tolerance = TOLERANCE if self.weight == "relative-difference" else 0.0
+        index, strength = _strength_of_match(correlation, xy1, xy2, near1, near2, search, tolerance)
         index[strength < self.min_strength * self.neighbours] = -1
         rows = _prepared.one_to_one(index, strength)
         two = index[rows]
         maps = np.tile(np.eye(2), (len(rows), 1, 1))
         matches = Matches(*pair, rows, two, xy1[rows], xy2[two], correlation[rows, two], maps)
-        if not self.align:
-            return matches
-        return align_matches(view1, view2, matches)
+        return align_matches(view1, view2, matches) if self.align else matches
 
 
 def _nearest(xy: F64, count: int, radius: float) -> I64:

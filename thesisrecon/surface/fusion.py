@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from thesisrecon._numba import ThreadPool, empty, kernel
-from thesisrecon.arrays import B8, F32, F64, I32, I64, U8
+from thesisrecon.arrays import B8, F32, F64, I32, I64
 from thesisrecon.camera import compose_camera, decompose_camera
 from thesisrecon.errors import StageFailure, require_range
 from thesisrecon.geometry.camera_matrix import project
@@ -66,32 +66,6 @@ class VoxelGrid(NamedTuple):
     value: F32
     weight: F32
     vertex: I32
-
-
-@kernel
-def touched_blocks(surface: FusionMap, rays: F64, centre: F64, reach: float, edge: float, marked: U8) -> None:
-    """Mark the blocks (X, Y, Z) of size ``edge`` that lie within ``reach`` of the surface.
-
-    ``rays`` (3, 3): from (x, y, 1) to depth 1 relative to ``centre`` (3,) of the camera in the grid.
-    """
-    depth, cosine = surface.depth, surface.cosine
-    for y in range(depth.shape[0]):
-        for x in range(depth.shape[1]):
-            z = depth[y, x]
-            if not z > 0.0:
-                continue
-            along = reach / cosine[y, x]
-            steps = int(np.ceil(2.0 * along / (0.5 * edge))) + 1
-            dx = rays[0, 0] * x + rays[0, 1] * y + rays[0, 2]
-            dy = rays[1, 0] * x + rays[1, 1] * y + rays[1, 2]
-            dz = rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]
-            for s in range(steps):
-                r = z + along * (2.0 * s / (steps - 1) - 1.0)
-                i = int(np.floor((centre[0] + r * dx) / edge))
-                j = int(np.floor((centre[1] + r * dy) / edge))
-                k = int(np.floor((centre[2] + r * dz) / edge))
-                if 0 <= i < marked.shape[0] and 0 <= j < marked.shape[1] and 0 <= k < marked.shape[2]:
-                    marked[i, j, k] = 1
 
 
 @kernel
@@ -245,7 +219,7 @@ def join_vertices(rows: tuple[int, int], window: VoxelGrid, points: F64, known: 
     first M. Returns their number; the shorter diagonal is used.
     """
     count = 0
-    ring = empty(4, np.int64)
+    ring, cell = empty(4, np.int64), empty(3, np.int64)
     blocks, value, weight = window.blocks, window.value, window.weight
     for b in range(rows[0], rows[1]):
         own = b - window.first
@@ -264,14 +238,12 @@ def join_vertices(rows: tuple[int, int], window: VoxelGrid, points: F64, known: 
                         stop = value[n, X % SIDE, Y % SIDE, Z % SIDE]
                         if (start < 0.0) == (stop < 0.0):
                             continue
-                        if not _ring(window, (x, y, z), axis, ring):
+                        if not _ring(window, (x, y, z), axis, cell, ring):
                             continue
                         if stop < 0.0:
                             ring[1], ring[3] = ring[3], ring[1]
-                        first = _squared(points, ring[0] - known, ring[2] - known) <= _squared(
-                            points, ring[1] - known, ring[3] - known
-                        )
-                        turn = 0 if first else 1
+                        rising = _squared(points, ring[0] - known, ring[2] - known)
+                        turn = 0 if rising <= _squared(points, ring[1] - known, ring[3] - known) else 1
                         for t in range(3 if count + 2 <= faces.shape[0] else 0):
                             faces[count, t] = ring[(t + turn) % 4]
                             faces[count + 1, t] = ring[(t + turn + 2) % 4]
@@ -288,19 +260,14 @@ def _squared(points: F64, a: int, b: int) -> float:
 
 
 @kernel
-def _ring(window: VoxelGrid, at: tuple[int, int, int], axis: int, ring: I64) -> bool:
+def _ring(window: VoxelGrid, at: tuple[int, int, int], axis: int, cell: I64, ring: I64) -> bool:
     """Vertices of the four cells around an edge from voxel ``at``; False if one is missing."""
     second, third = (axis + 1) % 3, (axis + 2) % 3
+    cell[axis] = at[axis]
     for t in range(4):
-        back_second = 1 if t == 0 or t == 3 else 0
-        back_third = 1 if t < 2 else 0
-        X = at[0] - (back_second if second == 0 else 0) - (back_third if third == 0 else 0)
-        Y = at[1] - (back_second if second == 1 else 0) - (back_third if third == 1 else 0)
-        Z = at[2] - (back_second if second == 2 else 0) - (back_third if third == 2 else 0)
-        n = _find(window, X, Y, Z)
-        if n < 0:
-            return False
-        ring[t] = window.vertex[n, X % SIDE, Y % SIDE, Z % SIDE]
+        cell[second], cell[third] = at[second] - (t == 0 or t == 3), at[third] - (t < 2)
+        n = _find(window, cell[0], cell[1], cell[2])
+        ring[t] = window.vertex[n, cell[0] % SIDE, cell[1] % SIDE, cell[2] % SIDE] if n >= 0 else -1
         if ring[t] < 0:
             return False
     return True
@@ -327,20 +294,16 @@ class VolumetricFusion:
         max_std_voxels = 1.0  # Upper limit of the standard deviations in the tolerance of the simplification
         # Longest side of a simplified face: a texture needs images that show a face completely.
         longest_voxels = 16.0
-        surface, std, voxel = self._fused(depth_maps, threads)
+        maps = OnDemand(len(depth_maps), lambda n: _measured(depth_maps[n]), GROUP_BYTES)
+        with ThreadPool(threads) as pool:
+            grid = self._lay_out(maps, sum(one.depth.size for one in depth_maps), pool)
+            (surface, std), voxel = _zero_level(grid, maps, pool), grid.voxel
         if not len(surface.faces):
             raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
         if self.tolerance:
             limit, longest = self.tolerance * np.minimum(std, max_std_voxels * voxel), longest_voxels * voxel
             surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
         return _mesh.remove_small_parts(surface)
-
-    def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
-        """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
-        maps = OnDemand(len(depth_maps), lambda n: _measured(depth_maps[n]), GROUP_BYTES)
-        with ThreadPool(threads) as pool:
-            grid = self._lay_out(maps, sum(one.depth.size for one in depth_maps), pool)
-            return *_zero_level(grid, maps, pool), grid.voxel
 
     def _lay_out(self, maps: Sequence[FusionMap], pixels: int, pool: ThreadPool) -> VoxelGrid:
         """Empty grid of the smallest voxels whose blocks fit into memory."""
@@ -376,10 +339,12 @@ def _certain_maps(
         yield list(pool.map(certain, range(first, min(first + group, len(maps)))))
 
 
-def _rays(P: F64) -> tuple[F64, F64]:
-    """Matrix (3, 3) from (x, y, 1) to the point at depth 1 minus the centre, and the centre (3,)."""
-    directions: F64 = np.asarray(np.linalg.inv(P[:, :3]), dtype=np.float64)
-    return directions, -directions @ P[:, 3]
+def _surface_points(one: FusionMap) -> tuple[F64, F64, F64]:
+    """Points (N, 3) of a map, the steps of their rays (N, 3) per unit of depth, and their cosines (N,)."""
+    inverse = np.asarray(np.linalg.inv(one.P[:, :3]), dtype=np.float64)
+    y, x = np.nonzero(one.depth > 0.0)
+    rays = np.stack([x, y, np.ones_like(x)], axis=1) @ inverse.T
+    return one.depth[y, x, None] * rays - inverse @ one.P[:, 3], rays, one.cosine[y, x].astype(np.float64)
 
 
 def _measured(depth_map: DepthMap) -> FusionMap:
@@ -437,9 +402,7 @@ def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> Vo
     """Blocks within the truncation of any depth; None if their bounding box is too large."""
     low, high, reach = np.full(3, np.inf), np.full(3, -np.inf), TRUNCATION_VOXELS * voxel
     for one in chain.from_iterable(_certain_maps(maps, reach, pool)):
-        directions, centre = _rays(one.P)
-        y, x = np.nonzero(np.isfinite(one.depth))
-        xyz = centre + one.depth[y, x, None] * (np.stack([x, y, np.ones_like(x)], axis=1) @ directions.T)
+        xyz = _surface_points(one)[0]
         if len(xyz):
             low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
     if not np.isfinite(low).all():
@@ -449,10 +412,17 @@ def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> Vo
     shape = np.ceil((high - low + 4.0 * reach) / edge).astype(int) + 1
     if np.prod(shape.astype(float)) > 2e8:
         return None
-    marked = np.zeros(tuple(shape), dtype=np.uint8)
+    marked = np.zeros(shape, dtype=bool)
     for one in chain.from_iterable(_certain_maps(maps, reach, pool)):
-        directions, centre = _rays(one.P)
-        touched_blocks(one, directions, centre - origin, reach, edge, marked)
+        xyz, rays, cosine = _surface_points(one)
+        along = reach / cosine
+        # Steps of half a block reach every block within the truncation.
+        steps = np.ceil(4.0 * along / edge).astype(int)
+        for s in range(int(steps.max(initial=-1)) + 1):
+            some = s <= steps
+            ahead = along[some] * (2.0 * s / steps[some] - 1.0)
+            place = np.floor((xyz[some] + ahead[:, None] * rays[some] - origin) / edge).astype(int)
+            marked[tuple(place[((place >= 0) & (place < shape)).all(axis=1)].T)] = True
     blocks = np.argwhere(marked).astype(np.int64)
     place = np.full(marked.shape, -1, dtype=np.int32)
     place[tuple(blocks.T)] = np.arange(len(blocks))
