@@ -42,33 +42,22 @@ _AS_GOOD, _IN_FRONT, _SAME = 6.0, 0.95, 0.02
 
 @dataclass(frozen=True)
 class EssentialFit:
-    """An essential matrix with the relative pose, its inliers and noise.
+    """An essential matrix with the relative pose, its inliers and noise."""
 
-    Parameters
-    ----------
-    E, R, t : ndarray (3, 3), (3, 3) and (3,)
-        E = [t]x R of unit norm; a point X in the frame of the first camera is R X + t in that of the second,
-        with \\|t\\| = 1.
-    inliers, in_front, sigma_px : ndarray (N,) of bool, ndarray (N,) of bool, float
-        Matches within the noise that were used, without those that are apart from the others where chance
-        explains them; those that meet in front of both cameras; standard deviation of one image
-        coordinate.
-    covariance : ndarray (6, 6)
-        Covariance of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as
-        if all inliers were right; it has no part along t.
-    competing_poses : ndarray (C, 3, 4)
-        [R t] of the other pose that explains the inliers to within their noise, as points of one plane have
-        one (Longuet-Higgins, Proc. R. Soc. B 227, 1986); C = 0 if the pose is determined.
-    """
-
-    E: F64
-    R: F64
-    t: F64
+    E: F64  #: (3, 3) [t]x R of unit norm
+    R: F64  #: (3, 3) a point X in the frame of the first camera is R X + t in that of the second
+    t: F64  #: (3,) of length 1
     inliers: B8
-    in_front: B8
-    sigma_px: float
+    """(N,) matches within the noise that were used, without those that are apart from the others where chance
+    explains them."""
+    in_front: B8  #: (N,) matches that meet in front of both cameras
+    sigma_px: float  #: standard deviation of one image coordinate
     covariance: F64
+    """(6, 6) of rotation vector w (rad) and translation d of x -> exp(w) x + d in the second camera, as if
+    all inliers were right; it has no part along t."""
     competing_poses: F64
+    """(C, 3, 4) [R t] of the other pose that explains the inliers to within their noise, as points of one
+    plane have one (Longuet-Higgins, Proc. R. Soc. B 227, 1986); C = 0 if the pose is determined."""
 
 
 @dataclass(frozen=True)

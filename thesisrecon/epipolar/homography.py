@@ -25,17 +25,6 @@ TRIPLES, SUBSET = 100, 200
 OFF_PLANE = 16.0
 
 
-@kernel
-def _equations(h: F64, match: F64, J: F64) -> tuple[float, float, float]:
-    """Equations c of x2 ~ H x1 and w = (H x1)_3; writes ``J`` (2, 2), dc / dx1; dc / dx2 is -w I."""
-    x1, y1, x2, y2 = match[0], match[1], match[2], match[3]
-    w = h[2, 0] * x1 + h[2, 1] * y1 + h[2, 2]
-    for j in range(2):
-        J[0, j], J[1, j] = h[0, j] - x2 * h[2, j], h[1, j] - y2 * h[2, j]
-    c0 = h[0, 0] * x1 + h[0, 1] * y1 + h[0, 2] - w * x2
-    return c0, h[1, 0] * x1 + h[1, 1] * y1 + h[1, 2] - w * y2, w
-
-
 @kernel(fastmath={"reassoc", "contract"})
 def _squared_distances(H: F64, columns: F64) -> F64:
     """Squared distances (S, N) of matches (4, N) from homographies (S, 3, 3)."""
@@ -102,7 +91,13 @@ def _add_equations(H: F64, points: F64, weight: F64, nearest: bool, G: F64, g: F
     for k in range(len(points)):
         if not weight[k] > 0.0:
             continue
-        c0, c1, w = _equations(H, points[k], J)
+        # The equations c of x2 ~ H x1, with w = (H x1)_3, dc / dx1 = J, and dc / dx2 = -w I.
+        m = points[k]
+        w = H[2, 0] * m[0] + H[2, 1] * m[1] + H[2, 2]
+        for j in range(2):
+            J[0, j], J[1, j] = H[0, j] - m[2] * H[2, j], H[1, j] - m[3] * H[2, j]
+        c0 = H[0, 0] * m[0] + H[0, 1] * m[1] + H[0, 2] - w * m[2]
+        c1 = H[1, 0] * m[0] + H[1, 1] * m[1] + H[1, 2] - w * m[3]
         a, b = J[0, 0] ** 2 + J[0, 1] ** 2 + w * w, J[0, 0] * J[1, 0] + J[0, 1] * J[1, 1]
         # det J J', without the rounding of a difference.
         determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) ** 2
@@ -196,21 +191,12 @@ _DEPENDENT = 1e-9  # ratio of singular values of the equations below which they 
 
 @dataclass(frozen=True, eq=False)
 class HomographyFit(Record):
-    """A homography with its inliers and noise.
+    """A homography with its inliers and noise."""
 
-    Parameters
-    ----------
-    H, covariance : ndarray (3, 3), ndarray (9, 9)
-        x2 ~ H x1, unit norm, and the covariance of its entries (row-major), rank 8.
-    inliers, sigma_px : ndarray (N,) of bool, float
-        Inliers, and the standard deviation of one image coordinate; for 4 matches it and the covariance are
-        NaN.
-    """
-
-    H: F64
-    inliers: B8
-    sigma_px: float
-    covariance: F64
+    H: F64  #: (3, 3) x2 ~ H x1, unit norm
+    inliers: B8  #: (N,)
+    sigma_px: float  #: standard deviation of one image coordinate; NaN for 4 matches, as the covariance
+    covariance: F64  #: (9, 9) of the entries of H (row-major), rank 8
 
 
 def fit_homography(

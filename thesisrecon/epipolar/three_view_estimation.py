@@ -1,6 +1,6 @@
 """Section 3.6.3: the trifocal tensor with the least reprojection error of points and lines in three views.
 
-Linear equations; least algebraic error (HZ, algorithm 16.2); least reprojection error (HZ 16.4).
+Linear equations, then those of cameras with their epipoles (HZ 16.3); least reprojection error (HZ 16.4).
 """
 
 from __future__ import annotations
@@ -28,33 +28,18 @@ _State = tuple[F64, F64]
 
 @dataclass(frozen=True, eq=False)
 class TrifocalFit(Record):
-    """A trifocal tensor with its residuals and noise.
+    """A trifocal tensor with its residuals and noise."""
 
-    Parameters
-    ----------
-    T : ndarray (3, 3, 3)
-        Tensor in pixels, unit norm; its cameras are exact.
-    point_residuals_px, line_residuals_px : ndarray (3, N), (3, M, 2)
-        Distances of the points to their reprojections and of the endpoints to the reprojected lines.
-    sigma_px : float
-        Noise of one coordinate from all residuals and degrees of freedom.
-    covariance : ndarray (27, 27)
-        First-order covariance of T, row-major, rank 18.
-    relative_std : float
-        Largest standard deviation of T in conditioned coordinates, times the root of the number of matches.
-        At values near 1, T is undetermined: changing it by its own size moves the reprojections no more than
-        their noise.
-    inliers : ndarray (N,) of bool
-        Points that were used; the residuals of the others are NaN.
-    """
-
-    T: F64
-    point_residuals_px: F64
-    line_residuals_px: F64
-    sigma_px: float
-    covariance: F64
+    T: F64  #: (3, 3, 3) in pixels, unit norm; its cameras are exact
+    point_residuals_px: F64  #: (3, N) distances of the points to their reprojections
+    line_residuals_px: F64  #: (3, M, 2) distances of the endpoints to the reprojected lines
+    sigma_px: float  #: noise of one coordinate from all residuals and degrees of freedom
+    covariance: F64  #: (27, 27) to first order of T, row-major, rank 18
     relative_std: float
-    inliers: B8
+    """Largest standard deviation of T in conditioned coordinates, times the root of the number of matches. At
+    values near 1, T is undetermined: changing it by its own size moves the reprojections no more than their
+    noise."""
+    inliers: B8  #: (N,) points that were used; the residuals of the others are NaN
 
 
 def fit_trifocal(
@@ -73,7 +58,7 @@ def fit_trifocal(
         raise StageFailure.of("few-trifocal-matches", n, m)
     try:
         equations = _tensor_equations(points, segments)
-        T = _minimize_algebraic_error(equations, equations.solve())
+        T = equations.solve_with_epipoles(*tensor_epipoles(equations.solve()))
     except ValueError as error:
         raise StageFailure.of("undetermined-tensor", "they are in a degenerate configuration") from error
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
@@ -95,21 +80,6 @@ def _epipolar_inliers(points: F64, search: LocallyOptimisedRansac, rng: Generato
             return np.ones(points.shape[1], dtype=bool)
         inliers &= fit.inliers
     return inliers
-
-
-def _minimize_algebraic_error(equations: _TensorEquations, start: F64) -> F64:
-    """Conditioned T (3, 3, 3) with cameras and the least |A t| near a start, over the two epipoles."""
-
-    def tensor(epipoles: F64) -> F64:
-        e2, e3 = epipoles[:3], epipoles[3:]
-        T = equations.solve_with_epipoles(e2 / np.linalg.norm(e2), e3 / np.linalg.norm(e3))
-        # The sign of the start keeps the residuals continuous.
-        return T * (1.0 if np.sum(T * start) >= 0.0 else -1.0)
-
-    found = least_squares.minimize_residuals(
-        lambda e: equations.A @ tensor(e).ravel(), np.concatenate(tensor_epipoles(start))
-    )
-    return tensor(found.x)
 
 
 class _ReprojectionProblem:

@@ -294,16 +294,20 @@ class VolumetricFusion:
         max_std_voxels = 1.0  # Upper limit of the standard deviations in the tolerance of the simplification
         # Longest side of a simplified face: a texture needs images that show a face completely.
         longest_voxels = 16.0
-        maps = OnDemand(len(depth_maps), lambda n: _measured(depth_maps[n]), GROUP_BYTES)
-        with ThreadPool(threads) as pool:
-            grid = self._lay_out(maps, sum(one.depth.size for one in depth_maps), pool)
-            (surface, std), voxel = _zero_level(grid, maps, pool), grid.voxel
+        surface, std, voxel = self._fused(depth_maps, threads)
         if not len(surface.faces):
             raise StageFailure.of("no-surface-of-depths", "the depth maps contain no depths that agree")
         if self.tolerance:
             limit, longest = self.tolerance * np.minimum(std, max_std_voxels * voxel), longest_voxels * voxel
             surface = simplify_surface(surface, limit, longest=longest, threads=threads, overwrite=True)
         return _mesh.remove_small_parts(surface)
+
+    def _fused(self, depth_maps: Sequence[DepthMap], threads: int) -> tuple[TexturedMesh, F64, float]:
+        """The surface of all voxels, the standard deviation at its vertices, and the voxel size."""
+        maps = OnDemand(len(depth_maps), lambda n: _measured(depth_maps[n]), GROUP_BYTES)
+        with ThreadPool(threads) as pool:
+            grid = self._lay_out(maps, sum(one.depth.size for one in depth_maps), pool)
+            return *_zero_level(grid, maps, pool), grid.voxel
 
     def _lay_out(self, maps: Sequence[FusionMap], pixels: int, pool: ThreadPool) -> VoxelGrid:
         """Empty grid of the smallest voxels whose blocks fit into memory."""
