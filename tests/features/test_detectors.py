@@ -218,7 +218,7 @@ def test_maxima_are_the_local_maxima_and_their_surfaces_have_their_top_there():
 
 def test_selected_corners_are_apart_or_spread():
     xy = np.random.default_rng(6).uniform(0, 100, (400, 2))
-    kept = harris.enforce_spacing(xy, np.arange(400), 6.0)
+    kept = harris.enforce_spacing(xy, 6.0)
     assert pdist(xy[kept]).min() >= 6.0
     for dropped in np.setdiff1d(np.arange(400), kept):
         assert np.linalg.norm(xy[kept[kept < dropped]] - xy[dropped], axis=1).min() < 6.0

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.random import Generator
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar import _matches
 from thesisrecon.epipolar._matches import PairFrame
 from thesisrecon.epipolar._sampling import sampson_distances
@@ -31,16 +31,6 @@ MINIMUM = 8
 # Not a probability, since matches of repeated structure are dependent.
 MIN_MARGIN = 3.0
 SAMPLED = 60  # inliers of which the covariance and the contradictions are tested
-
-
-def _select_distinct(order: I64, agree: F64, weights: F64, chosen: list[int], most: int) -> None:
-    """Add models of ``order``, to ``most`` in all, that share at most 80 % with any chosen before."""
-    for s in order:
-        own = weights * agree[s]
-        if all(own @ agree[c] <= 0.8 * own.sum() for c in chosen):
-            chosen.append(int(s))
-        if len(chosen) >= most:
-            break
 
 
 @dataclass(frozen=True)
@@ -91,8 +81,13 @@ def _competing_starts(
     beyond = np.maximum(sums[:, 0] - 2.0, 0.0) / max(float(w.sum()) - 2.0, 1.0)
     chosen: list[int] = []
     for k, value in enumerate((sums[:, 0], sums[:, 0] + sums[:, 1])):
-        order = np.argsort(-value, kind="stable")
-        _select_distinct(order[:100], agree, w, chosen, (k + 1) * distinct)
+        # Models that share at most 80 % with any chosen before.
+        for s in np.argsort(-value, kind="stable")[:100].tolist():
+            own_weight = w * agree[s]
+            if all(own_weight @ agree[c] <= 0.8 * own_weight.sum() for c in chosen):
+                chosen.append(s)
+            if len(chosen) >= (k + 1) * distinct:
+                break
     # Most epipoles are wrong.
     return F[chosen], float(np.quantile(beyond, 0.3)) / wide
 
@@ -132,7 +127,11 @@ def assess_degeneracy(
     sigma_px = max(fit.sigma_px, 0.1 * unit_px)
     band_px = max(2.5 * fit.sigma_px, 0.3 * unit_px)
     plane = find_dominant_plane(f, points, fit.inliers, sigma=sigma_px * frame.scale, rng=rng)
-    error_px = _expected_error(fit, xy1, xy2)
+    # RMS distance of exact matches to their lines, from the covariance of F.
+    some = np.flatnonzero(fit.inliers)
+    some = some[:: max(1, len(some) // SAMPLED)]
+    std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
+    error_px = float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
     if plane is None:
         return DegeneracyReport(False, ("F has too few inliers",), expected_error_px=error_px)
     H, off_plane = plane[0], plane[1] > OFF_PLANE
@@ -206,32 +205,16 @@ def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: flo
     return float(some[contradicted].sum() / max(some.sum(), 1e-300))
 
 
-def _expected_error(fit: FundamentalFit, xy1: F64, xy2: F64) -> float:
-    """RMS distance of exact matches to their lines over the inliers, px, from the covariance of F."""
-    some = np.flatnonzero(fit.inliers)
-    some = some[:: max(1, len(some) // SAMPLED)]
-    std = epipolar_distance_std(fit.F, fit.covariance, xy1[some], xy2[some])
-    return float(np.sqrt(np.mean(std**2))) if len(std) else float("inf")
-
-
 @dataclass(frozen=True, eq=False)
 class FundamentalEstimate(FundamentalFit):
-    """An estimate of F with its matches, and whether they determine it, tested when it is first read.
+    """An estimate of F with its matches, and whether they determine it, tested when it is first read."""
 
-    Parameters
-    ----------
-    xy1, xy2 : ndarray (M, 2)
-        The matches, px.
-    unit_px : float
-        Error of epipolar lines that matters: the threshold of the search.
-    noise_covariance : ndarray (9, 9), optional
-        The part of the covariance without accepted wrong matches, of which the test takes its own account.
-    """
-
-    xy1: F64 = field(kw_only=True, repr=False)
+    xy1: F64 = field(kw_only=True, repr=False)  #: (M, 2) px, as ``xy2``: the matches
     xy2: F64 = field(kw_only=True, repr=False)
     unit_px: float = field(default=1.0, kw_only=True, repr=False)
+    """Error of epipolar lines that matters: the threshold of the search."""
     noise_covariance: F64 | None = field(default=None, kw_only=True, repr=False)
+    """(9, 9) covariance without accepted wrong matches, of which the test takes its own account."""
 
     @cached_property
     def degeneracy(self) -> DegeneracyReport:

@@ -101,14 +101,6 @@ class _Pair:
         by_pose = np.concatenate([of_turn, cross_matrix(directions_across(t)) @ R])
         return np.asarray(by_pose.reshape(5, 9) @ self.of_essential.T)
 
-    def leverages(self, R: F64, t: F64, inliers: B8) -> F64:
-        """Share (N,) of each match in its own prediction by the fit of the ``inliers``."""
-        F, T = self.fundamental(relative_pose.essential_from_pose(R, t)), self.tangent(R, t)
-        a, b = homogenize(self.points[:, :2]), homogenize(self.points[:, 2:])
-        slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
-        J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ T.T / slope[:, None]
-        return np.asarray(np.sum(J @ np.linalg.pinv(J[inliers].T @ J[inliers]) * J, axis=1))
-
 
 def fit_essential(
     xy1: F64, xy2: F64, K1: F64, K2: F64, threshold_px: float | None, budget: Budget, rng: Generator
@@ -192,7 +184,13 @@ def _without_apart(pair: _Pair, E: F64, inliers: B8, noise: float, share: float)
     if (inliers & front).sum() <= _SAMPLE:
         return inliers
     wrong, inliers = share * np.count_nonzero(~inliers), inliers & front
-    high = inliers & (pair.leverages(R, t, inliers) > _HIGH * _UNKNOWN / inliers.sum())
+    # Leverage: the share of each match in its own prediction by the fit of the inliers.
+    F, T = pair.fundamental(relative_pose.essential_from_pose(R, t)), pair.tangent(R, t)
+    a, b = homogenize(pair.points[:, :2]), homogenize(pair.points[:, 2:])
+    slope = np.sqrt(np.sum((a @ F.T)[:, :2] ** 2 + (b @ F)[:, :2] ** 2, axis=1) + 1e-300)
+    J = (b[:, :, None] * a[:, None, :]).reshape(-1, 9) @ T.T / slope[:, None]
+    leverage = np.sum(J @ np.linalg.pinv(J[inliers].T @ J[inliers]) * J, axis=1)
+    high = inliers & (leverage > _HIGH * _UNKNOWN / inliers.sum())
     return inliers & ~high if wrong > _DOUBT * high.sum() else inliers
 
 

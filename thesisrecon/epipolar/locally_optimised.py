@@ -75,7 +75,12 @@ class LocallyOptimisedRansac:
 
     def _best_of_searches(self, points: F64, gate: float, rng: Generator) -> _Candidate:
         ends, samples = self._repeat_search(points, gate, rng)
-        f, others = _best_and_competing(ends, points, gate)
+        # The F with the lowest score, and the next ones that coincide with none before.
+        chosen: list[F64] = []
+        for _, one in sorted(ends, key=lambda end: end[0]):
+            if len(chosen) <= 3 and not any(_coincide(other, one, points, gate) for other in chosen):
+                chosen.append(one)
+        f, *others = chosen or [np.zeros(9)]
         noise, loss = _refine_to_noise(f, points, gate) if f.any() else (None, (0.0, 0.0))
         return _Candidate(f, samples, np.asarray(sampson_distances(f, points)), noise, loss, others)
 
@@ -173,16 +178,6 @@ class _Candidate:
         return few and self.noise.log_likelihood > other.noise.log_likelihood
 
 
-def _refine_best(points: F64, columns: F64, gate: float, state: F64, f: F64) -> None:
-    """Refine the best F of a search on few points with twice the gate and keep the better of the two."""
-    trial = f.copy()
-    refine(trial, points[:300], SAMPSON, 2.0 * gate, gate, 4, None)
-    score, inliers, _ = truncated_score(trial, columns, gate, state[0], (0.0, 0.0))
-    if score < state[0]:
-        state[:2] = score, inliers / len(points)
-        f[:] = trial
-
-
 def _score_samples(
     sampled: F64, points: F64, columns: F64, gate: float, limits: tuple[int, int, float],
     state: F64, f: F64, rng: Generator,
@@ -197,7 +192,12 @@ def _score_samples(
         drawn = search_fundamental(sampled, columns, uniforms, gate, stop, state, f)
         uniforms = uniforms[drawn - before :]
         if state[0] < score:
-            _refine_best(points, columns, gate, state, f)
+            # Refined on few points with twice the gate; the better of the two is kept.
+            trial = f.copy()
+            refine(trial, points[:300], SAMPSON, 2.0 * gate, gate, 4, None)
+            better, inliers, _ = truncated_score(trial, columns, gate, state[0], (0.0, 0.0))
+            if better < state[0]:
+                state[:2], f[:] = (better, inliers / len(points)), trial
             watched(drawn, state[0], state[1], f)
         elif len(uniforms):
             break
@@ -226,15 +226,6 @@ def _coincide(f: F64, other: F64, points: F64, gate: float) -> bool:
         if far @ far > gate**2 * len(far):
             return False
     return True
-
-
-def _best_and_competing(ends: list[tuple[float, F64]], points: F64, gate: float) -> tuple[F64, list[F64]]:
-    """The F with the lowest score (0 without any), and the next ones that coincide with none before."""
-    chosen: list[F64] = []
-    for _, f in sorted(ends, key=lambda end: end[0]):
-        if len(chosen) <= 3 and not any(_coincide(g, f, points, gate) for g in chosen):
-            chosen.append(f)
-    return (chosen[0], chosen[1:]) if chosen else (np.zeros(9), [])
 
 
 def _refine_to_noise(f: F64, points: F64, gate: float) -> tuple[NoiseMixture | None, tuple[float, float]]:

@@ -12,7 +12,7 @@ from thesisrecon.arrays import B8, F64
 from thesisrecon.epipolar._matches import MIN_PX, PairFrame, as_matches, check_matches, noise_scale
 from thesisrecon.epipolar._sampling import sampson_distances
 from thesisrecon.epipolar.refinement import Criterion, fundamental_covariance, refine_fundamental
-from thesisrecon.errors import StageFailure, require_range
+from thesisrecon.errors import StageFailure, require_range, unknown_word
 from thesisrecon.geometry import two_view
 from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
 from thesisrecon.optimize.ransac import draw_samples, watched
@@ -114,17 +114,17 @@ class _InlierTest(NamedTuple):
     limit: float
 
 
-def _larger_epipolar_distance(F: F64, xy1: F64, xy2: F64) -> F64:
-    return np.asarray(two_view.epipolar_distances(F, xy1, xy2).max(axis=1))
-
-
 InlierTest = Literal["sampson", "epipolar-distance", "symmetric-distance"]
 INLIER_TESTS = {
     # Chi-square with one degree of freedom: 95 % of the right matches pass.
     "sampson": _InlierTest(two_view.sampson_residuals, 1.0, CHI2_1_95),
     # First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2)
     # sigma. If the images have equal weight the distances are equal: the test by the Sampson distance.
-    "epipolar-distance": _InlierTest(_larger_epipolar_distance, 1.4142135623730951, 2.0 * CHI2_1_95),
+    "epipolar-distance": _InlierTest(
+        lambda F, xy1, xy2: np.asarray(two_view.epipolar_distances(F, xy1, xy2).max(axis=1)),
+        float(np.sqrt(2.0)),
+        2.0 * CHI2_1_95,
+    ),  # fmt: skip
     # Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. Both are
     # multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not of
     # two: 92 % of the right matches pass, not the 95 % of the thesis.
@@ -173,9 +173,7 @@ class ThesisRansac:
     def __post_init__(self) -> None:
         require_range(self, threshold_px="(0, inf)", samples="[1, inf)", rounds="[0, inf)")
         if self.inlier_test not in INLIER_TESTS:
-            raise ValueError(
-                f"inlier_test must be one of {', '.join(INLIER_TESTS)}; got {self.inlier_test!r}"
-            )
+            raise ValueError(unknown_word("inlier_test", self.inlier_test, INLIER_TESTS))
 
     def estimate(self, xy1: F64, xy2: F64, rng: Generator) -> FundamentalFit:
         """See `thesisrecon.config.FundamentalEstimator.estimate`."""

@@ -210,15 +210,21 @@ def orthonormal_from_fundamental(f: F64, U: F64, V: F64) -> float:
 
 
 @kernel
+def _multiply(A: F64, B: F64, out: F64) -> None:
+    """Write A B, A (9, 9), to ``out``."""
+    for i in range(out.shape[0]):
+        for j in range(B.shape[1]):
+            total = 0.0
+            for k in range(9):
+                total += A[i, k] * B[k, j]
+            out[i, j] = total
+
+
+@kernel
 def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
     """Write H = B' G B (7, 7) and g = B' h (7,)."""
     GB = empty((9, 7))
-    for i in range(9):
-        for a in range(7):
-            total = 0.0
-            for j in range(9):
-                total += G[i, j] * B[j, a]
-            GB[i, a] = total
+    _multiply(G, B, GB)
     for a in range(7):
         g[a] = 0.0
         for i in range(9):
@@ -228,17 +234,6 @@ def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
             for i in range(9):
                 total += B[i, a] * GB[i, b]
             H[a, b] = H[b, a] = total
-
-
-@kernel
-def _multiply(A: F64, B: F64, out: F64) -> None:
-    """Write A B, A (9, 9), to ``out``."""
-    for i in range(out.shape[0]):
-        for j in range(B.shape[1]):
-            total = 0.0
-            for k in range(9):
-                total += A[i, k] * B[k, j]
-            out[i, j] = total
 
 
 @kernel(forceinline=True)

@@ -145,7 +145,13 @@ def _classify(case: _InlierData) -> Configuration:
         H, squared = plane[0], plane[1] * case.sigma**2
         noise = _plane_noise(squared[case.agree])
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
-        errors = _excess_errors(case, near, float(squared[near].sum()))
+        # Standard errors by which the squared parallax of the matches near the plane exceeds the noise: of
+        # the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
+        k, errors = int(near.sum()), np.inf
+        if k >= MINIMUM - 4:
+            across = _least_squares(case.f, case.points[near])
+            ratio = max(float(squared[near].sum()) - across, 1e-24) / (k - 1) * (k - 7) / max(across, 1e-24)
+            errors = float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
         # For a plane F fits the epipole to the noise, which makes the excess 1.5 +- 1 standard errors.
         if errors < 4.0 and case.false_alarms(far, EPIPOLE) > MAX_CHANCE:
             inliers = case.points[near]
@@ -170,17 +176,6 @@ def _plane_noise(squared: F64) -> float:
             break
         variance = float(near.sum()) / (2.0 * 0.97743 * (len(near) - 4))
     return float(np.sqrt(max(variance, 1e-24)))
-
-
-def _excess_errors(case: _InlierData, near: B8, rss_plane: float) -> float:
-    """Standard errors by which the squared parallax of the matches near the plane exceeds the noise."""
-    # Of the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
-    k = int(near.sum())
-    if k < MINIMUM - 4:
-        return float("inf")
-    across = _least_squares(case.f, case.points[near])
-    ratio = max(rss_plane - across, 1e-24) / (k - 1) * (k - 7) / max(across, 1e-24)
-    return float(np.log(ratio) / np.sqrt(2.0 / (k - 1) + 2.0 / (k - 7)))
 
 
 def _eigenvalue_errors(H: F64, covariance: F64) -> float:

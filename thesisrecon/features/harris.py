@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import scipy
 
 from thesisrecon._numba import FAST, empty, full, kernel, zeros
 from thesisrecon.arrays import F32, F64, I64
@@ -53,59 +54,35 @@ def _measure_row(moment: F32, count: int, trace_weight: float, out: F32) -> None
             out[x] = a[x] * c[x] - b[x] * b[x] - trace_weight * trace * trace
 
 
-@kernel
 def fit_maxima(response: F32, threshold: float, subpixel: bool = True) -> tuple[F64, F32]:
     """Local maxima of R: positions (N, 2) refined by least-squares quadratic surfaces, and responses (N,)."""
     height, width = response.shape
-    # Maxima do not touch: at most one in four pixels.
-    most = (height // 2 + 1) * (width // 2 + 1)
-    xy = empty((most, 2), np.float64)
-    value = empty(most, np.float32)
-    limit = np.float32(threshold)
-    n = 0
-    for y in range(1, height - 1):
-        row = response[y]
-        for x in range(1, width - 1):
-            v = row[x]
-            if v > limit and v > row[x - 1] and v >= row[x + 1] and _is_maximum(response, x, y):
-                dx, dy = _surface_maximum(response, x, y) if subpixel else (0.0, 0.0)
-                xy[n, 0], xy[n, 1] = x + dx, y + dy
-                value[n] = v
-                n += 1
-    return xy[:n].copy(), value[:n].copy()
-
-
-@kernel
-def _is_maximum(response: F32, x: int, y: int) -> bool:
+    beside = [response[k // 3 : height - 2 + k // 3, k % 3 : width - 2 + k % 3] for k in range(9)]
     # > before and >= after the pixel: a plateau of two pixels gives one corner.
-    for k in range(9):
-        other = response[y + k // 3 - 1, x + k % 3 - 1]
-        if (k < 4 and response[y, x] <= other) or response[y, x] < other:
-            return False
-    return True
+    highest = beside[4] > np.float32(threshold)
+    for k, other in enumerate(beside):
+        highest &= beside[4] > other if k < 4 else beside[4] >= other
+    y, x = np.nonzero(highest)
+    xy = np.stack([x, y], axis=1).astype(np.float64) + 1.0
+    around = np.stack([each[y, x] for each in beside]).reshape(3, 3, -1)
+    if subpixel:
+        xy += _surface_maximum(around)
+    return xy, around[1, 1]
 
 
-@kernel
-def _surface_maximum(response: F32, x: int, y: int) -> tuple[float, float]:
-    gx = gy = gxx = gyy = gxy = 0.0
-    for k in range(-1, 2):
-        left, centre, right = response[y + k, x - 1], response[y + k, x], response[y + k, x + 1]
-        above, middle, below = response[y - 1, x + k], response[y, x + k], response[y + 1, x + k]
-        gx += (right - left) / 6.0
-        gy += (below - above) / 6.0
-        gxx += (left - 2.0 * centre + right) / 3.0
-        gyy += (above - 2.0 * middle + below) / 3.0
-    gxy = (
-        response[y + 1, x + 1] + response[y - 1, x - 1] - response[y - 1, x + 1] - response[y + 1, x - 1]
-    ) / 4.0
+def _surface_maximum(around: F32) -> F64:
+    """Maximum (N, 2) of the surface of least squares through responses (3, 3, N); 0 if it is not beside."""
+    wide = around.astype(np.float64)
+    gx = ((around[:, 2] - around[:, 0]).astype(np.float64) / 6.0).sum(axis=0)
+    gy = ((around[2] - around[0]).astype(np.float64) / 6.0).sum(axis=0)
+    gxx = ((wide[:, 0] - 2.0 * wide[:, 1] + wide[:, 2]) / 3.0).sum(axis=0)
+    gyy = ((wide[0] - 2.0 * wide[1] + wide[2]) / 3.0).sum(axis=0)
+    gxy = (around[2, 2] + around[0, 0] - around[0, 2] - around[2, 0]).astype(np.float64) / 4.0
     determinant = gxx * gyy - gxy * gxy
-    if not (gxx < 0.0 and determinant > 1e-12 * gxx * gxx):
-        return 0.0, 0.0
-    dx = -(gyy * gx - gxy * gy) / determinant
-    dy = -(gxx * gy - gxy * gx) / determinant
-    if abs(dx) > 1.0 or abs(dy) > 1.0:
-        return 0.0, 0.0
-    return dx, dy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step = -np.stack([gyy * gx - gxy * gy, gxx * gy - gxy * gx], axis=1) / determinant[:, None]
+        inside = (gxx < 0.0) & (determinant > 1e-12 * gxx * gxx) & (np.abs(step) <= 1.0).all(axis=1)
+    return np.where(inside[:, None], step, 0.0)
 
 
 @kernel(fastmath=FAST)
@@ -127,20 +104,13 @@ def squared_suppression_radii(xy: F32, response: F32, robustness: float) -> F32:
     return out
 
 
-@kernel
-def enforce_spacing(xy: F64, order: I64, distance: float) -> I64:
-    """Select indices in the sequence of ``order``, each at least ``distance`` from all selected before."""
-    kept = empty(len(order), np.int64)
-    n = 0
-    for i in order:
-        for k in range(n):
-            dx, dy = xy[i, 0] - xy[kept[k], 0], xy[i, 1] - xy[kept[k], 1]
-            if dx * dx + dy * dy < distance * distance:
-                break
-        else:
-            kept[n] = i
-            n += 1
-    return kept[:n]
+def enforce_spacing(xy: F64, distance: float) -> I64:
+    """Rows, in order, of the positions (N, 2) at least ``distance`` from all that are kept before."""
+    keep = np.ones(len(xy), np.bool_)
+    near = scipy.spatial.cKDTree(xy).query_pairs(np.nextafter(distance, 0.0)) if len(xy) else ()
+    for a, b in sorted(near):
+        keep[b] &= not keep[a]
+    return np.flatnonzero(keep)
 
 
 @dataclass(frozen=True)
@@ -207,8 +177,7 @@ class HarrisCorners:
         if self.selection == "spread":
             kept = select_spread(xy, response, self.max_corners)
         else:
-            spacing = self.spacing_rel * max(image.size)
-            kept = enforce_spacing(xy, np.arange(len(xy)), spacing)[: self.max_corners]
+            kept = enforce_spacing(xy, self.spacing_rel * max(image.size))[: self.max_corners]
         return Features(xy=xy[kept], scale=np.ones(len(kept), np.float32), response=response[kept])
 
 

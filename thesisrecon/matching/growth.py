@@ -1,6 +1,6 @@
 """The default matching: seeds without a search radius, guided matching along epipolar lines, alignment."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,20 +39,6 @@ of matches tested: accepted real pairs reach 0.28; of n equal copies in a patter
 
 
 @kernel
-def _median(values: F64, ordered: F64) -> float:
-    """Median of a few values by insertion into ``ordered``."""
-    n = len(values)
-    for k in range(n):
-        at = k
-        while at > 0 and ordered[at - 1] > values[k]:
-            ordered[at] = ordered[at - 1]
-            at -= 1
-        ordered[at] = values[k]
-    middle: float = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
-    return middle
-
-
-@kernel
 def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64) -> tuple[F64, F64, F64]:
     """Affine map of image 1 to image 2 around each of ``xy`` (N, 2) from its neighbouring matches (N, K)."""
     # Weights 1 / (d^2 + d_mean^2), Cauchy reweighting against other surfaces, and the mean of the maps
@@ -61,7 +47,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
     count, k = neighbours.shape
     affine, position, spread = empty((count, 2, 2)), empty((count, 2)), empty(count)
     offset, rest, a0, z = empty((k, 2)), empty((k, 2)), empty((2, 2)), empty((3, 2))
-    distance2, residual2, ordered = empty(k), empty(k), empty(k)
+    distance2, residual2 = empty(k), empty(k)
     for n in range(count):
         mean2 = 0.0
         a0[:] = 0.0
@@ -89,7 +75,7 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
                 ex = rest[m, 0] - (z[0, 0] * dx + z[1, 0] * dy + z[2, 0])
                 ey = rest[m, 1] - (z[0, 1] * dx + z[1, 1] * dy + z[2, 1])
                 residual2[m] = ex * ex + ey * ey
-            scale2 = _median(residual2, ordered)
+            scale2 = np.median(residual2)
         for p in range(2):
             for q in range(2):
                 affine[n, p, q] = a0[p, q] + z[q, p]
@@ -173,7 +159,11 @@ def match_guided(
         if best >= 0:
             index[n], score[n] = best, top
             # Closer corners, in pixels of their scale, may be one scene point.
-            second_best[n] = _best_elsewhere(xy2, best, 3.0 * scale2[best], near[:found], seen)
+            apart = 3.0 * scale2[best]
+            for t in range(found):
+                dx, dy = xy2[near[t], 0] - xy2[best, 0], xy2[near[t], 1] - xy2[best, 1]
+                if dx * dx + dy * dy > apart**2:
+                    second_best[n] = max(second_best[n], seen[t])
     return index, score, second_best
 
 
@@ -235,17 +225,6 @@ def _warp_windows(
             step = inverse * sizes[t]
             if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, raster, window[t]):
                 ready[t] = normalize_window(window[t]) > 0.0
-
-
-@kernel
-def _best_elsewhere(xy2: F64, best: int, apart: float, near: I64, seen: F32) -> float:
-    """Largest of the correlations ``seen`` of corners ``near`` that lie ``apart`` from the best; -1: none."""
-    second_best = np.float32(-1.0)
-    for t in range(len(near)):
-        dx, dy = xy2[near[t], 0] - xy2[best, 0], xy2[near[t], 1] - xy2[best, 1]
-        if dx * dx + dy * dy > apart**2:
-            second_best = max(second_best, seen[t])
-    return float(second_best)
 
 
 @dataclass(frozen=True)
@@ -406,7 +385,12 @@ def _verified_seeds(
     best: tuple[Matches, FundamentalFit] | None = None
     most = 0
     for seeds, support in sets:
-        for trial in _trials(seeds, support):
+        wide = support is _seeds.map_support
+        # Of a strength of 10 at most; seeds whose maps are affine need less.
+        supported = support(seeds) >= (1.0 if wide else 2.0)
+        # So few seeds of simulated views are right that a wrong F of all may have more inliers.
+        trials = (select_found(seeds, supported), *(() if wide else (seeds,)))
+        for trial in trials if supported.sum() >= MIN_SEEDS else ():
             found = _verified(trial, estimate, rng)
             if found is not None and len(found[0].xy1) >= max(MIN_SEEDS, most + 1):
                 best, most = found, len(found[0].xy1)
@@ -416,18 +400,6 @@ def _verified_seeds(
         if most >= max(50, 0.5 * len(seeds.xy1)):
             break
     return best
-
-
-def _trials(seeds: Matches, support: Callable[[Matches], F64]) -> tuple[Matches, ...]:
-    """Sets of seeds to estimate F from; none if there are too few."""
-    wide = support is _seeds.map_support
-    # Of a strength of 10 at most; seeds whose maps are affine need less.
-    supported = support(seeds) >= (1.0 if wide else 2.0)
-    if supported.sum() < MIN_SEEDS:
-        return ()
-    chosen = select_found(seeds, supported)
-    # So few seeds of simulated views are right that a wrong F of all may have more inliers.
-    return (chosen,) if wide else (chosen, seeds)
 
 
 def _verified(

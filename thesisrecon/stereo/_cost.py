@@ -184,7 +184,7 @@ def support_masks(channels: I16, valid: U8, tolerance: np.int16) -> U8:
     255 where the pixel s + 1 to the left, right, top or bottom is within ``tolerance`` in each channel.
     """
     height, width = valid.shape
-    levels, known = (np.pad(a, [(0, 0)] * (a.ndim - 2) + [(ARM, ARM)] * 2) for a in (channels, valid))
+    levels, known = np.pad(channels, [(0, 0), (ARM, ARM), (ARM, ARM)]), np.pad(valid, ARM)
     masks = np.zeros((4, ARM, height, width), np.uint8)
     for arm, (dy, dx) in enumerate(((0, -1), (0, 1), (-1, 0), (1, 0))):
         joined = np.full(valid.shape, 255, np.uint8)

@@ -148,7 +148,7 @@ def _posterior(costs: I32, first: int, found: I32, likelihood: F64) -> F32:
     share = np.where(known, likelihood[np.clip(costs - least, 0, len(likelihood) - 1)], 0.0)
     near = np.abs(np.arange(first, first + len(costs))[:, None] - found) <= 1
     total = np.where(found == OCCLUDED, 1.0, share.sum(axis=0))
-    return (np.where(near, share, 0.0).sum(axis=0) / total).astype(np.float32)
+    return np.asarray(np.where(near, share, 0.0).sum(axis=0) / total, np.float32)
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,8 @@ class SemiGlobalMatching:
             own = found[:, start:stop]
             _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
-        return self._postprocess(*found, images, _postprocessing.texture_of(images[0], measured))
+        texture = _postprocessing.texture_of(images[0], measured)
+        return self._postprocess(found[0], found[1], found[2], images, texture)
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
