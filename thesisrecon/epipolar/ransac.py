@@ -121,10 +121,8 @@ INLIER_TESTS = {
     # First test of section 5.4: both points within 1.96 sigma_d of their epipolar lines, sigma_d = sqrt(2)
     # sigma. If the images have equal weight the distances are equal: the test by the Sampson distance.
     "epipolar-distance": _InlierTest(
-        lambda F, xy1, xy2: np.asarray(two_view.epipolar_distances(F, xy1, xy2).max(axis=1)),
-        float(np.sqrt(2.0)),
-        2.0 * CHI2_1_95,
-    ),  # fmt: skip
+        lambda *args: np.asarray(two_view.epipolar_distances(*args).max(axis=1)), 2.0**0.5, 2.0 * CHI2_1_95
+    ),
     # Second test of section 5.4: sum of both squared epipolar distances below 5.99 sigma_d^2. Both are
     # multiples of one residual, so the sum is 2 sigma_d^2 times a chi-square of one degree of freedom, not of
     # two: 92 % of the right matches pass, not the 95 % of the thesis.
