@@ -13,8 +13,9 @@ from thesisrecon.camera import compose_camera, project_camera
 from thesisrecon.records import IntrinsicInterval, MetricResult, Tracks
 from validation.metrics import cameras
 from validation.references.colmap import map_with_pycolmap, read_run, reconstruct_with_pycolmap
+from validation.runs.records import Outcome
 from validation.scenes.real import Scene, load_fixture_scene
-from validation.studies.against_colmap import COLMAP, OURS, Outcome, check_reconstruction
+from validation.studies.against_colmap import COLMAP, OURS, Run, check_reconstruction
 
 V, N = 6, 30
 
@@ -149,8 +150,9 @@ def test_models_of_pycolmap_are_returned_in_our_types(tmp_path):
 
 def test_rows_hold_both_methods_and_a_failure_misses_its_targets():
     model = _reconstruction(_truth())
-    ours, colmap = Outcome(model, 9.0, 500.0, 12.0, claimed_rms_px=1.0), Outcome(model, 10.0, 300.0, 15.0)
-    failed = Outcome(None, 3.0, 100.0, 5.0, failure="no pair was found")
+    ours = Run(Outcome(Path(), "", 9.0, 12.0, 500.0), model, {"reprojection_rms_px": 1.0})
+    colmap = Run(Outcome(Path(), "", 10.0, 15.0, 300.0), model)
+    failed = Run(Outcome(Path(), "no pair was found", 3.0, 5.0, 100.0), None)
     scene = Scene("fountain-P11", tuple(Path(f"{k}.png") for k in range(V)), *_truth())
     checked = [check_reconstruction(scene, {OURS: o, COLMAP: colmap}) for o in (ours, failed)]
     rows, missed = ({row.name: row for row in found} for found in checked)

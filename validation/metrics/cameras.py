@@ -62,16 +62,21 @@ def measure_cameras(reconstruction: Reconstruction, truth: TrueCameras) -> Camer
     intrinsics = measure_intrinsics(reconstruction, truth[0])
     if not len(views):
         return CameraErrors(*intrinsics, None, np.nan)
-    R_true, C_true = truth[1][views], truth[2][views]
     R = _rotations_translations(reconstruction)[0][known]
+    off = centre_errors(reconstruction, truth)
+    turn = float(np.median(rotation_errors_deg(R, truth[1][views])))
+    return CameraErrors(*intrinsics, None if off is None else float(np.mean(off)), turn)
+
+
+def centre_errors(reconstruction: Reconstruction, truth: TrueCameras) -> F64 | None:
+    """Distances of the registered centres that are known, after the similarity; None if they are too few."""
+    views = np.flatnonzero(reconstruction.registered & np.isfinite(truth[2]).all(axis=1))
+    centres = dehomogenize(camera_centre(reconstruction.P[views]))
     try:
-        centres = dehomogenize(camera_centre(reconstruction.P[views]))
-        moved = estimate_similarity(centres, C_true).apply(centres)
-        centre_error = float(np.mean(np.linalg.norm(moved - C_true, axis=1)))
+        moved = estimate_similarity(centres, truth[2][views]).apply(centres)
     except ValueError:
-        centre_error = None
-    turn = float(np.median(rotation_errors_deg(R, R_true)))
-    return CameraErrors(*intrinsics, centre_error, turn)
+        return None
+    return np.asarray(np.linalg.norm(moved - truth[2][views], axis=1))
 
 
 def measure_intrinsics(reconstruction: Reconstruction, K_true: F64) -> tuple[float, float]:

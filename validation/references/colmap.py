@@ -1,4 +1,4 @@
-"""COLMAP from images to cameras: ``python -m validation.references.colmap IMAGES OUT``.
+"""COLMAP from images to cameras.
 
 SIFT, exhaustive matching and mapping (Schönberger and Frahm, CVPR 2016; Pan et al., ECCV 2024) without
 priors: EXIF focal lengths are replaced by COLMAP's default, 1.2 times the long side. Models come back in our
@@ -7,7 +7,6 @@ types.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import time
@@ -24,7 +23,8 @@ from thesisrecon.io._files import write_text
 from thesisrecon.io._models import read_model
 from thesisrecon.lens import stacked_rows
 from thesisrecon.records import Reconstruction, Tracks
-from validation.references.libraries import pycolmap
+from validation.references.libraries import load, pycolmap
+from validation.runs.processes import timed
 
 
 def read_colmap_model(folder: Path, names: Sequence[str]) -> Reconstruction:
@@ -76,21 +76,24 @@ def principal_points_by_pycolmap(folder: Path, names: Sequence[str]) -> F64:
 
 
 def match_with_pycolmap(
-    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None, reader: Any = None
-) -> dict[str, float]:
-    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both. ``reader``
-    are pycolmap's ImageReaderOptions of a camera whose parameters are given.
+    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None,
+    camera: tuple[str, Sequence[float]] | None = None,
+) -> dict[str, float]:  # fmt: skip
+    """SIFT and matching of all pairs, or of a list, with their verification; the seconds of both. ``camera``:
+    COLMAP's camera model and its parameters; without it COLMAP guesses.
     """
     _begin(out)
     database, seconds, start = out / "database.db", {}, time.perf_counter()
 
-    mode = pycolmap.CameraMode.SINGLE
+    mode, reader = pycolmap.CameraMode.SINGLE, pycolmap.ImageReaderOptions()
+    if camera is not None:
+        reader.camera_model, reader.camera_params = camera[0], ", ".join(map(str, camera[1]))
     extraction = pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False)
     pycolmap.extract_features(
         database, images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu,
-        reader_options=pycolmap.ImageReaderOptions() if reader is None else reader,
+        reader_options=reader,
     )  # fmt: skip
-    if reader is None:
+    if camera is None:
         _guess_focals(database)
     seconds["extract"], start = time.perf_counter() - start, time.perf_counter()
 
@@ -193,29 +196,27 @@ def _model_folders(out: Path) -> list[Path]:
     return folders
 
 
+def map_and_read(images: Path, out: Path, **options: Any) -> Reconstruction | None:
+    """The model of :func:`map_with_pycolmap`, None without one."""
+    try:
+        map_with_pycolmap(images, out, **options)
+        return read_run(images, out)[0]
+    except StageFailure:
+        return None
+
+
 def reconstruct_with_pycolmap(
-    images: Path, out: Path, *, threads: int = 2, pairs: Path | None = None, **options: Any
-) -> None:
-    """Match (all pairs or a list) and map a folder of images on the CPU; ``out`` is emptied first."""
-    match_with_pycolmap(images, out, threads=threads, pairs=pairs)
-    map_with_pycolmap(images, out, threads=threads, **options)
+    images: str | Path, out: str | Path, pairs: str | Path | None = None, threads: int = 2,
+    refine_principal_point: bool = False,
+) -> tuple[float, float]:  # fmt: skip
+    """Match (all pairs or a list) and map a folder of images on the CPU; ``out`` is emptied first. Return
+    the wall and the processor seconds, without the import of COLMAP.
+    """
+    load("pycolmap")
+    given = Path(images), Path(out)
 
+    def work() -> None:
+        match_with_pycolmap(*given, threads=threads, pairs=None if pairs is None else Path(pairs))
+        map_with_pycolmap(*given, threads=threads, refine_principal_point=refine_principal_point)
 
-def main() -> None:
-    """Run COLMAP once, as a program."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("images", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--refine-principal-point", action="store_true")
-    parser.add_argument("--threads", type=int, default=2)
-    parsed = parser.parse_args()
-    if parsed.out.exists() and any(parsed.out.iterdir()):
-        parser.error(f"{parsed.out} is not empty, and would be emptied; choose a new folder")
-    refine = parsed.refine_principal_point
-    reconstruct_with_pycolmap(
-        parsed.images, parsed.out, refine_principal_point=refine, threads=parsed.threads
-    )
-
-
-if __name__ == "__main__":
-    main()
+    return timed(work)[1:]

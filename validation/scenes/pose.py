@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,12 @@ class Pose:
     C: F64
     exposure: float = 1.0
     lens: F64 | None = None
+
+
+def true_cameras(poses: Sequence[Pose]) -> tuple[F64, F64, F64]:
+    """K, R (V, 3, 3) and C (V, 3) of poses."""
+    K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
+    return K, R, C
 
 
 def look_at(C: F64, target: F64, tan_half_roll: float) -> F64:

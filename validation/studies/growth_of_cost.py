@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image as PillowImage
@@ -26,11 +25,11 @@ from thesisrecon.pipeline.run import Until
 from thesisrecon.records import Reconstruction
 from validation.metrics.cameras import measure_cameras, relative_centre_error
 from validation.references.colmap import read_run, reconstruct_with_pycolmap
-from validation.references.libraries import load
-from validation.runs.processes import call_apart, peak_mb, reset_peak, timed
+from validation.runs.processes import call_apart, peak_mb, reset_peak
 from validation.runs.study import Part
 from validation.runs.tables import text_table
 from validation.scenes.many_views import walk, walk_street, write_street, write_views
+from validation.scenes.pose import true_cameras
 
 STAGES = ["images", "features", "pairs", "matches", "tracks", "projective"]
 STAGES += ["selfcalibration", "metric", "dense", "model", "outputs"]
@@ -118,9 +117,9 @@ def costs_of(meter: Meter) -> Cost:
 def _errors(found: Reconstruction, scene: str, paths: Sequence[Path]) -> tuple[float, float]:
     with PillowImage.open(paths[0]) as image:
         poses = WALKS[scene][0](len(found.P), image.size)
-    K, R, C = (np.array([getattr(pose, name) for pose in poses]) for name in "KRC")
-    errors = measure_cameras(found, (K, R, C))
-    return errors.focal_error_pct / 100.0, relative_centre_error(errors, C)
+    truth = true_cameras(poses)
+    errors = measure_cameras(found, truth)
+    return errors.focal_error_pct / 100.0, relative_centre_error(errors, truth[2])
 
 
 def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[str, float]:
@@ -132,22 +131,14 @@ def measure_colmap(images: Path, count: int, threads: int, scene: str) -> dict[s
         for path in paths:
             (folder / path.name).symlink_to(path.resolve())
         pairs = images / f"pairs-{count}.txt"
-        costs, process = call_apart(run_colmap, folder, out, pairs, threads, cores=threads)
+        arguments = (folder, out, pairs, threads, True)
+        (wall_s, cpu_s), process = call_apart(reconstruct_with_pycolmap, *arguments, cores=threads)
         model, spent = read_run(folder, out)
     focal, centre = _errors(model, scene, paths)
-    costs |= {"peak MB": process.peak_mb}
+    costs = {"wall s": wall_s, "processor s": cpu_s, "peak MB": process.peak_mb}
     costs |= {f"{name}, wall s": seconds for name, seconds in spent.items()}
     costs |= {"registered": float(model.registered.sum())}
-    found: dict[str, float] = costs | {"focal error, %": 100 * focal, "centres, %": 100 * centre}
-    return found
-
-
-def run_colmap(images: str, out: str, pairs: str, threads: int) -> dict[str, float]:
-    """Run COLMAP in this process; return its wall and processor seconds, without imports as for ours."""
-    load("pycolmap")
-    given: dict[str, Any] = {"pairs": Path(pairs), "threads": threads, "refine_principal_point": True}
-    _, wall, cpu = timed(lambda: reconstruct_with_pycolmap(Path(images), Path(out), **given))
-    return {"wall s": wall, "processor s": cpu}
+    return costs | {"focal error, %": 100 * focal, "centres, %": 100 * centre}
 
 
 def cost_table(costs: Sequence[Cost], failures: Sequence[str] = ()) -> str:

@@ -10,10 +10,11 @@ import numpy as np
 
 from thesisrecon import reconstruct
 from thesisrecon.errors import StageFailure
-from validation.metrics.cameras import TrueCameras, pose_pair_errors
+from validation.metrics.cameras import pose_pair_errors
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import text_table
 from validation.scenes.look_alikes import KINDS, SCENES, SIZE, build_look_alike
+from validation.scenes.pose import true_cameras
 from validation.scenes.sensor import write_images
 
 MAX_ERROR_DEG, MAX_WRONG = 8.0, 0.1  # error of a relative pose, and share of wrong ones in a right model
@@ -50,8 +51,6 @@ def verdict(kind: str, detail: int, seed: int) -> str:
             return VERDICTS[4]
     if metric is None:
         return VERDICTS[4]
-    K, R, C = (np.array([getattr(pose, name) for pose in scene.poses]) for name in ("K", "R", "C"))
-    truth: TrueCameras = (K, R, C)
-    errors = pose_pair_errors(metric.reconstruction, truth)
+    errors = pose_pair_errors(metric.reconstruction, true_cameras(scene.poses))
     right = np.mean(errors[np.isfinite(errors)] > MAX_ERROR_DEG) <= MAX_WRONG
     return VERDICTS[(0 if right else 2) + ((not metric.trusted) if right else int(metric.trusted))]

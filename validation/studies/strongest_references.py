@@ -24,8 +24,7 @@ from validation.metrics.cameras import (
     pose_pair_errors,
     relative_centre_error,
 )
-from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_run
-from validation.references.libraries import pycolmap
+from validation.references.colmap import map_and_read, match_with_pycolmap
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import text_table
 from validation.scenes.real import REAL_SCENES, TURNTABLE_SCENES, Scene, scenes_here
@@ -70,7 +69,7 @@ def _models(scene: Scene, out: Path, seeds: int, threads: int) -> Iterator[tuple
     for (mapper, lens, principal), seed in product(SETTINGS, range(seeds)):
         given = {"mapper": mapper, "lens": lens, "refine_principal_point": principal, "seed": seed}
         place = out / "mapped" / f"{mapper}-{lens}-{principal:d}-{seed}"
-        model = _colmap(images, place, matched=matched, threads=threads, **given)
+        model = map_and_read(images, place, matched=matched, threads=threads, **given)
         name = f"{lens}, {mapper}{', principal point refined' if principal else ''}"
         if (mapper, lens, principal) == SETTINGS[0] and seed == 0:
             yield "COLMAP", model
@@ -80,15 +79,10 @@ def _models(scene: Scene, out: Path, seeds: int, threads: int) -> Iterator[tuple
         if missing + centres < smallest:
             best, smallest, best_name = model, missing + centres, f"{name}, seed {seed}"
     yield f"COLMAP, best: {best_name}", best
-    K, reader = truth[0][0], pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
+    K, calibrated = truth[0][0], out / "calibrated"
     centre = K[:2, 2] + 0.5  # COLMAP's origin is the corner of a pixel
-    reader.camera_params = ", ".join(map(str, (K[0, 0], K[1, 1], *centre)))
-    match_with_pycolmap(images, matched := out / "calibrated", threads=threads, reader=reader)
-    yield (
-        "COLMAP, true calibration",
-        _colmap(images, out / "mapped" / "calibrated", matched=matched, fixed=True, threads=threads),
-    )
+    match_with_pycolmap(images, calibrated, threads=threads, camera=("PINHOLE", [K[0, 0], K[1, 1], *centre]))
+    yield "COLMAP, true calibration", map_and_read(images, calibrated, fixed=True, threads=threads)
 
 
 def _known(truth: TrueCameras) -> IntrinsicsOptions:
@@ -97,14 +91,6 @@ def _known(truth: TrueCameras) -> IntrinsicsOptions:
         focal="known", focal_px=K[0, 0], aspect_ratio=K[1, 1] / K[0, 0], skew_px=K[0, 1],
         principal_point="known", principal_point_px=(K[0, 2], K[1, 2]), k1="known",
     )  # fmt: skip
-
-
-def _colmap(images: Path, out: Path, **given: object) -> Reconstruction | None:
-    try:
-        map_with_pycolmap(images, out, **given)  # type: ignore[arg-type]
-        return read_run(images, out)[0]
-    except StageFailure:
-        return None
 
 
 def _relative(errors: CameraErrors, truth: TrueCameras) -> float:

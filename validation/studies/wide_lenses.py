@@ -18,18 +18,16 @@ from thesisrecon import Camera, reconstruct
 from thesisrecon.arrays import F64
 from thesisrecon.camera import camera_of_row
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import image_of_directions, lens_row
 from thesisrecon.records import Reconstruction
-from validation.metrics.cameras import area_under_recall, camera_poses, relative_pose_errors
-from validation.references.colmap import map_with_pycolmap, match_with_pycolmap, read_run
-from validation.references.libraries import pycolmap
+from validation.metrics.cameras import TrueCameras, area_under_recall, centre_errors, pose_pair_errors
+from validation.references.colmap import map_and_read, match_with_pycolmap
 from validation.runs.study import Part, report_progress
 from validation.runs.tables import text_table
 from validation.scenes.courtyard import SUN, WALL_HEIGHT, build_yard
 from validation.scenes.many_views import TEXEL, WIDTH, _crate, _front, build_near, walk, walk_street
 from validation.scenes.materials import cut_stone, grid, planks, rubble
-from validation.scenes.pose import Pose, look_at
+from validation.scenes.pose import Pose, look_at, true_cameras
 from validation.scenes.raycast import Surface, World, build_world
 from validation.scenes.sensor import write_images
 
@@ -67,27 +65,18 @@ def run_colmap(given: WideSet, out: Path, threads: int, *, calibrated: bool) -> 
     K, guess = given.camera.K, 1.2 * max(SIZE)
     start = [guess, guess, SIZE[0] / 2.0, SIZE[1] / 2.0, 0.0, 0.0, 0.0, 0.0]
     true = [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, K1, 0.0, 0.0, 0.0]
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "OPENCV_FISHEYE"
-    reader.camera_params = ", ".join(map(str, true if calibrated else start))
-    match_with_pycolmap(given.images, out, threads=threads, reader=reader)
-    try:
-        map_with_pycolmap(given.images, out, threads=threads, refine_principal_point=True, fixed=calibrated)
-        return read_run(given.images, out)[0]
-    except StageFailure:
-        return None
+    camera = ("OPENCV_FISHEYE", true if calibrated else start)
+    match_with_pycolmap(given.images, out, threads=threads, camera=camera)
+    return map_and_read(given.images, out, threads=threads, refine_principal_point=True, fixed=calibrated)
 
 
-def score(R: F64, C: F64, poses: Sequence[Pose]) -> str:
+def score(model: Reconstruction | None, truth: TrueCameras) -> str:
     """Registered cameras; RMS error of their centres over the extent; AUC of relative poses."""
-    true_R, true_C = np.array([pose.R for pose in poses]), np.array([pose.C for pose in poses])
-    auc = area_under_recall(relative_pose_errors(R, C, true_R, true_C), AUC_DEG)
-    there = np.isfinite(C).all(axis=1)
-    if there.sum() < 3:
-        return f"{there.sum()}; –; {auc:.3f}"
-    off = estimate_similarity(C[there], true_C[there]).apply(C[there]) - true_C[there]
-    extent = np.sqrt(np.sum((true_C - true_C.mean(axis=0)) ** 2, axis=1).mean())
-    return f"{there.sum()}; {np.sqrt(np.sum(off**2, axis=1).mean()) / extent:.3%}; {auc:.3f}"
+    auc = area_under_recall(pose_pair_errors(model, truth), AUC_DEG)
+    if model is None or (off := centre_errors(model, truth)) is None:
+        return f"{0 if model is None else model.registered.sum()}; –; {auc:.3f}"
+    extent = np.sqrt(np.sum((truth[2] - truth[2].mean(axis=0)) ** 2, axis=1).mean())
+    return f"{model.registered.sum()}; {np.sqrt(np.mean(off**2)) / extent:.3%}; {auc:.3f}"
 
 
 def wide_lenses_study(
@@ -102,7 +91,7 @@ def wide_lenses_study(
         lines.append([f"{scene}, {wide:g}°", *_ours(given, out / "ours" / name, threads)])
         for kind, calibrated in (("guess", False), ("true", True)):
             model = run_colmap(given, out / kind / name, threads, calibrated=calibrated)
-            lines[-1].append(score(*camera_poses(model, views), given.poses))
+            lines[-1].append(score(model, true_cameras(given.poses)))
         report_progress(" | ".join(map(str, lines[-1])))
     head = ["scene, angle", "trusted", "angle of view (true)", "focal length", "cameras; centres; AUC"]
     yield text_table([*head, "COLMAP from its guess", "COLMAP, true calibration"], lines)
@@ -110,18 +99,18 @@ def wide_lenses_study(
 
 def _ours(given: WideSet, out: Path, threads: int) -> list[str]:
     """Whether our result is trusted, the angle of view, the error of the focal length, and the scores."""
-    R, C = camera_poses(None, len(given.poses))
+    truth = true_cameras(given.poses)
     try:
         result = reconstruct(given.images, out, until="metric", threads=threads, overwrite=True)
     except StageFailure as failure:
-        return [f"no result: {failure}", "", "", score(R, C, given.poses)]
-    for name, camera in result.cameras.items():
-        R[int(name[:4])], C[int(name[:4])] = camera.R, camera.centre
+        return [f"no result: {failure}", "", "", score(None, truth)]
+    assert result.metric is not None
     one, true = next(iter(result.cameras.values())), given.camera
     std = (one.std or {}).get("angle_of_view_deg", np.nan)
     angle = f"{one.angles_of_view[0]:.2f} ± {std:.2f} ({true.angles_of_view[0]:.2f})"
     focal = f"{abs(one.K[0, 0] / true.K[0, 0] - 1.0):.3%}"
-    return ["yes" if result.summary["trusted"] else "no", angle, focal, score(R, C, given.poses)]
+    trusted, scores = "yes" if result.metric.trusted else "no", score(result.metric.reconstruction, truth)
+    return [trusted, angle, focal, scores]
 
 
 PRINCIPAL = (0.507, 0.494)  # principal point, as shares of the sides
