@@ -7,9 +7,15 @@ from scipy.spatial.transform import Rotation
 
 import thesisrecon
 from tests.epipolar.pairs import SIZE, K, make_pair, spoil
-from tests.epipolar.test_estimators import plane_matches, squared_in_covariance
+from tests.epipolar.test_estimators import plane_matches
 
 TRIALS, POINTS, SIGMA = 150, 200, 0.5
+
+
+def squared_in_covariance(error, covariance, rank):
+    """Mean squared error in the directions of a covariance, in its standard deviations."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.mean((vectors[:, -rank:].T @ error.ravel()) ** 2 / values[-rank:])
 
 
 def of_f(seed, *, method, wrong):
@@ -54,6 +60,8 @@ def f_by(method, wrong=0.0):
         pytest.param(f_by("gold-standard"), 7, 0.94, 1.33, id="F-of-least-reprojection-error"),
         # Its test leaves out one right match in twenty, and wrong ones near their lines stay.
         pytest.param(f_by("ransac", 0.2), 7, 0.92, 1.6, id="F-of-the-thesis"),
+        # The covariance is that of the least squares fit.
+        pytest.param(f_by("eight-point"), 7, 0.94, 40.0, id="F-of-eight-points"),
         pytest.param(of_e, 5, 0.95, 1.33, id="E"),
         pytest.param(of_h, 8, 0.95, 1.33, id="H"),
     ],
@@ -63,8 +71,10 @@ def test_noise_covariance_and_inliers_are_as_stated(estimate, unknowns, share, m
     squared = np.array([z for z, _, _ in found])
     sigma = np.mean([fit.sigma_px for _, fit, _ in found]) / SIGMA
     right = np.mean([fit.inliers[good].mean() for _, fit, good in found])
+    wrong = np.mean([np.sum(fit.inliers & ~good) for _, fit, good in found])
     # The median is that of a chi-square variable, with a standard error of 4 to 7 %.
     median = np.median(squared) * unknowns / stats.chi2.median(unknowns)
     assert 0.75 < median < most
     assert sigma == pytest.approx(1.0, abs=0.05)
     assert right > share
+    assert wrong < 1.0
