@@ -107,7 +107,7 @@ def test_a_missing_position_costs_one_image_and_too_few_or_collinear_ones_are_re
         np.testing.assert_allclose(moved.views[4].centre, true_positions(model)["4.jpg"], atol=1e-9)
 
 
-def test_models_are_cameras_in_any_form():
+def test_a_known_distance_gives_the_scale_of_cameras_in_any_form():
     views = make_model(4).views
     cameras = {view.name: Camera(view.K, view.R, view.t, view.size, view.distortion) for view in views}
     K, R, t = (np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t"))
@@ -118,9 +118,6 @@ def test_models_are_cameras_in_any_form():
         assert {view.camera for view in found.views} == {0}
     refuses(UsageError, "0.jpg is a ndarray", scaled, {"0.jpg": np.eye(3, 4)}, "0.jpg", "1.jpg", 1.0)
     refuses(UsageError, "a model must be", scaled, 3, "0.jpg", "1.jpg", 1.0)
-
-
-def test_a_known_distance_gives_the_scale():
     model = make_model(4)
     metres = scaled(model, "1.jpg", "3.jpg", 7.5)
     assert np.linalg.norm(metres.views[1].centre - metres.views[3].centre) == pytest.approx(7.5)

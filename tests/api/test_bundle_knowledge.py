@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import refuses
 from thesisrecon import Camera, bundle_adjust
 from thesisrecon.optimize.bundle.knowledge import LOSSES
-from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
 
 K = np.array([[700.0, 0, 319.5], [0, 700, 239.5], [0, 0, 1]])
 NOISE = 0.5
@@ -143,41 +142,6 @@ def test_known_positions_give_the_frame_and_its_uncertainty():
     scores = [d @ np.linalg.solve(C, d) / 3 for d, C in zip(off, found.point_covariance, strict=True)]
     assert 0.1 < np.mean(scores) < 3.0
     assert np.sqrt(np.trace(found.centre_covariance[4])) < 0.15
-
-
-@pytest.mark.references
-def test_fixed_poses_points_and_losses_agree_with_ceres():
-    pycolmap, ceres = pytest.importorskip("pycolmap"), pytest.importorskip("validation.references.ceres")
-    true, X, xy, rng = _scene(3, 6, 60)
-    start, xy = X + 0.01 * rng.normal(size=X.shape), np.where(np.isfinite(xy), xy, 0.0)
-    xy[2, 5:9] += 60.0
-    found = bundle_adjust(
-        true, start, xy, fixed_cameras=[0, 2], fixed_points=np.arange(10), loss="cauchy", loss_px=1.0,
-        sigma_px=1.0,
-    )  # fmt: skip
-    view, point = np.repeat(np.arange(6), 60), np.tile(np.arange(60), 6)
-    row = [[700.0, 1.0, 0.0, 319.5, 239.5, 0.0]]
-    R, t = (np.array([getattr(camera, name) for camera in true]) for name in ("R", "t"))
-    cameras = MetricCameras(R, t, np.array(row), np.zeros(6, dtype=np.int64))
-    model = ceres.colmap_model(cameras, start, Observations(view, point, xy.reshape(-1, 2)), (640, 480))
-    config, options = pycolmap.BundleAdjustmentConfig(), pycolmap.BundleAdjustmentOptions()
-    for image in model.images.values():
-        config.add_image(image.image_id)
-        if image.image_id in (1, 3):
-            config.set_constant_rig_from_world_pose(image.frame_id)
-    for j in range(1, 11):
-        config.add_constant_point(j)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 1.0
-    options.ceres.solver_options.function_tolerance = 0.0
-    options.ceres.solver_options.max_num_iterations = 200
-    options.print_summary = False
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
-    focal, _, _, k1 = model.cameras[1].params
-    assert found.cameras[0].K[0, 0] == pytest.approx(focal, rel=1e-5)
-    assert found.cameras[0].distortion[0] == pytest.approx(k1, abs=1e-4)
-    theirs = np.array([model.points3D[j + 1].xyz for j in range(60)])
-    np.testing.assert_allclose(found.X, theirs, atol=2e-4)
 
 
 def test_an_outlier_is_left_out_named_or_without_influence():

@@ -188,14 +188,3 @@ def test_homographies_come_apart_into_the_true_plane_and_pose():
     np.testing.assert_allclose(turned.R[0], R, atol=1e-7)
     assert not turned.t.any()
     refuses(ValueError, "singular", decompose_homography, np.ones((3, 3)), K)
-
-
-@pytest.mark.references
-def test_homographies_come_apart_as_by_opencv():
-    cv2 = pytest.importorskip("cv2")
-    R, t, n = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.3, -0.2, 0.1]), [0.1, 0.2, 0.97]
-    H = K @ (R + np.outer(t, n)) @ np.linalg.inv(K)
-    found = decompose_homography(H, K)
-    for R_cv, t_cv, n_cv in zip(*cv2.decomposeHomographyMat(H, K)[1:], strict=True):
-        apart = np.abs(found.R - R_cv).max((1, 2)) + np.abs(found.t - t_cv.T).max(1)
-        assert (apart + np.abs(found.normal - n_cv.T).max(1)).min() < 1e-7

@@ -210,25 +210,6 @@ def test_algorithm_2_with_the_tests_of_the_text_finds_the_right_matches(inlier_t
     assert fit.sigma_px == pytest.approx(usual.sigma_px, rel=0.2)
 
 
-@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("n", [30, 100])
-def test_the_default_is_as_good_as_the_gold_standard_at_any_noise(n, sigma):
-    """At 2 px most right matches lie beyond the threshold of 1 px."""
-    errors, sigmas = [], []
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        pair = make_pair(n, rng)
-        xy1, xy2, _ = spoil(pair, rng, sigma=sigma, outliers=0.0)
-        fit = estimate_fundamental(xy1, xy2, seed=seed)
-        gold = refine_fundamental(pair.F, xy1, xy2, "reprojection")
-        errors.append([error_px(F, pair) for F in (fit.F, gold)])
-        sigmas.append(fit.sigma_px / sigma)
-        assert fit.inliers.mean() > 0.9
-    ours, least = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert ours < 1.15 * least
-    assert np.median(sigmas) == pytest.approx(1.0, abs=0.1)
-
-
 def test_heavy_tails_stay_where_asked_for_and_no_noise_is_invented():
     rng = np.random.default_rng(5)
     pair = make_pair(400, rng)
@@ -401,8 +382,11 @@ def of_many(F, covariance):
     return epipoles_of(FundamentalFit(F, np.ones(10**6, dtype=bool), 1.0, covariance))
 
 
-@pytest.mark.parametrize(("sigma", "n"), [(0.25, 100), (0.5, 300), (2.0, 1000)])
+@pytest.mark.parametrize(
+    ("sigma", "n"), [(0.25, 100), (0.5, 30), (0.5, 300), (1.0, 30), (2.0, 30), (2.0, 100), (2.0, 1000)]
+)
 def test_the_default_comes_near_the_bound_at_its_default_threshold(sigma, n):
+    """At 2 px most right matches lie beyond the threshold of 1 px."""
     values = {row.name: row.values[DEFAULT] for row in check_precision(sigma, n, 30) if DEFAULT in row.values}
     assert values["RMS distance over bound"] < 1.1
     assert values["coverage of distances"] > 0.92

@@ -10,7 +10,6 @@ from thesisrecon.api.pairs import estimate_trifocal
 from thesisrecon.camera import decompose_camera
 from thesisrecon.epipolar.three_view_estimation import (
     NO_SEGMENTS,
-    _ReprojectionProblem,
     _tensor_equations,
 )
 from thesisrecon.errors import StageFailure
@@ -143,23 +142,6 @@ def test_matches_that_do_not_determine_a_tensor_are_named(kind, sigma):
             points = rng.uniform(0.0, 1000.0, points.shape)
         noisy = points + rng.normal(0.0, sigma, points.shape)
         refuses(StageFailure, "do not determine", estimate_trifocal, *noisy)
-
-
-def test_the_gradient_of_the_refinement_is_right():
-    rng = np.random.default_rng(3)
-    points, segments = matches(three_cameras(rng), rng, 9, 8, 1.0)
-    equations = _tensor_equations(points, segments)
-    problem = _ReprojectionProblem(equations.solve(), points, segments, equations.transforms, 1.0)
-    state = (np.zeros(18), np.zeros((17, 4)))
-    for _ in range(60):
-        # The gradient is that of the cameras alone if points and lines fit them.
-        state = problem.retract(state, np.zeros(18))
-    gradient = problem.linearize(state).gradient
-    numeric = [
-        (problem.cost(problem.retract(state, d)) - problem.cost(problem.retract(state, -d))) / 2e-7
-        for d in 1e-7 * np.eye(18)
-    ]
-    np.testing.assert_allclose(numeric, gradient, rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
 
 
 def test_wrong_matches_do_not_spoil_the_tensor():

@@ -140,16 +140,6 @@ def test_turntable_tracks(estimator, view):
     assert fit.inliers[wrong].mean() < 0.1
 
 
-@pytest.mark.real
-@pytest.mark.parametrize("name", ["biscuit", "book"])
-def test_hand_labelled_matches(name):
-    rows = np.loadtxt(real_data(f"adelaide/{name}/matches.txt"))
-    right = rows[:, 4] > 0
-    fit = estimate_fundamental(rows[:, :2], rows[:, 2:4], threshold_px=2.0)
-    assert fit.inliers[right].mean() > 0.7
-    assert fit.inliers[~right].mean() < 0.15
-
-
 def noisy_matches(kind, n, sigma, rng, *, wrong=0.0):
     """Matches of a scene of this kind; this share of them is replaced by wrong ones."""
     scene = make_two_views(kind, n, rng)

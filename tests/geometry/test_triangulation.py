@@ -225,16 +225,11 @@ def test_6_3_3_of_perpendicular_points_the_nearer_one_goes_to_its_epipole(far):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_scales_of_the_cameras_have_no_effect(method):
-    P, X = two_views("general", np.random.default_rng(0))
-    found = triangulate(P * np.array([1e-5, -1e5])[:, None, None], images(P, X), method=method)
-    np.testing.assert_allclose(found[:, :3] / found[:, 3:], X[:, :3], atol=1e-6)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_nan_means_not_seen_for_every_method(method):
+def test_scales_of_the_cameras_have_no_effect_and_nan_means_not_seen(method):
     P, X = two_views("general", np.random.default_rng(0))
     xy = images(P, X)
+    found = triangulate(P * np.array([1e-5, -1e5])[:, None, None], xy, method=method)
+    np.testing.assert_allclose(found[:, :3] / found[:, 3:], X[:, :3], atol=1e-6)
     xy[1, 3], xy[0, 5, 1] = np.nan, np.nan
     found = thesisrecon.triangulate(P, xy, method=method)
     assert not found[[3, 5]].any()

@@ -4,15 +4,12 @@ import numpy as np
 import pytest
 
 from tests.geometry.properties import gap, holds_for_every, random_camera
-from thesisrecon.epipolar.three_view_estimation import _tensor_equations
 from thesisrecon.geometry import three_view
 from thesisrecon.geometry.camera_matrix import camera_centre, project
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_normals
 from thesisrecon.geometry.strata import transform
 from thesisrecon.geometry.two_view import symmetric_residuals
 from validation.scenes.rigs import random_transform
-
-NO_SEGMENTS = np.zeros((3, 0, 2, 2))
 
 
 def three_cameras(rng):
@@ -124,15 +121,3 @@ def test_views_that_are_rectified_to_the_first_have_their_epipoles_and_cameras(K
             assert gap(found, P[k][:, 3]) < 1e-12
         assert gap(three_view.tensor_from_cameras(*three_view.cameras_from_tensor(T)), T) < 1e-10
         np.testing.assert_allclose(three_view.transfer_points(T, xy[0], xy[1]), xy[2], atol=1e-8)
-
-
-@holds_for_every(examples=10)
-def test_given_epipoles_the_constrained_solution_is_the_tensor_of_the_cameras(rng):
-    P = three_cameras(rng)
-    equations = _tensor_equations(seen_points(P, rng, 10), NO_SEGMENTS)
-    e2, e3 = three_view.tensor_epipoles(equations.solve())
-    T = equations.solve_with_epipoles(e2, e3)
-    assert gap(equations.in_pixels(T), three_view.tensor_from_cameras(*P)) < 1e-6
-    noisy = equations.solve_with_epipoles(*np.linalg.qr(rng.normal(size=(3, 3)))[0][:2])
-    conditioned = three_view.tensor_from_cameras(*three_view.cameras_from_tensor(noisy))
-    assert gap(conditioned, noisy) < 1e-6

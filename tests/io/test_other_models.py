@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.conftest import refuses
 from thesisrecon import Camera, UsageError, compare_models, detect_corners, read_cameras, read_mesh
-from thesisrecon.io import _exports
 from thesisrecon.io._models import read_model
 from thesisrecon.results import SparseModel, SparseView
 
@@ -22,16 +21,6 @@ def _model():
     R = Rotation.from_rotvec(0.4 * rng.normal(size=(4, 3))).as_matrix()
     views = [SparseView(f"{i}.png", r, rng.normal(size=3), K, SIZE, np.zeros(3)) for i, r in enumerate(R)]
     return SparseModel(views, rng.normal(size=(9, 3)))
-
-
-def test_written_models_are_read_again(tmp_path):
-    model = _model()
-    found = read_model(_exports.write_nerfstudio(tmp_path, model, masked=False))
-    assert found.names == model.names
-    for a, b in zip(found.views, model.views, strict=True):
-        for name in ("R", "t", "K", "distortion"):
-            np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=1e-9)
-        assert a.size == b.size
 
 
 def test_nerf_gives_an_angle(tmp_path):

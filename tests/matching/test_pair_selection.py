@@ -213,20 +213,6 @@ def test_chance_gives_no_evidence_and_a_turned_copy_gives_much(windows):
         assert max(chance) < 2.0
 
 
-def test_photographs_of_one_wall_use_the_same_words(windows):
-    sketches = [_subset_seeds(f.seeds, rotated=False) for f in windows.features if f.seeds]
-    words = word_weights(
-        [s.seeds.patches for s in sketches], 1024, map_all=one_by_one, rng=np.random.default_rng(0)
-    )
-    alike = (words @ words.T).toarray()
-    np.testing.assert_allclose(alike, alike.T, atol=1e-12)
-    np.testing.assert_allclose(np.diag(alike), 1.0)
-    pairs = list(combinations(range(CROPS), 2))
-    common = np.array([shared(windows, i, j) for i, j in pairs])
-    value = np.array([alike[i, j] for i, j in pairs])
-    assert np.median(value[common > 0.4]) > np.quantile(value[common == 0.0], 0.9)
-
-
 def test_views_of_places_with_the_same_windows_are_told_apart_by_the_rest():
     """Nine tenths of the patches stand in every image; two views of a place share the others, with noise."""
     rng = np.random.default_rng(6)

@@ -95,14 +95,9 @@ CODE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.M | re.S)
 PAGES = sorted(path for path in DOCS.rglob("*.md") if not {"_build", "modules", "generated"} & {*path.parts})
 
 
-def _python_of_the_readme():
-    first, calls = [text for kind, text in CODE.findall(README.read_text("utf-8")) if kind == "python"]
-    return first, calls
-
-
 def test_the_calls_of_the_readme_fit_the_functions():
     """Its names stand for data of the reader, so it cannot run."""
-    tree = ast.parse(_python_of_the_readme()[1])
+    tree = ast.parse(block("../README.md", 1))
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     calls = [call for call in calls if ast.unparse(call.func).startswith("thesisrecon.")]
     for call in calls:
@@ -166,21 +161,13 @@ def test_the_example_of_the_conventions_runs():
 
 
 @pytest.mark.slow
-def test_the_first_lines_of_the_readme_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("page", "images"), [("../README.md", 14), ("start/first-reconstruction.md", 6)])
+def test_the_first_lines_of_the_readme_and_the_first_reconstruction_run(page, images, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fixtures").symlink_to(DOCS.parent / "fixtures")
     names = {}
-    exec(compile(_python_of_the_readme()[0], "README.md", "exec"), names)
-    assert len(names["result"].cameras) == 14
-    assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
-
-
-@pytest.mark.slow
-def test_the_first_reconstruction_runs_as_it_stands(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "fixtures").symlink_to(DOCS.parent / "fixtures")
-    names = {}
-    exec(compile(block("start/first-reconstruction.md"), "first-reconstruction.md", "exec"), names)
+    exec(compile(block(page), page, "exec"), names)
+    assert len(names["result"].cameras) == images
     assert names["result"].summary["trusted"]
     assert names["camera"].K[0, 0] == pytest.approx(908.6, rel=2e-3)
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"report.html", "cameras.json", "sparse"}

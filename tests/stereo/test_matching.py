@@ -91,16 +91,11 @@ def test_disparities_do_not_prefer_whole_pixels(noise):
 
 
 @names
-def test_a_range_may_span_zero(variant):
+def test_a_range_may_span_zero_and_invalid_pixels_have_no_disparity(variant):
     left, right, truth, both = pair_with_truth()
     shifted = np.full_like(right, np.nan)
     shifted[:, 10:] = right[:, :-10]
     require_right(variant.match(left, shifted, disparity_range=(-12, 12)), truth - 10.0, both, known=0.7)
-
-
-@names
-def test_invalid_pixels_have_no_disparity(variant):
-    left, right, truth, both = pair_with_truth()
     left[:20], left[100:, 90:] = np.nan, np.nan
     found = variant.match(left, right, disparity_range=(0, 24))
     assert np.isnan(found.disparity[np.isnan(left)]).all()
