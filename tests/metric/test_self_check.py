@@ -387,7 +387,9 @@ def test_a_richer_model_of_one_camera_predicts_no_better_and_one_of_crops_far_be
     shift = np.random.default_rng(1).uniform(-80.0, 80.0, (8, 2))
     for images, low, high in ((scene, 0.9, 1.3), (changed(scene, np.ones(8), shift), 0.0, MAX_REMAINING)):
         simple = settled(images)
-        model, adjustment = _adjustment.with_own_values(*simple, (_model.FOCAL, *_model.CENTRE))
+        shared = simple[1].prior.shared.copy()
+        shared[:, (_model.FOCAL, *_model.CENTRE)] = np.arange(len(shared))[:, None]
+        model, adjustment = _adjustment.with_prior(*simple, replace(simple[1].prior, shared=shared))
         model = adjustment.run(model, iterations=25)[0]
         assert low < _adjustment.remaining_cost(simple, (model, adjustment)) < high
 

@@ -14,7 +14,7 @@ from thesisrecon.geometry.small_matrices import floored_diagonal
 from thesisrecon.optimize.bundle import covariance as bundle_covariance
 from thesisrecon.optimize.bundle import projection, projective, scatter, schur
 from thesisrecon.optimize.bundle.covariance import robust_sigma
-from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points, sum_leverages
+from thesisrecon.optimize.bundle.elimination import ReducedSums, revert_crossing_points
 from thesisrecon.optimize.bundle.metric import BundleOptions, refine_metric_bundle
 from thesisrecon.optimize.bundle.projection import (
     Jacobians,
@@ -298,16 +298,12 @@ def test_a_bending_loss_keeps_the_gradient_and_bends_the_curvature():
 
 def test_noise_is_found_beside_outliers_and_leverages_are_those_of_the_points():
     rng = np.random.default_rng(0)
-    start, B, leverage = np.array([0, 3, 3, 7]), rng.normal(size=(7, 2, 3)), np.empty((7, 2))
-    sum_leverages(start, B, leverage)
-    for s, e in ((0, 3), (3, 7)):
-        J = B[s:e].reshape(-1, 3)
-        np.testing.assert_allclose(leverage[s:e].ravel(), np.diag(J @ np.linalg.pinv(J)), rtol=1e-9)
     # Orthonormal columns in any unit, also of a point on one ray.
+    B = rng.normal(size=(7, 2, 3))
     B[5:, :, 2] = 0.0
     point = np.array([0, 0, 0, 2, 2, 3, 3])
     for unit in (1e-8, 1.0, 1e8):
-        Q = scatter._orthonormal(unit * B, point, 4)
+        Q = bundle_covariance.orthonormal_columns(unit * B, point, 4)
         for rows in (point == 0, point == 2, point == 3):
             J, q = B[rows].reshape(-1, 3), Q[rows].reshape(-1, 3)
             np.testing.assert_allclose(q @ q.T, J @ np.linalg.pinv(J), atol=1e-9)

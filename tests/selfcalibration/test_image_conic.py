@@ -24,14 +24,15 @@ def pixels(found, K):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_dual_image_is_carried_exactly_by_homographies_of_determinant_one(seed):
+def test_the_image_of_a_constant_camera_is_carried_exactly_by_homographies_of_determinant_one(seed):
     scene = make_scene(seed=seed, principal_shift=(60.0, -45.0))
     found, plane = scenes.setup(scene, scenes.NOTHING_BUT_CONSTANT, seed=seed)
     H = _frame.infinite_homographies(found.frame, plane[None])[0]
     np.testing.assert_allclose(np.linalg.det(H), 1.0, atol=1e-12)
-    dual, s = absolute_conic.dual_conic_of_constant_camera(H)
-    np.testing.assert_allclose(H @ dual @ H.swapaxes(1, 2), np.tile(dual, (len(H), 1, 1)), atol=1e-9)
-    K = pixels(found, calibration_from_image(dual, is_dual=True)[None])[0]
+    conic = absolute_conic.solve_conic(H, found.constraints)
+    w, s = conic.w, conic.singular_values
+    np.testing.assert_allclose(absolute_conic.transferred_conics(H, w), np.tile(w, (len(H), 1, 1)), atol=1e-9)
+    K = pixels(found, calibration_from_image(w)[None])[0]
     np.testing.assert_allclose(K, scene.K[0], rtol=1e-8, atol=1e-5)
     assert s[5] < 1e-10 < 1e-4 * s[4]
 

@@ -258,7 +258,7 @@ def _adjusted(
         if known.loss == "squared":
             loss_px = np.inf if plain else found
         options = metric.BundleOptions(
-            sigma_px=found, loss_px=loss_px, max_iterations=most, settled=1e-6, covariance=last,
+            sigma_px=found, loss_px=loss_px, max_iterations=most, settled=1e-6, noise=True, covariance=last,
             point_covariance=last, joint_covariance=last and joint,
         )  # fmt: skip
         fit = metric.refine_metric_bundle(
@@ -526,7 +526,6 @@ def _check(
         rule = "R is world to camera and t = -R centre"
         raise ValueError(f"{behind:.0%} of the observed points lie behind their cameras; {rule}")
     seen, points = np.unique(view), np.unique(point)
-    assert start.shared is not None
     own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
     fixed = [
         0 if mask is None else int(mask[index].sum())

@@ -10,7 +10,7 @@ from thesisrecon.api.relative_pose import Calibration, calibrated_rays
 from thesisrecon.arrays import F64, Record, checked, flag, require_calibration
 from thesisrecon.epipolar.ransac import estimate_seven_point
 from thesisrecon.errors import StageFailure
-from thesisrecon.geometry.homogeneous import checked_unit, products, symmetric
+from thesisrecon.geometry.homogeneous import checked_unit, quadratic_rows, symmetric
 from thesisrecon.geometry.relative_pose import depths_of_matches, poses_from_essential
 from thesisrecon.optimize.least_squares import central_differences
 
@@ -299,11 +299,11 @@ def factorize_affine(xy: F64, *, orthographic: bool = False) -> AffineFactorizat
     M, X = U[:, :3] * D[:3], Vt[:3]
     a, b = M[::2], M[1::2]
 
-    square, norm = products(a, a), D[0] ** 2
-    rows, right = [square - products(b, b), square[:1]], np.append(np.zeros(2 * n_views), norm)
+    square, norm = quadratic_rows(a, a), D[0] ** 2
+    rows, right = [square - quadratic_rows(b, b), square[:1]], np.append(np.zeros(2 * n_views), norm)
     if orthographic:
-        rows, right = [square, products(b, b)], np.repeat([0.0, norm, norm], n_views)
-    A = np.concatenate([products(a, b), *rows])
+        rows, right = [square, quadratic_rows(b, b)], np.repeat([0.0, norm, norm], n_views)
+    A = np.concatenate([quadratic_rows(a, b), *rows])
     solution, _, rank, _ = np.linalg.lstsq(A, right, rcond=1e-9)
     Q = symmetric(solution)
     if rank < 6 or not np.linalg.eigvalsh(Q)[0] > 1e-9 * np.abs(Q).max():

@@ -13,7 +13,7 @@ from thesisrecon.arrays import F64, I64, Record, checked, generator, number, num
 from thesisrecon.camera import Camera
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry import homogeneous
-from thesisrecon.geometry.homogeneous import homogenize, products, symmetric, unit_norm
+from thesisrecon.geometry.homogeneous import homogenize, quadratic_rows, symmetric, unit_norm
 from thesisrecon.geometry.strata import calibration_from_image, nearest_rotation
 from thesisrecon.optimize.least_squares import central_differences, minimize_residuals
 
@@ -359,7 +359,7 @@ def calibrate_from_homographies(
     T = np.linalg.inv(homogeneous.pixel_from_unit(np.array([[width, height]]))[0])
     G = unit_norm(T @ H)
     a, b = G[:, :, 0], G[:, :, 1]
-    rows = np.concatenate([products(a, b), products(a, a) - products(b, b)])
+    rows = np.concatenate([quadratic_rows(a, b), quadratic_rows(a, a) - quadratic_rows(b, b)])
     if len(H) == 2:
         rows = np.vstack([rows, np.eye(6)[1]])
     _, sizes, Vt = np.linalg.svd(rows)

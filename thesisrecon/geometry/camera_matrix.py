@@ -5,9 +5,10 @@ The thesis writes R for camera-to-world (3.21); here R is world-to-camera, its t
 
 import numpy as np
 
-from thesisrecon.arrays import F64, I64
+from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.camera import _left_determinant, compose_camera
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
+from thesisrecon.records import Reconstruction
 
 
 def camera_from_centre(K: F64, R: F64, centre: F64) -> F64:
@@ -47,6 +48,13 @@ def pose_of_camera(K: F64, P: F64) -> tuple[F64, F64]:
     """R (..., 3, 3) and t (..., 3) of cameras P = K [R t]."""
     Rt = np.asarray(np.linalg.solve(K, P), dtype=np.float64)
     return Rt[..., :3], Rt[..., 3]
+
+
+def poses_of_model(model: Reconstruction, views: B8 | I64) -> tuple[F64, F64, F64]:
+    """R (N, 3, 3), t (N, 3) and centres (N, 3) of registered ``views`` of a metric model."""
+    assert model.K is not None
+    R, t = pose_of_camera(model.K[views], model.P[views])
+    return R, t, -np.einsum("vba,vb->va", R, t)
 
 
 def camera_centre(P: F64) -> F64:

@@ -171,20 +171,19 @@ def whitened_frame(X: F64) -> SpaceFrame:
     return SpaceFrame(N, whitening_transform(X @ N.T))
 
 
-_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+def quadratic_rows(x: F64, y: F64) -> F64:
+    """Rows (..., n (n + 1) / 2) with r . q = x' Q y for the upper triangle q of a symmetric Q, row by row."""
+    pairs = zip(*np.triu_indices(x.shape[-1]), strict=True)
+    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in pairs]
+    return np.stack(terms, axis=-1)
 
 
-def products(a: F64, b: F64) -> F64:
-    """Rows (N, 6) with a' S b = row . s for the entries s of a symmetric S (3, 3), as in `symmetric`."""
-    return np.column_stack([a[:, p] * b[:, q] + (p != q) * a[:, q] * b[:, p] for p, q in _ENTRIES])
-
-
-def symmetric(s: F64) -> F64:
-    """The symmetric matrix (3, 3) of its entries 11, 12, 13, 22, 23, 33."""
-    S = np.zeros((3, 3))
-    for value, (p, q) in zip(s, _ENTRIES, strict=True):
-        S[p, q] = S[q, p] = value
-    return S
+def symmetric(q: F64) -> F64:
+    """The symmetric matrices (..., n, n) of upper triangles (..., n (n + 1) / 2)."""
+    n = int(np.sqrt(2 * q.shape[-1]))
+    place, upper = np.empty((n, n), np.int64), np.triu_indices(n)
+    place[upper] = place[upper[::-1]] = np.arange(q.shape[-1])
+    return q[..., place]
 
 
 def unit_norm(F: F64) -> F64:

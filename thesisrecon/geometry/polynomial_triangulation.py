@@ -80,14 +80,6 @@ def _conditioning(xy: F64) -> tuple[float, F64, F64]:
     return scale, centre, T
 
 
-def _balanced(L: F64) -> F64:
-    """Lines L (2, 3, 2) of a pencil in a balanced basis."""
-    B = np.einsum("vka,vkb->vab", L[:, :2], L[:, :2])
-    traces = np.maximum(np.trace(B, axis1=1, axis2=2), 1e-300)
-    values, basis = np.linalg.eigh((B / traces[:, None, None]).sum(axis=0))
-    return np.asarray(L @ (basis / np.sqrt(np.maximum(values, _RANK * values[1]))))
-
-
 def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
     """Move matches to the nearest pairs with x2' F x1 = 0: least sum of squared distances.
 
@@ -103,7 +95,12 @@ def correct_matches(F: F64, xy1: F64, xy2: F64) -> tuple[F64, F64]:
         raise ValueError("correct_matches needs an F of rank 2; got one of rank 1")
     lines1 = Vt[:2].T
     lines2 = (U[:, :2] * s[:2]) @ Vt[:2] @ cross_matrix(Vt[2]) @ lines1
-    L = _balanced(np.stack([lines1, lines2]))
+    L = np.stack([lines1, lines2])
+    # A basis of the pencil in which both images weigh the same.
+    B = np.einsum("vka,vkb->vab", L[:, :2], L[:, :2])
+    traces = np.maximum(np.trace(B, axis1=1, axis2=2), 1e-300)
+    values, basis = np.linalg.eigh((B / traces[:, None, None]).sum(axis=0))
+    L = L @ (basis / np.sqrt(np.maximum(values, _RANK * values[1])))
     moved = (xy - centre[:, None]) * scale
     lines = moved @ L[:, :2] + L[:, 2:]
     with np.errstate(divide="ignore", invalid="ignore"):

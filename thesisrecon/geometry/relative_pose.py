@@ -25,7 +25,13 @@ def essential_five_points(x1: F64, x2: F64) -> F64:
     """
     rows = np.einsum("ski,skj->sijk", x2, x1).reshape(-1, 9, 5)
     N = np.ascontiguousarray(np.linalg.qr(rows, mode="complete")[0][:, :, 5:].swapaxes(1, 2))
-    A = _essential_constraints(N.reshape(-1, 4, 3, 3))
+    basis = N.reshape(-1, 4, 3, 3)
+    squares = basis[:, :, None] @ basis[:, None].swapaxes(3, 4)
+    squares = 2.0 * squares - np.trace(squares, axis1=3, axis2=4)[..., None, None] * np.eye(3)
+    cubes = np.einsum("suvik,swkj->sijuvw", squares, basis, optimize=True).reshape(-1, 9, 64)
+    minors = np.cross(basis[:, :, None, 1], basis[:, None, :, 2])
+    determinant = np.einsum("suvi,swi->suvw", minors, basis[:, :, 0]).reshape(-1, 1, 64)
+    A = np.concatenate([cubes, determinant], axis=1) @ _ALL_CUBIC
     regular = np.isfinite(A).all(axis=(1, 2)) & (np.linalg.det(A[:, :, :10]) != 0.0)
     A, N = A[regular], N[regular]
     by_x = np.zeros((len(A), 10, 10))
@@ -35,16 +41,6 @@ def essential_five_points(x1: F64, x2: F64) -> F64:
     sample, which = np.nonzero(values.imag == 0.0)
     E = np.einsum("sk,skm->sm", vectors[sample, 6:, which].real, N[sample])
     return np.asarray((E / np.linalg.norm(E, axis=1, keepdims=True)).reshape(-1, 3, 3))
-
-
-def _essential_constraints(E: F64) -> F64:
-    """2 E E' E - tr(E E') E and det E (S, 10, 20) over ``_CUBIC`` of E0 to E3 (S, 4, 3, 3)."""
-    squares = E[:, :, None] @ E[:, None].swapaxes(3, 4)
-    squares = 2.0 * squares - np.trace(squares, axis1=3, axis2=4)[..., None, None] * np.eye(3)
-    cubes = np.einsum("suvik,swkj->sijuvw", squares, E, optimize=True).reshape(-1, 9, 64)
-    minors = np.cross(E[:, :, None, 1], E[:, None, :, 2])
-    determinant = np.einsum("suvi,swi->suvw", minors, E[:, :, 0]).reshape(-1, 1, 64)
-    return np.asarray(np.concatenate([cubes, determinant], axis=1) @ _ALL_CUBIC)
 
 
 def poses_from_essential(E: F64) -> tuple[F64, F64]:

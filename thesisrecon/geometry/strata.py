@@ -196,12 +196,6 @@ def dual(C: F64) -> F64:
     return np.asarray(sign * (Vt.T * others) @ U.T)
 
 
-def _length_scale(C: F64) -> float:
-    """Unit of length, at least 1, in which the blocks of a conic or quadric [A b; b' c] are similar."""
-    a, b, c = (float(np.linalg.norm(part)) for part in (C[:-1, :-1], C[:-1, -1], C[-1, -1]))
-    return max(1.0, b / a, math.sqrt(c / a)) if a > 1e-15 * max(b, c) else 1.0
-
-
 def intersect_line(C: F64, x: F64, y: F64) -> F64:
     """Real intersections (0 to 2, d) of a conic or quadric with the line of two points (3.5).
 
@@ -209,7 +203,10 @@ def intersect_line(C: F64, x: F64, y: F64) -> F64:
     discriminant S(x, y)^2 - S(x) S(y) is 0 for tangents (3.6, where the thesis' text lost the square).
     """
     require_finite("intersect_line", C)
-    units = np.append(np.full(len(C) - 1, _length_scale(C)), 1.0)
+    # In a unit of length, at least 1, in which the blocks of [A b; b' c] are similar.
+    a, b, c = (float(np.linalg.norm(part)) for part in (C[:-1, :-1], C[:-1, -1], C[-1, -1]))
+    length = max(1.0, b / a, math.sqrt(c / a)) if a > 1e-15 * max(b, c) else 1.0
+    units = np.append(np.full(len(C) - 1, length), 1.0)
     x, y, C = (checked_unit(a, "intersect_line") for a in (x / units, y / units, units[:, None] * C * units))
     sxx, sxy, syy = (float(bilinear_form(C, a, b)) for a, b in ((x, x), (x, y), (y, y)))
     size = max(abs(sxx), abs(sxy), abs(syy))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from thesisrecon._numba import copy_to, empty, kernel, zeros
 from thesisrecon.arrays import F64, I64, require_finite
 from thesisrecon.geometry.camera_matrix import camera_centre
-from thesisrecon.geometry.homogeneous import homogenize, normalizing_transform, unit_norm
+from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, normalizing_transform, unit_norm
 from thesisrecon.geometry.small_matrices import orthogonalize_columns
 
 PASSES = 10
@@ -24,6 +24,9 @@ _ONE_CENTRE = 1e-12
 _PARALLEL = 1e-14
 """Determinant of the mid-point system of two rays, about 2 sin^2 of their angle, below which they are
 parallel; it grows with the third power of their number."""
+
+SortedPixels = tuple[I64, I64, F64]
+"""Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
 
 
 @kernel
@@ -88,62 +91,18 @@ def _from_one_centre(P: F64, centre: F64, first: int, last: int, view: I64) -> b
 
 
 @kernel
-def _reprojection_cost(P: F64, x: F64, first: int, last: int, view: I64, xy: F64) -> float:
-    """Return the sum of squared reprojection errors of one point, infinite or NaN in a focal plane."""
-    cost = 0.0
-    for k in range(first, last):
-        p = P[view[k]]
-        w = 1.0 / (p[2, 0] * x[0] + p[2, 1] * x[1] + p[2, 2] * x[2] + p[2, 3] * x[3])
-        du = w * (p[0, 0] * x[0] + p[0, 1] * x[1] + p[0, 2] * x[2] + p[0, 3] * x[3]) - xy[k, 0]
-        dv = w * (p[1, 0] * x[0] + p[1, 1] * x[1] + p[1, 2] * x[2] + p[1, 3] * x[3]) - xy[k, 1]
-        cost += du * du + dv * dv
-    return cost
+def _triangulate_each(P: F64, weight: F64, centre: F64, listed: SortedPixels, X: F64) -> None:
+    """Fill X (N, 4) by the linear method, the rows of an observation times its weight (K,).
 
-
-@kernel
-def _triangulate_each_linear(
-    P: F64, scale: F64, centre: F64, listed: tuple[I64, I64, F64], passes: int, tolerance: float, X: F64
-) -> None:
-    """Fill X (N, 4) by the linear method, the rows of a view times its ``scale`` (V,)."""
-    # Points observed from one `centre` (V, 4) stay 0. `passes` > 0: repeat with each row over the depth p3'X
-    # of the last pass until no depth changes by more than `tolerance`, else the better answer is kept.
+    Points observed from one ``centre`` (V, 4) are 0.
+    """
     start, view, xy = listed
-    R, row, x, y = zeros((4, 4)), empty(4), empty(4), empty(4)
-    weight = empty(len(xy))
-    obs = (view, xy, weight)
+    R, row = zeros((4, 4)), empty(4)
     for j in range(len(start) - 1):
         first, last = start[j], start[j + 1]
         X[j] = 0.0
-        if last - first < 2 or _from_one_centre(P, centre, first, last, view):
-            continue
-        for k in range(first, last):
-            weight[k] = scale[view[k]]
-        _least_algebraic(P, obs, first, last, R, row, x)
-        copy_to(X[j], x)
-        copy_to(y, x)
-        rest = False
-        for n in range(passes):
-            change = total = 0.0
-            for k in range(first, last):
-                p = P[view[k], 2]
-                depth = abs(p[0] * y[0] + p[1] * y[1] + p[2] * y[2] + p[3] * y[3])
-                change = max(change, abs(depth * weight[k] - 1.0))
-                weight[k] = 1.0 / depth if depth > 0.0 else math.inf
-                total += weight[k]
-            rest = n > 0 and change < tolerance
-            if rest or not math.isfinite(total):
-                break
-            _least_algebraic(P, obs, first, last, R, row, y)
-        if passes > 0 and (
-            rest
-            or _reprojection_cost(P, y, first, last, view, xy)
-            < _reprojection_cost(P, x, first, last, view, xy)
-        ):
-            copy_to(X[j], y)
-
-
-SortedPixels = tuple[I64, I64, F64]
-"""Observations sorted by point: first of each point (N + 1,), views (K,), pixels (K, 2)."""
+        if last - first >= 2 and not _from_one_centre(P, centre, first, last, view):
+            _least_algebraic(P, (view, xy, weight), first, last, R, row, X[j])
 
 
 def triangulate_observations(P: F64, view: I64, point: I64, xy: F64, n_points: int) -> F64:
@@ -191,9 +150,32 @@ def triangulate_linear(P: F64, listed: SortedPixels, passes: int) -> F64:
     scale = 1.0 / np.where(size > 0.0, size, 1.0)
     centre = camera_centre(P)
     centre /= np.maximum(np.linalg.norm(centre, axis=1, keepdims=True), 1e-300)
-    X = np.empty((len(start) - 1, 4))
-    _triangulate_each_linear(P, scale, centre, listed, passes, _AT_REST, X)
-    return X
+    X, weight = np.empty((len(start) - 1, 4)), scale[view]
+    _triangulate_each(P, weight, centre, listed, X)
+    return _iterated(P, weight, centre, listed, X, passes) if passes else X
+
+
+def _iterated(P: F64, weight: F64, centre: F64, listed: SortedPixels, X: F64, passes: int) -> F64:
+    """Iterative-LS: each row over the depth p3'X of the last pass, until no depth of a point changes.
+
+    Where it does not come to rest, the answer of least reprojection error.
+    """
+    start, view, xy = listed
+    point = np.repeat(np.arange(len(X)), np.diff(start))
+    found, moving = X.copy(), np.abs(X).any(axis=1)
+    for n in range(passes):
+        depth = np.abs(np.einsum("ka,ka->k", P[view, 2], found[point]))
+        change = np.zeros(len(X))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            np.maximum.at(change, point, np.abs(depth * weight - 1.0))
+            weight = 1.0 / depth
+        moving &= (np.bincount(point, weight, len(X)) < np.inf) & ((n == 0) | (change >= _AT_REST))
+        trial = np.empty_like(X)
+        _triangulate_each(P, np.where(moving[point], weight, 1.0), centre, listed, trial)
+        found[moving] = trial[moving]
+    images = (dehomogenize(np.einsum("kab,kb->ka", P[view], Y[point])) - xy for Y in (found, X))
+    cost, before = (np.bincount(point, np.sum(off**2, axis=1), len(X)) for off in images)
+    return np.where(((change < _AT_REST) | (cost < before))[:, None], found, X)
 
 
 def triangulate_midpoint(P: F64, listed: SortedPixels) -> F64:

@@ -241,7 +241,12 @@ def require_parallax_of_matches(
     noise, off = (float(np.quantile(distances, share)) for share in (0.9, 0.5))
     most = max(_MAX_OFF_PX, _MAX_OFF_REL * float(max(np.ptp(xy1, axis=0).max(), np.ptp(xy2, axis=0).max())))
     if at_infinity is None:
-        what, residuals = "one homography", _homography_residuals(xy1, xy2)
+        what, inliers = "one homography", np.ones(len(xy1), dtype=bool)
+        # Least squares, fitted twice more without the worst tenth.
+        for _ in range(3):
+            H = homography_linear(xy1[inliers], xy2[inliers])
+            residuals = homography_residuals(H, xy1, xy2)
+            inliers = residuals <= np.fmax(np.quantile(residuals, 0.9), np.partition(residuals, 3)[3])
     else:
         what, residuals = "a scene at infinity", homography_residuals(at_infinity, xy1, xy2)
     parallax = float(np.quantile(residuals, 0.9))
@@ -251,13 +256,3 @@ def require_parallax_of_matches(
     if not fits and parallax > most:
         raise StageFailure.of("fundamental-of-other-matches", off)
     raise StageFailure.of("no-parallax", advice, what, len(xy1), parallax, noise)
-
-
-def _homography_residuals(xy1: F64, xy2: F64) -> F64:
-    """Residuals (N,) of a least-squares homography, fitted twice more without the worst tenth of them."""
-    inliers, residuals = np.ones(len(xy1), dtype=bool), np.zeros(len(xy1))
-    for _ in range(3):
-        H = homography_linear(xy1[inliers], xy2[inliers])
-        residuals = homography_residuals(H, xy1, xy2)
-        inliers = residuals <= np.fmax(np.quantile(residuals, 0.9), np.partition(residuals, 3)[3])
-    return residuals

@@ -16,7 +16,6 @@ from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.metric._model import (
-    ASPECT,
     CENTRE,
     DECENTRING,
     DECENTRING_STD,
@@ -130,9 +129,12 @@ class MetricAdjustment:
         """Adjust the model to its inliers, all that is ``free`` but ``fixed`` (V,) cameras; measure noise."""
         moves, options = self.free(model), self.options(model, iterations=iterations, settled=settled)
         moves = moves if free is None else moves & free[: len(moves)]
+        seen = np.isin(self.centres.index, model.tracks.view_index[model.inlier])
+        known = PositionPrior(*(a[seen] for a in vars(self.centres).values()))
         result = refine_metric_bundle(
             model.cameras, model.X, inlier_observations(model), free=moves,
-            prior=self.row_prior(model), options=options, fixed=fixed, knowledge=self._knowledge(model),
+            prior=self.row_prior(model), options=options, fixed=fixed,
+            knowledge=BundleKnowledge(centres=known) if seen.any() else None,
         )  # fmt: skip
         model = replace(model, cameras=result.cameras, X=result.X, sigmas_to_minimum=result.sigmas_to_minimum)
         if keep_noise:
@@ -144,14 +146,6 @@ class MetricAdjustment:
         loss, tail = min(width / sigma, 20.0), tail_width(norms, sigma)
         return replace(model, sigma_px=sigma, loss_sigmas=loss, tail=tail), result
 
-    def _knowledge(self, model: MetricEstimate) -> BundleKnowledge | None:
-        """The known positions of cameras with inliers."""
-        seen = np.isin(self.centres.index, model.tracks.view_index[model.inlier])
-        if not seen.any():
-            return None
-        index, position, root = (a[seen] for a in vars(self.centres).values())
-        return BundleKnowledge(centres=PositionPrior(index, position, root))
-
     def linearised(self, model: MetricEstimate) -> LinearisedFit:
         """The linearised adjustment of a model at its minimum."""
         noise = self.inflation * model.sigma_px, model.loss_sigmas * model.sigma_px
@@ -161,7 +155,6 @@ class MetricAdjustment:
 
 def _shares_a_lens(model: MetricEstimate) -> B8:
     """(G,) rows whose k2 and k3 at least three registered views share; else they are not estimated."""
-    assert model.cameras.shared is not None
     lens = np.unique(model.cameras.shared[:, K1 + 1], return_inverse=True)[1].reshape(-1)
     views = np.bincount(lens[model.cameras.group[model.registered]], minlength=int(lens.max()) + 1)
     return np.asarray(views[lens] >= 3)
@@ -202,31 +195,14 @@ def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[in
             yield columns
 
 
-def with_own_values(
-    model: MetricEstimate, adjustment: MetricAdjustment, columns: tuple[int, ...]
-) -> tuple[MetricEstimate, MetricAdjustment]:
-    """The model with one value per image in some columns of the intrinsics, without hierarchical prior."""
-    shared = adjustment.prior.shared.copy()
-    shared[:, columns] = np.arange(len(shared))[:, None]
-    return _with_prior(model, adjustment, replace(adjustment.prior, shared=shared))
-
-
-def with_free_aspect(
-    model: MetricEstimate, adjustment: MetricAdjustment
-) -> tuple[MetricEstimate, MetricAdjustment]:
-    """The model with an unknown aspect ratio of the pixels, without hierarchical prior."""
-    std = adjustment.prior.std.copy()
-    std[:, ASPECT] = np.inf
-    return _with_prior(model, adjustment, replace(adjustment.prior, std=std))
-
-
-def _with_prior(
+def with_prior(
     model: MetricEstimate, adjustment: MetricAdjustment, prior: IntrinsicsPrior
 ) -> tuple[MetricEstimate, MetricAdjustment]:
+    """The model under a prior that leaves more unknown, without hierarchical prior; new columns are 0."""
     group, table = camera_rows(prior)
-    first = np.unique(group, return_index=True)[1]
-    intrinsics = model.cameras.intrinsics[model.cameras.group[first]]
-    cameras = replace(model.cameras, intrinsics=intrinsics, group=group, shared=table)
+    rows = model.cameras.intrinsics[model.cameras.group[np.unique(group, return_index=True)[1]]]
+    rows = np.pad(rows, ((0, 0), (0, table.shape[1] - rows.shape[1])))
+    cameras = replace(model.cameras, intrinsics=rows, group=group, shared=table)
     return replace(model, cameras=cameras), replace(adjustment, prior=prior, hierarchical=None, inflation=1.0)
 
 

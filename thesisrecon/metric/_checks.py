@@ -24,7 +24,7 @@ from thesisrecon.optimize.bundle import identifiability
 from thesisrecon.optimize.bundle.identifiability import CalibrationProblem, UpgradedCameras
 from thesisrecon.optimize.bundle.metric import MAX_SIGMAS_TO_MINIMUM
 from thesisrecon.optimize.bundle.partial import refine_pose
-from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
+from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import IdentifiabilityReport, IntrinsicsPrior, common_points
 
@@ -314,11 +314,8 @@ def check_returned(
     used = np.flatnonzero(np.isin(seen.view_index, views))
     used = used[(np.bincount(seen.point_index[used]) >= 2)[seen.point_index[used]]]
     c, rows, prior = model.cameras, model.cameras.group[views], adjustment.row_prior(model)
-    assert c.shared is not None
-    own = np.arange(len(views), dtype=np.int64)
     problem = CalibrationProblem(
-        MetricCameras(c.R[views], c.t[views], c.intrinsics[rows], own, c.shared[rows]),
-        model.X,
+        c.of_views(views), model.X,
         Observations(np.searchsorted(views, seen.view_index[used]), seen.point_index[used], seen.xy[used]),
         IntrinsicsPrior.unshared(prior.mean[rows], prior.std[rows]), max(model.sigma_px, 1e-3),
         len(used) / max(int(model.inlier.sum()), 1), model.sizes[views].max(axis=1).astype(np.float64), views,

@@ -9,6 +9,7 @@ give the similarity: two of them its scale.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,9 +17,9 @@ import numpy as np
 import scipy
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.geometry.camera_matrix import pose_of_camera
+from thesisrecon.geometry.camera_matrix import poses_of_model
 from thesisrecon.geometry.homogeneous import homogenize
-from thesisrecon.geometry.strata import nearest_rotation
+from thesisrecon.geometry.strata import estimate_similarity, nearest_rotation
 from thesisrecon.lens import stacked_rows, undistort
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.optimize.ransac import Budget, draw_samples, resect_calibrated
@@ -181,16 +182,11 @@ def _hypotheses(points: _Points, rng: np.random.Generator, most: int = 500) -> l
     chosen = whole[draw_samples(rng, most, len(whole), 3)]
     if scipy.special.comb(len(whole), 3) <= most:
         chosen = np.array(list(combinations(whole, 3)))
-    a, b = points.a[chosen], points.b[chosen]
-    mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
-    a, b = a - mean_a[:, None], b - mean_b[:, None]
-    U, _, Vt = np.linalg.svd(np.einsum("nki,nkj->nij", a, b))
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        R, scale = U @ Vt, np.linalg.norm(a, axis=(1, 2)) / np.linalg.norm(b, axis=(1, 2))
-    t = mean_a - scale[:, None] * np.einsum("nij,nj->ni", R, mean_b)
-    usable = np.flatnonzero(np.isfinite(scale) & (scale > 0.0))
-    return [Similarity(float(scale[k]), R[k], t[k]) for k in usable]
+    found = list[Similarity]()
+    for three in chosen:
+        with suppress(ValueError):  # points on one line
+            found.append(estimate_similarity(points.b[three], points.a[three]))
+    return found
 
 
 def _of_resected_images(
@@ -224,7 +220,7 @@ def _resected(
         X, rays = other.X[t.point_index[k], :3], _normalized(model, k)
         pose, inlier, _ = resect_calibrated(X, rays, threshold=threshold, budget=SAMPLES, rng=rng)
         if pose is not None and inlier.sum() >= MIN_COMMON:
-            R, translation = pose_of_camera(model.K[[view]], model.P[[view]])
+            R, translation, _ = poses_of_model(model, np.array([view]))
             answer.append((pose, np.column_stack([R[0], translation[0]])))
     return answer
 
@@ -314,7 +310,7 @@ def _merged(first: Reconstruction, second: Reconstruction, s: Similarity, agree:
     assert first.K is not None
     assert second.distortion is not None
     assert first.distortion is not None
-    turn, t_new = pose_of_camera(second.K[new], second.P[new])
+    turn, t_new, _ = poses_of_model(second, new)
     R = turn @ s.R.T
     P, K = first.P.copy(), first.K.copy()
     P[new] = second.K[new] @ np.concatenate([R, s.scale * t_new[:, :, None] - R @ s.t[:, None]], axis=2)

@@ -12,7 +12,7 @@ from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
 from thesisrecon.lens import ANGLE, DIVISION, directions_of_image
 from thesisrecon.metric import _model
-from thesisrecon.metric._adjustment import MetricAdjustment, best_predictors, predicts_better
+from thesisrecon.metric._adjustment import MetricAdjustment, best_predictors, predicts_better, with_prior
 from thesisrecon.metric._model import BASES, FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
 from thesisrecon.optimize.bundle.identifiability import TOLERANCES
 from thesisrecon.optimize.bundle.projection import LENS
@@ -65,12 +65,8 @@ def with_decentring(
     model: MetricEstimate, adjustment: MetricAdjustment
 ) -> tuple[MetricEstimate, MetricAdjustment]:
     """The model of a nearly straight lens with the lens model "brown", which is decentred."""
-    prior = replace(adjustment.prior, lens_model="brown")
-    group, shared = _model.camera_rows(prior)
-    rows = model.cameras.intrinsics[model.cameras.group[np.unique(group, return_index=True)[1]]]
-    rows = np.pad(rows, ((0, 0), (0, _model.LENS_WIDTH - _model.WIDTH)))
-    cameras = replace(model.cameras, intrinsics=rows, group=group, shared=shared)
-    return replace(model, cameras=cameras), replace(adjustment, prior=prior, decentred=True)
+    free = replace(adjustment, decentred=True)
+    return with_prior(model, free, replace(adjustment.prior, lens_model="brown"))
 
 
 def _settled(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:

@@ -98,7 +98,6 @@ def adjust_window(model: MetricEstimate, adjustment: MetricAdjustment, views: B8
     part = _model.retriangulate_tracks(restrict_points(model, points), sigmas=EARLY_SIGMAS)
     if part.inlier.sum() < MIN_OBSERVATIONS:
         return model
-    assert cameras.shared is not None
     inside, outside = (cameras.shared[cameras.group[model.registered & v]] for v in (views, ~views))
     own = np.array([not np.isin(a, b).any() for a, b in zip(inside.T, outside.T, strict=True)])
     part = adjustment.run(part, free=WITHOUT_K2_K3[: len(own)] & own, fixed=~views, iterations=6)[0]
@@ -142,7 +141,6 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
     t, cameras = model.tracks, model.cameras
     k = rows[model.valid[t.point_index[rows]]]
     row = int(cameras.group[view])
-    assert cameras.shared is not None
     focals = cameras.shared[:, 0]
     alone = not model.registered[focals[cameras.group] == focals[row]].any()
     zooms = (1.0, 0.8, 1.25, 0.64, 1.56) if alone else (1.0,)

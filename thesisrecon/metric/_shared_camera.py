@@ -76,7 +76,6 @@ def _per_view(
     """Give the views own values in some columns, unknown or within ``own_std`` of those of the model."""
     views, adjustment = np.flatnonzero(model.registered), replace(adjustment, hierarchical=None)
     cameras, seen = model.cameras, subsample_inliers(model)
-    assert cameras.shared is not None
     rows = cameras.group[views]
     shared, own = cameras.shared[rows].copy(), np.arange(len(views), dtype=np.int64)
     prior, free = adjustment.row_prior(model), adjustment.free(model)
@@ -94,7 +93,7 @@ def _per_view(
     if np.isfinite(focal_spread):
         spread = np.where(np.arange(mean.shape[1]) == FOCAL, focal_spread, np.inf)
         known = replace(known, kind=cameras.shared[rows, FOCAL], spread=spread)
-    cameras = MetricCameras(cameras.R[views], cameras.t[views], cameras.intrinsics[rows], own, shared)
+    cameras = replace(cameras.of_views(views), shared=shared)
     seen = seen._replace(view_index=np.searchsorted(views, seen.view_index))
     return cameras, model.X, seen, free, known
 
@@ -138,7 +137,6 @@ def deviations_of_images(
     Images may have own aspect ratios and skews; with up to six images or after a ``critical`` motion own
     principal points too, as large as possible if ``contradicted``. Videos may show a rolling shutter.
     """
-    assert model.cameras.shared is not None
     focal = model.cameras.shared[model.cameras.group[model.registered], FOCAL]
     few = len(focal) <= 6
     if not few and len(np.unique(focal)) == len(focal):
@@ -315,7 +313,6 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
 
 def _sets(model: MetricEstimate, adjustment: MetricAdjustment, views: I64, column: int) -> list[_SharedGroup]:
     """Views that share a column; those whose principal point is known."""
-    assert model.cameras.shared is not None
     rows = model.cameras.group[views]
     known = adjustment.row_prior(model).std[rows, column] == 0.0
     number = model.cameras.shared[rows, column]
@@ -417,7 +414,6 @@ def inconsistent_principal_point(
 def _free_focals(model: MetricEstimate, adjustment: MetricAdjustment) -> tuple[F64, F64, I64]:
     """Focals (V,) without prior, relative standard deviations, and numbers: equal ones share their focal."""
     cameras = model.cameras
-    assert cameras.shared is not None
     prior, shared = adjustment.row_prior(model), cameras.shared.copy()
     known = np.flatnonzero(prior.std[:, FOCAL] == 0.0)
     alike = np.unique(prior.mean[known, FOCAL], return_inverse=True)[1].reshape(-1)

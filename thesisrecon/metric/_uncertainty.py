@@ -145,7 +145,6 @@ def apply_hierarchical_prior(
     model: MetricEstimate, adjustment: MetricAdjustment, hierarchical: HierarchicalPrior
 ) -> tuple[MetricEstimate, MetricAdjustment]:
     """Add the hierarchical prior, and share k2 and k3 among cameras of one zoom setting."""
-    assert model.cameras.shared is not None
     shared = model.cameras.shared.copy()
     for kind in np.unique(hierarchical.kind[hierarchical.kind >= 0]):
         rows = np.flatnonzero(hierarchical.kind == kind)

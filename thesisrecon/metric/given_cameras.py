@@ -116,7 +116,10 @@ def metric_from_given(
     calibration = records.calibration_of_metric(start.K, records.GIVEN)
     wide = prior if given.of_images else _prior_of_stds(given, prior)
     refined = MetricRefinement().refine(start, calibration, prior=wide, rng=rng, threads=threads)
-    return _in_given_frame(given, refined)
+    # By the similarity that brings its centres nearest to the given ones.
+    both = refined.reconstruction.registered & given.known
+    target = -np.einsum("vba,vb->va", given.R[both], given.t[both])
+    return moved(refined, estimate_similarity(centres_of(refined.reconstruction)[both], target))
 
 
 def _start(given: GivenCameras, tracks: Tracks, sizes: I64, prior: IntrinsicsPrior) -> MetricEstimate:
@@ -261,10 +264,3 @@ def _prior_of_stds(given: GivenCameras, prior: IntrinsicsPrior) -> IntrinsicsPri
             if peers.any():
                 std[view, column] = std[peers, column].min()
     return replace(known, std=std)
-
-
-def _in_given_frame(given: GivenCameras, refined: records.MetricResult) -> records.MetricResult:
-    """A refined result moved by the similarity that brings its centres nearest to the given ones."""
-    both = refined.reconstruction.registered & given.known
-    target = -np.einsum("vba,vb->va", given.R[both], given.t[both])
-    return moved(refined, estimate_similarity(centres_of(refined.reconstruction)[both], target))

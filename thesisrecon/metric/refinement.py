@@ -15,16 +15,9 @@ import scipy
 
 from thesisrecon import records
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.metric import _adjustment, _model, _shared_camera, _uncertainty
+from thesisrecon.metric import _adjustment, _lens, _model, _shared_camera, _uncertainty
 from thesisrecon.metric._adjustment import MetricAdjustment
 from thesisrecon.metric._checks import Join, check_returned, returned_cameras, self_check
-from thesisrecon.metric._lens import (
-    MIN_REACH,
-    reach_of_points,
-    undetermined_lens,
-    with_best_lens,
-    with_decentring,
-)
 from thesisrecon.metric._model import EARLY_SIGMAS, K1, LATE_SIGMAS, MetricEstimate
 from thesisrecon.metric._resection import MIN_POINTS, WITHOUT_K2_K3, register_missing_cameras
 from thesisrecon.optimize.bundle import identifiability
@@ -72,12 +65,16 @@ class MetricRefinement:
         )
         trials = [_start(reconstruction, u, adjustment) for u in calibration.candidates]
         models = [m for m in trials if m is not None]
+        if not models and not prior.focal_known.any():
+            raise StageFailure.of("no-metric-model", len(trials))
         if not models:
-            raise _no_candidate(prior, len(trials))
+            wide = float(prior.std[prior.focal_known, 0].max())
+            advice = ", or set a larger focal_std_rel" if wide > 0.0 else ""
+            raise StageFailure.of("focal-against-images", advice, len(trials), wide)
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         costs = np.array([_model.truncated_cost(m, gate) for m in models])
         model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
-        model, adjustment = with_best_lens(model, adjustment)
+        model, adjustment = _lens.with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
         model, adjustment, finished = _finished_with_decentring(model, adjustment)
@@ -133,7 +130,9 @@ def _assess(
     )
     intervals = _uncertainty.widen_by_camera_model(intervals, (deviations.focal, 0.0), 1.0)
     angles = _uncertainty.with_angles_of_view(model, uncertainty, scatter, intervals)
-    if undetermined_lens(model, angles, motion) or (critical and reach_of_points(model) < MIN_REACH):
+    if _lens.undetermined_lens(model, angles, motion) or (
+        critical and _lens.reach_of_points(model) < _lens.MIN_REACH
+    ):
         # Near the centre of the images the effect of distortion is as small as other errors.
         expected = _uncertainty.changes_by_expected_lens(model, adjustment, uncertainty)
         intervals = _uncertainty.widen_by_camera_model(intervals, expected, 1.0)
@@ -144,29 +143,25 @@ def _assess(
     model = complete
     checked = self_check(model, calibration.K, intervals, sigmas=LATE_SIGMAS)
     # An enlarged camera model replaces the prior that the images contradicted; pairs know a lens only nearly.
-    start = [] if enlarged or adjustment.prior.lens is not None else _contradiction(calibration)
-    failed_checks = [*([] if report.identifiable else report.sentences), *start, *checked.failed]
+    failed_checks = list(() if report.identifiable else report.sentences)
+    before = calibration.identifiability
+    if before is not None and before.prior_contradicted and not enlarged and adjustment.prior.lens is None:
+        count = counted(int((calibration.K[:, 0, 0] > 0.0).sum()), "image")
+        why = identifiability.excess_noise(before.evidence)
+        failed_checks.append(Notice("start-contradicts-prior", count, why))
+    failed_checks += checked.failed
     failed_checks += [*_shared_camera.contradicted_focal_priors(model, adjustment), *sharing.failed_checks]
     failed_checks += _shared_camera.inconsistent_principal_point(model, adjustment, scatter)
     if deviations.focal > _adjustment.MAX_CHANGE:
         failed_checks.append(Notice("focal-by-camera-model", deviations.focal))
     views = np.flatnonzero(model.registered).tolist()
     warnings = shrinkage.warnings(views, 0.1 / 1.96) + sharing.warnings
-    warnings += undetermined_lens(model, intervals, motion) + deviations.warnings
+    warnings += _lens.undetermined_lens(model, intervals, motion) + deviations.warnings
     result = records.MetricResult(
         as_reconstruction(model, reasons), tuple(intervals), checked.numbers, not failed_checks,
         tuple(failed_checks), warnings, enlarged, report, poses,
     )  # fmt: skip
     return result, checked.doubtful
-
-
-def _contradiction(calibration: records.SelfCalibration) -> list[str]:
-    """A sentence if the images contradicted the prior of the intrinsics in self-calibration."""
-    report = calibration.identifiability
-    if report is None or not report.prior_contradicted:
-        return []
-    views = counted(int((calibration.K[:, 0, 0] > 0.0).sum()), "image")
-    return [Notice("start-contradicts-prior", views, identifiability.excess_noise(report.evidence))]
 
 
 def _start(
@@ -201,14 +196,21 @@ def settle_camera_model(simple: _Finished) -> _Settled:
     chosen, sharing = simple, _shared_camera.check_shared_cameras(*simple[:2])
     square, limitations, difference = tuple[str, ...](), tuple[str, ...](), (0.0, 0.0)
     if sharing.failed_checks and not simple.adjustment.prior.std[:, _model.ASPECT].any():
-        rich = finish_metric(*_adjustment.with_free_aspect(simple.model, simple.adjustment))
+        std = simple.adjustment.prior.std.copy()
+        std[:, _model.ASPECT] = np.inf
+        rich = finish_metric(*_adjustment.with_prior(*simple[:2], replace(simple.adjustment.prior, std=std)))
         if _adjustment.remaining_cost(simple[:2], rich[:2]) < MAX_REMAINING:
             simple = chosen = rich
-            sharing, square = _shared_camera.check_shared_cameras(*rich[:2]), (_aspect_ratios(rich.model),)
+            sharing, cameras = _shared_camera.check_shared_cameras(*rich[:2]), rich.model.cameras
+            ratios = cameras.intrinsics[cameras.group[rich.model.registered], _model.ASPECT]
+            square = (Notice("pixels-not-square", ratios[np.abs(np.log(ratios)).argmax()]),)
     for columns in _adjustment.richer_models(sharing.contradicted, simple[1].prior):
         if not sharing.failed_checks:
             break
-        rich = finish_metric(*_adjustment.with_own_values(simple.model, simple.adjustment, columns))
+        shared = simple.adjustment.prior.shared.copy()
+        shared[:, columns] = np.arange(len(shared))[:, None]
+        own = replace(simple.adjustment.prior, shared=shared)
+        rich = finish_metric(*_adjustment.with_prior(*simple[:2], own))
         if _adjustment.remaining_cost(chosen[:2], rich[:2]) < MAX_REMAINING:
             chosen, sharing = rich, _shared_camera.check_shared_cameras(*rich[:2])
             limitations, difference = (_adjustment.differences_of_images(rich.model, columns),), (0.0, 0.0)
@@ -220,18 +222,11 @@ def settle_camera_model(simple: _Finished) -> _Settled:
     return chosen, sharing, (*square, *limitations), difference
 
 
-def _aspect_ratios(model: MetricEstimate) -> str:
-    """A sentence with the largest deviation of the pixels from squares."""
-    ratios = model.cameras.intrinsics[model.cameras.group[model.registered], _model.ASPECT]
-    return Notice("pixels-not-square", ratios[np.abs(np.log(ratios)).argmax()])
-
-
 def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finished:
     """Adjust everything, then again with the noise that blocks of the scene show and a hierarchical prior."""
     model = _iterate_inliers(model, adjustment)
     scatter = block_scatter(adjustment.linearised(model))
     own = _uncertainty.per_camera_estimates(model, adjustment, scatter)
-    assert model.cameras.shared is not None
     hierarchical = _uncertainty.estimate_hierarchical_prior(own, model.cameras.shared)
     # Correlated errors do not average out: without the inflation they would overrule every prior.
     adjustment = replace(adjustment, inflation=scatter.inflation)
@@ -253,7 +248,7 @@ def _finished_with_decentring(
     limit = scipy.special.chdtri(2, 1e-3)
     narrow &= adjustment.shares_a_lens(model)
     if narrow and decentring_score(finished.fit, _model.DECENTRING_STD) > limit:
-        free = with_decentring(model, adjustment)
+        free = _lens.with_decentring(model, adjustment)
         decentred = finish_metric(*free)
         if _adjustment.predicts_better(finished[:2], decentred[:2]):
             return *free, decentred
@@ -290,15 +285,6 @@ def _adjust_to_precise_points(
             break
         before = points
     return model
-
-
-def _no_candidate(prior: records.IntrinsicsPrior, tried: int) -> StageFailure:
-    if not prior.focal_known.any():
-        return StageFailure.of("no-metric-model", tried)
-    wide = float(prior.std[prior.focal_known, 0].max())
-    return StageFailure.of(
-        "focal-against-images", ", or set a larger focal_std_rel" if wide > 0.0 else "", tried, wide
-    )
 
 
 def as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> records.Reconstruction:

@@ -11,24 +11,25 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from thesisrecon.arrays import B8, F64
+from thesisrecon import records
+from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.camera import viewing_rays
 from thesisrecon.errors import UsageError
-from thesisrecon.geometry.camera_matrix import pose_of_camera
+from thesisrecon.geometry.camera_matrix import poses_of_model
 from thesisrecon.geometry.strata import estimate_similarity, transform, upgrade_points
 from thesisrecon.metric.refinement import MetricRefinement
-from thesisrecon.metric.vertical_lines import vertical_of_lines
 from thesisrecon.optimize.bundle.knowledge import PositionPrior
-from thesisrecon.records import (
-    Image,
-    IntrinsicsPrior,
-    MetricResult,
-    Reconstruction,
-    Similarity,
-    calibration_of_metric,
-)
 
 MAX_ROLL_DEG = 15.0
 """Root mean square roll of the cameras beyond which they do not tell where up is."""
+MIN_GRADIENT, MAX_WIDTH, MIN_LENGTH = 4.0, 1.4, 0.04
+"""Grey levels per pixel of an edge, px RMS across it, and its length as a share of the long side."""
+ALIGNED = np.sin(np.radians(1.0))
+"""A line is vertical if its plane with the camera centre deviates by less from the direction."""
+CONE, MIN_SHARE, MIN_IMAGES, MAX_STD_DEG = np.radians(15.0), 0.4, 3, 0.5
+"""Angle about the direction expected, share of the lines in it that agree, by length, and images with them:
+of buildings they are 0.5 to 0.7, of objects and trees below 0.3."""
+MOST = 40  # images of which edges are read
 _INLIER_SIGMAS = 3.37  # 99 % of the lengths of three-dimensional normal residuals are shorter
 
 
@@ -38,21 +39,20 @@ class Placed(NamedTuple):
     ``used`` (V,) are the positions that determined the frame, ``sigma`` is the noise of a coordinate.
     """
 
-    result: MetricResult
+    result: records.MetricResult
     residual: F64
     used: B8
     sigma: float
 
 
-def centres_of(r: Reconstruction) -> F64:
+def centres_of(r: records.Reconstruction) -> F64:
     """Camera centres (V, 3), NaN where not registered."""
-    assert r.K is not None
-    views, centres = np.flatnonzero(r.registered), np.full((len(r.P), 3), np.nan)
-    centres[views] = -np.einsum("vba,vb->va", *pose_of_camera(r.K[views], r.P[views]))
+    centres = np.full((len(r.P), 3), np.nan)
+    centres[r.registered] = poses_of_model(r, r.registered)[2]
     return centres
 
 
-def moved(result: MetricResult, move: Similarity) -> MetricResult:
+def moved(result: records.MetricResult, move: records.Similarity) -> records.MetricResult:
     """A result in another world, y = scale R x + t."""
     r, H, std = result.reconstruction, move.matrix, result.pose_std
     P = np.where(r.registered[:, None, None], move.scale * transform(H, r.P, "cameras"), 0.0)
@@ -96,21 +96,112 @@ def up_direction(R: F64) -> tuple[F64, float]:
     return (u if float(np.sum((R[:, 1] + R[:, 2]) @ u)) < 0.0 else -u), roll
 
 
-def upright(result: MetricResult, images: Sequence[Image]) -> tuple[MetricResult, dict[str, Any]]:
+def upright(
+    result: records.MetricResult, images: Sequence[records.Image]
+) -> tuple[records.MetricResult, dict[str, Any]]:
     """A result with z up by vertical lines, else by :func:`up_direction`, and how up was found."""
     r = result.reconstruction
-    assert r.K is not None
-    u, roll = up_direction(pose_of_camera(r.K[r.registered], r.P[r.registered])[0])
+    u, roll = up_direction(poses_of_model(r, r.registered)[0])
     found: dict[str, Any] = {"axes": "z up", "by": "level sides of the images", "roll_rms_deg": roll}
     if lines := vertical_of_lines(r, images, u):
         level, (u, std, count) = u, lines
         off = float(np.degrees(np.arccos(min(float(u @ level), 1.0))))
         found |= {"by": "vertical lines", "std_deg": std, "images": count, "off_level_deg": off}
     turn = scipy.spatial.transform.Rotation.align_vectors([[0.0, 0.0, 1.0]], [u])[0].as_matrix()
-    return moved(result, Similarity(1.0, turn, np.zeros(3))), found
+    return moved(result, records.Similarity(1.0, turn, np.zeros(3))), found
 
 
-def placed(result: MetricResult, positions: F64) -> Placed:
+def vertical_of_lines(
+    model: records.Reconstruction, images: Sequence[records.Image], expected: F64
+) -> tuple[F64, float, int] | None:
+    """Unit vector to which most nearly vertical lines point, its standard deviation (degrees), and images.
+
+    None if few of the lines within 15 degrees of the ``expected`` direction agree. The deviation is that of
+    the jackknife over the images, since errors of one image are common to its lines.
+    """
+    normals, weights, views = list[F64](), list[F64](), list[int]()
+    assert model.K is not None
+    here = np.flatnonzero(model.registered)
+    here = here[:: 1 + len(here) // MOST]
+    for v, R in zip(here.tolist(), poses_of_model(model, here)[0], strict=True):
+        ends = straight_edges(images[v].gray, images[v].mask)
+        lens = np.zeros(1) if model.distortion is None else model.distortion[v]
+        across = np.cross(*(viewing_rays(model.K[v], ends[:, k], lens) @ R for k in (0, 1)))
+        length = np.linalg.norm(across, axis=1)
+        near = np.abs(across @ expected) < np.sin(CONE) * length
+        normals.append(across[near] / length[near, None])
+        weights.append(length[near])
+        views += [v] * int(near.sum())
+    if len(views) < 10 or len(set(views)) < MIN_IMAGES:
+        return None
+    n, w, view = np.concatenate(normals), np.concatenate(weights), np.array(views)
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, len(n), 4000)
+    second = (first + rng.integers(1, len(n), 4000)) % len(n)
+    c = np.cross(n[first], n[second])
+    length = np.linalg.norm(c, axis=1)
+    c = c[(length > ALIGNED) & (np.abs(c @ expected) > np.cos(CONE) * length)]
+    c /= np.linalg.norm(c, axis=1, keepdims=True)
+    if not len(c):
+        return None
+    u = c[int(((np.abs(c @ n.T) < ALIGNED) @ w).argmax())]
+
+    def refined(keep: B8) -> F64:
+        one = u
+        for _ in range(10):
+            off = np.abs(n[keep] @ one)
+            weight = w[keep] * (off < 2.0 * ALIGNED) / np.maximum(off, 0.2 * ALIGNED)
+            one = np.linalg.eigh(np.einsum("vi,v,vj->ij", n[keep], weight, n[keep]))[1][:, 0]
+        return np.asarray(one * np.sign(one @ expected))
+
+    u = refined(np.ones(len(n), bool))
+    agree = np.abs(n @ u) < ALIGNED
+    seen = np.unique(view[agree])
+    if w[agree].sum() < MIN_SHARE * w.sum() or len(seen) < MIN_IMAGES:
+        return None
+    without = np.array([refined(view != v) for v in seen])
+    spread = np.sum((without - without.mean(axis=0)) ** 2) * (len(seen) - 1) / len(seen)
+    std = float(np.degrees(np.sqrt(spread)))
+    return (u, std, len(seen)) if std < MAX_STD_DEG else None
+
+
+def straight_edges(gray: F32, mask: B8 | None = None) -> F64:
+    """End points (N, 2, 2) of straight edges: regions of one gradient direction that are long and thin."""
+    smooth = scipy.ndimage.gaussian_filter(gray.astype(np.float64), 1.0)
+    gy, gx = np.gradient(smooth)
+    strength, found = np.hypot(gx, gy), list[F64]()
+    strong = strength > MIN_GRADIENT
+    if mask is not None:
+        strong &= scipy.ndimage.binary_erosion(mask, iterations=3)
+    # Two sets of directions: those at the border of one are in the middle of the other.
+    for shift in (0.0, 0.5):
+        sector = (np.arctan2(gy, gx) * (8.0 / np.pi) + shift) // 1.0 % 16.0
+        label, count = np.zeros(gray.shape, np.int64), 0
+        for k in range(16):
+            part, number = scipy.ndimage.label(strong & (sector == k), np.ones((3, 3)))
+            label += np.where(part > 0, part + count, 0)
+            count += number
+        row, column = np.nonzero(label > 0)
+        own, weight = label[row, column] - 1, strength[row, column]
+        total = np.bincount(own, weight, count)
+
+        def mean(x: F64 | I64) -> F64:
+            return np.bincount(own, weight * x, count) / total  # noqa: B023
+
+        middle = np.column_stack([mean(column), mean(row)])
+        dx, dy = column - middle[own, 0], row - middle[own, 1]
+        xx, xy, yy = mean(dx * dx), mean(dx * dy), mean(dy * dy)
+        angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+        c, s = np.cos(angle), np.sin(angle)
+        along, each = dx * c[own] + dy * s[own], np.arange(count)
+        ends = np.column_stack([getattr(scipy.ndimage, f)(along, own, each) for f in ("minimum", "maximum")])
+        straight = yy * c**2 + xx * s**2 - 2.0 * xy * c * s < MAX_WIDTH**2
+        long = straight & (np.ptp(ends, axis=1) > MIN_LENGTH * max(gray.shape))
+        found.append((middle[:, None] + ends[:, :, None] * np.column_stack([c, s])[:, None])[long])
+    return np.concatenate(found)
+
+
+def placed(result: records.MetricResult, positions: F64) -> Placed:
     """Move a result to the positions (V, 3) of its cameras, NaN: unknown; ``UsageError`` if impossible."""
     centres = centres_of(result.reconstruction)
     known = np.isfinite(positions).all(axis=1) & result.reconstruction.registered
@@ -126,7 +217,7 @@ def placed(result: MetricResult, positions: F64) -> Placed:
 
 
 def constrained(
-    found: Placed, positions: F64, std: float, *, refiner: MetricRefinement, prior: IntrinsicsPrior,
+    found: Placed, positions: F64, std: float, *, refiner: MetricRefinement, prior: records.IntrinsicsPrior,
     rng: np.random.Generator, threads: int = 1,
 ) -> Placed:  # fmt: skip
     """Adjust a placed result again, with the positions that it used as observations of deviation ``std``.
@@ -136,15 +227,15 @@ def constrained(
     r = found.result.reconstruction
     assert r.K is not None
     spread = upgrade_points(r.X, r.valid, np.eye(4))[2]
-    unit = moved(found.result, Similarity.scaling(1.0 / spread)).reconstruction
-    start = calibration_of_metric(r.K, "positions")
+    unit = moved(found.result, records.Similarity.scaling(1.0 / spread)).reconstruction
+    start = records.calibration_of_metric(r.K, "positions")
     # Positions that a domed model contradicts may be right.
     for _ in range(3):
         index = np.flatnonzero(found.used)
         roots = np.tile(np.eye(3) * spread / std, (len(index), 1, 1))
         centres = PositionPrior(index, positions[index] / spread, roots)
         result = refiner.refine(unit, start, prior=prior, rng=rng, threads=threads, centres=centres)
-        result = moved(result, Similarity.scaling(spread))
+        result = moved(result, records.Similarity.scaling(spread))
         residual = centres_of(result.reconstruction) - positions
         used = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf) < _INLIER_SIGMAS * std
         before, found = found.used, Placed(result, residual, used | found.used, found.sigma)
@@ -164,13 +255,13 @@ def require_width(points: F64, what: str, sigma: float) -> None:
         )
 
 
-def robust_similarity(source: F64, target: F64, seed: int) -> tuple[Similarity, B8, float]:
+def robust_similarity(source: F64, target: F64, seed: int) -> tuple[records.Similarity, B8, float]:
     """Similarity, inliers and noise of one coordinate."""
     n = len(source)
     # Residuals below are rounding.
     floor = 1e-9 * float(np.linalg.norm(target - target.mean(axis=0), axis=1).max())
 
-    def distances(found: Similarity) -> F64:
+    def distances(found: records.Similarity) -> F64:
         return np.asarray(np.linalg.norm(found.apply(source) - target, axis=1))
 
     # A triple fits itself, so that the quantile of Rousseeuw counts three positions more than half.

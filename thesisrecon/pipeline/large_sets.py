@@ -7,7 +7,7 @@ Parts are independent tasks. Wrong matches between two similar places cannot def
 one of them, and a part that fails does not affect the others: its images are registered after the alignment.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice, product
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig, SelfCalibrator
 from thesisrecon.errors import StageFailure
+from thesisrecon.geometry.camera_matrix import poses_of_model
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.lens import stacked_rows
@@ -318,7 +319,9 @@ def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
     both = a.model.registered[va] & b.model.registered[vb]
     if both.sum() < MIN_COMMON:
         return 0, _IDENTITY
-    found = _similarity_of_cameras(*_poses(a.model, va[both]), *_poses(b.model, vb[both]))
+    Ra, _, Ca = poses_of_model(a.model, va[both])
+    Rb, _, Cb = poses_of_model(b.model, vb[both])
+    found = _similarity_of_cameras(Ra, Ca, Rb, Cb)
     _, pa, pb = np.intersect1d(a.points, b.points, return_indices=True)
     t, view_of = a.model.tracks, np.full(a.model.tracks.n_points, -1)
     view_of[t.point_index[a.model.inlier][::-1]] = t.view_index[a.model.inlier][::-1]
@@ -333,13 +336,6 @@ def _align_part(a: _Part, b: _Part) -> tuple[int, Similarity]:
         offset = xy[0] - xy[1]
     close = np.linalg.norm(offset, axis=1) < MAX_OFFSET_REL * a.model.sizes[view].max(axis=1)
     return (int(close.sum()), found) if close.mean() >= MIN_AGREEMENT else (0, _IDENTITY)
-
-
-def _poses(model: Reconstruction, views: I64) -> tuple[F64, F64]:
-    """Rotations (N, 3, 3) and centres (N, 3)."""
-    assert model.K is not None
-    M = np.linalg.inv(model.K[views]) @ model.P[views]
-    return M[:, :, :3], -np.einsum("nji,nj->ni", M[:, :, :3], M[:, :, 3])
 
 
 def _similarity_of_cameras(Ra: F64, Ca: F64, Rb: F64, Cb: F64) -> Similarity:
@@ -364,53 +360,42 @@ def _in_one_frame(
     tracks: Tracks, sizes: I64, own: Sequence[I64], placed: dict[int, tuple[_Part, Similarity]]
 ) -> Reconstruction:
     """Cameras and points of the placed parts; inliers agree with their part and with the whole."""
-    registered, R, C, K, distortion = _cameras_in_one_frame(tracks.n_views, own, placed)
-    X, support, seen = _points_in_one_frame(tracks, placed.values())
-    t, f = -np.einsum("vij,vj->vi", R, C), np.where(registered, K[:, 0, 0], 1.0)
-    intrinsics = np.column_stack([K[:, 0, 0], K[:, 1, 1] / f, K[:, 0, 1:], K[:, 1, 2], distortion])
-    cameras = MetricModel(R, t, intrinsics, np.arange(tracks.n_views), np.ascontiguousarray(X[:, :3]))
-    k = np.flatnonzero(seen & registered[tracks.view_index])
-    view, point = tracks.view_index[k], tracks.point_index[k]
-    offset = np.linalg.norm(image_points(cameras, view, point)[0] - tracks.xy[k], axis=1)
-    inlier = np.zeros(len(tracks.xy), dtype=bool)
-    inlier[k] = np.nan_to_num(offset, nan=np.inf) < MAX_OFFSET_REL * sizes[view].max(axis=1)
-    valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=tracks.n_points) >= 2)
-    return Reconstruction(
-        "metric", compose_camera(K, R, t), X, registered, valid, inlier & valid[tracks.point_index], tracks,
-        sizes, sigma_px=float(np.median([part.model.sigma_px for part, _ in placed.values()])),
-        reasons=("",) * tracks.n_views, K=K, distortion=distortion,
-    )  # fmt: skip
-
-
-def _cameras_in_one_frame(
-    n_views: int, own: Sequence[I64], placed: dict[int, tuple[_Part, Similarity]]
-) -> tuple[B8, F64, F64, F64, F64]:
-    """Registered views (V,), R, centres, K and distortion, if possible from the part that owns the view."""
-    registered, R, K = np.zeros(n_views, dtype=bool), np.zeros((n_views, 3, 3)), np.zeros((n_views, 3, 3))
-    C, lenses = np.zeros((n_views, 3)), [np.zeros(3)] * n_views
+    n, m = tracks.n_views, tracks.n_points
+    registered, (R, K), C = np.zeros(n, dtype=bool), np.zeros((2, n, 3, 3)), np.zeros((n, 3))
+    lenses = [np.zeros(3)] * n
+    # Cameras of the part that owns the view, if possible.
     for inner, (p, (part, similarity)) in product((True, False), placed.items()):
         model = part.model
         free = model.registered & ~registered[part.views] & (np.isin(part.views, own[p]) | (not inner))
         views = part.views[free]
-        turned, centres = _poses(model, np.flatnonzero(free))
+        turned, _, centres = poses_of_model(model, free)
         assert model.K is not None
         R[views], C[views], K[views] = turned @ similarity.R.T, similarity.apply(centres), model.K[free]
         if model.distortion is not None:
             for view, lens in zip(views.tolist(), model.distortion[free], strict=True):
                 lenses[view] = lens
         registered[views] = True
-    return registered, R, C, K, stacked_rows(lenses)
-
-
-def _points_in_one_frame(tracks: Tracks, placed: Iterable[tuple[_Part, Similarity]]) -> tuple[F64, I64, B8]:
-    """Points (M, 4) of the part with most inliers, their numbers of inliers, and inliers (K,) of any part."""
-    m = tracks.n_points
+    distortion = stacked_rows(lenses)
+    # Points of the part with most inliers.
     X, support, seen = np.zeros((m, 4)), np.zeros(m, np.int64), np.zeros(len(tracks.xy), dtype=bool)
-    for part, similarity in placed:
+    for part, similarity in placed.values():
         points, model = part.points, part.model
         seen[part.rows[model.inlier]] = True
         count = np.bincount(model.tracks.point_index[model.inlier], minlength=len(points))
         better = model.valid & (count > support[points])
         X[points[better]] = homogenize(similarity.apply(model.X[better, :3] / model.X[better, 3:]))
         support[points[better]] = count[better]
-    return X, support, seen
+    t, f = -np.einsum("vij,vj->vi", R, C), np.where(registered, K[:, 0, 0], 1.0)
+    intrinsics = np.column_stack([K[:, 0, 0], K[:, 1, 1] / f, K[:, 0, 1:], K[:, 1, 2], distortion])
+    cameras = MetricModel(R, t, intrinsics, np.arange(n), np.ascontiguousarray(X[:, :3]))
+    k = np.flatnonzero(seen & registered[tracks.view_index])
+    view, point = tracks.view_index[k], tracks.point_index[k]
+    offset = np.linalg.norm(image_points(cameras, view, point)[0] - tracks.xy[k], axis=1)
+    inlier = np.zeros(len(tracks.xy), dtype=bool)
+    inlier[k] = np.nan_to_num(offset, nan=np.inf) < MAX_OFFSET_REL * sizes[view].max(axis=1)
+    valid = (support > 0) & (np.bincount(tracks.point_index[inlier], minlength=m) >= 2)
+    return Reconstruction(
+        "metric", compose_camera(K, R, t), X, registered, valid, inlier & valid[tracks.point_index], tracks,
+        sizes, sigma_px=float(np.median([part.model.sigma_px for part, _ in placed.values()])),
+        reasons=("",) * n, K=K, distortion=distortion,
+    )  # fmt: skip

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, counted
 from thesisrecon.geometry.camera_matrix import camera_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
@@ -33,7 +32,8 @@ def next_photographs(
     joined = [p for p in accepted if here[p.i] and here[p.j]]
     if not joined or here.all():
         return
-    angles = [_angle_deg(C[[p.i, p.j]] - middle[p.i]) for p in joined]
+    a, b = np.array([C[[p.i, p.j]] - middle[p.i] for p in joined]).swapaxes(0, 1)
+    angles = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("pi,pi->p", a, b)))
     usual = np.quantile([p.inliers for p in joined], 0.1)
     label = connected_groups(len(here), [(p.i, p.j) for p in accepted if not (here[p.i] or here[p.j])])
     chance = np.median([p.inliers for p in pairs if not p.accepted] or [0])
@@ -56,8 +56,3 @@ def next_photographs(
         most = np.quantile(angles, 0.95)
         count = counted(int(inside.sum()), "image")
         yield Notice("photograph-next", count, first, second, float(np.median(angles)), why, most)
-
-
-def _angle_deg(rays: F64) -> float:
-    a, b = rays
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

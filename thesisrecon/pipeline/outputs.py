@@ -75,9 +75,18 @@ def with_image_names(result: RunResult) -> RunResult:
 
 
 def _described(run: Run, result: RunResult, until: str, failure: StageFailure | None) -> RunResult:
-    warnings, reports = (*run.warnings, *_failure_warnings(result)), tuple(run.reports.values())
-    text = "" if failure is None else str(failure)
-    result = replace(result, warnings=warnings, reports=reports, failure=text)
+    metric, calibration, warnings = result.metric, result.calibration, list(run.warnings)
+    own = () if metric is None or metric.trusted else tuple(dict.fromkeys(metric.failed_checks))
+    if metric is not None and not metric.trusted:
+        warnings.append(Notice("failed-self-check", "; ".join(own)))
+    tested = metric is not None and metric.identifiability is not None
+    if calibration is not None and not calibration.identifiable and not tested:
+        # The self-check may repeat the reasons of its calibration.
+        rest = [reason for reason in dict.fromkeys(calibration.reasons) if reason not in own]
+        if rest or not own:
+            warnings.append(Notice("undetermined-calibration", "; ".join(rest)))
+    reports, text = tuple(run.reports.values()), "" if failure is None else str(failure)
+    result = replace(result, warnings=tuple(warnings), reports=reports, failure=text)
     return replace(result, summary=summarize(result) | _run_facts(run, until))
 
 
@@ -85,11 +94,19 @@ def _write(run: Run, result: RunResult, until: str, failure: StageFailure | None
     """Write the records and the summary, then files and page, each on its own, and the summary again."""
     out, config = run.directory.path, toml_from_config(run.config)
     result = _described(run, result, until, failure)
+
+    def coarse_model() -> TexturedMesh | None:
+        if result.mesh is None:
+            return None
+        threads = max(run.workers.threads - 1, 1)
+        coarse = reduce_faces(result.mesh, PAGE_FACES, threads=threads)
+        return texture_mesh(coarse, result.views, max_texels=PAGE_TEXELS, threads=threads)
+
     _write_records(run.directory, result)
     write_text(out / CONFIG, config)
     with run.clock("outputs"), ThreadPool(1) as beside:
         # The file of the model is written while that of the page is made.
-        for_page = beside.submit(_model_for_page, result, max(run.workers.threads - 1, 1))
+        for_page = beside.submit(coarse_model)
         if run.workers.threads == 1:
             wait([for_page])
         max_mb = getattr(run.config.model, "max_glb_mb", SurfaceModel.max_glb_mb)
@@ -189,21 +206,6 @@ def _write_exports(
     return colors, warnings + _write_surface(directory, result, max_mb, threads)
 
 
-def _failure_warnings(result: RunResult) -> list[str]:
-    """Warnings that the result is not trusted or the calibration not identifiable."""
-    metric, calibration, warnings = result.metric, result.calibration, list[str]()
-    own = () if metric is None or metric.trusted else tuple(dict.fromkeys(metric.failed_checks))
-    if metric is not None and not metric.trusted:
-        warnings.append(Notice("failed-self-check", "; ".join(own)))
-    tested = metric is not None and metric.identifiability is not None
-    if calibration is not None and not calibration.identifiable and not tested:
-        # The self-check may repeat the reasons of its calibration.
-        rest = [reason for reason in dict.fromkeys(calibration.reasons) if reason not in own]
-        if rest or not own:
-            warnings.append(Notice("undetermined-calibration", "; ".join(rest)))
-    return warnings
-
-
 def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warnings: list[str]) -> None:
     """Write ``sparse/0`` in original pixels, all of it or nothing; add warnings."""
     images, metric = result.images, result.metric
@@ -253,13 +255,6 @@ def _peak_memory_mb() -> float | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
-
-
-def _model_for_page(result: RunResult, threads: int) -> TexturedMesh | None:
-    if result.mesh is None:
-        return None
-    coarse = reduce_faces(result.mesh, PAGE_FACES, threads=threads)
-    return texture_mesh(coarse, result.views, max_texels=PAGE_TEXELS, threads=threads)
 
 
 def _thinned_maps(result: RunResult) -> dict[int, F32]:

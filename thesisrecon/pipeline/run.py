@@ -370,7 +370,11 @@ def run_position(folder: Path) -> str:
     content = read_json(folder / _run_folder.RUN_FILE)
     if not isinstance(content, dict):
         return ""
-    stage, done = _latest_stage(folder)
+    # The last stage that was written to; older records belong to a replaced run and were not reused.
+    started, (stage, done) = (folder / _run_folder.RUN_FILE).stat().st_mtime, ("images", 0)
+    for one, name in FOLDERS.items():
+        if items := sum(path.stat().st_mtime >= started for path in (folder / name).glob("*.npz")):
+            stage, done = one, items
     total = len(content.get("images", ())) if stage == "features" else 0
     if stage == "matches":
         pairs = _run_folder.StageFolder(folder / FOLDERS["pairs"])
@@ -381,13 +385,3 @@ def run_position(folder: Path) -> str:
         where = f"{stage}, {done} of {total} done" if done < total else f"{stage} is done"
     running = _run_folder.is_running(folder)
     return f"running: {where}" if running else f"interrupted: {where}; repeat the command to resume"
-
-
-def _latest_stage(folder: Path) -> tuple[str, int]:
-    """The last stage that was written to, and the number of its items."""
-    started, found = (folder / _run_folder.RUN_FILE).stat().st_mtime, ("images", 0)
-    for stage, name in FOLDERS.items():
-        # Older records belong to a replaced run and were not reused.
-        if items := sum(path.stat().st_mtime >= started for path in (folder / name).glob("*.npz")):
-            found = stage, items
-    return found

@@ -143,19 +143,20 @@ def metric_in_world(job: Job, metric: MetricResult, attempt: int) -> MetricResul
     keys = [key for name, key in run.logs["metric"].keys.items() if name.startswith(f"attempt-{attempt}")]
     code, options = code_digest(placed, constrained, upright), [images.gps, images.gps_std_m, images.up]
     key = run.key("metric", keys, job.inputs.places, options, run.variant_key("metric"), code, run.seed)
-    by = partial(_placed_by_gps, job, metric, attempt) if images.gps else partial(_upright, job, metric)
+
+    def moved() -> dict[str, Any]:
+        if images.gps:
+            return _placed_by_gps(job, metric, attempt)
+        return dict(zip(("result", "facts"), upright(metric, job.images), strict=True))
+
     try:
-        found = run.cached("metric", f"attempt-{attempt}-world", key, by)
+        found = run.cached("metric", f"attempt-{attempt}-world", key, moved)
     except UsageError as error:
         run.warnings.append(Notice("frame-unknown", error))
         return metric
     run.world = dict(found["facts"])
     result: MetricResult = found["result"]
     return result
-
-
-def _upright(job: Job, metric: MetricResult) -> dict[str, Any]:
-    return dict(zip(("result", "facts"), upright(metric, job.images), strict=True))
 
 
 def _placed_by_gps(job: Job, metric: MetricResult, attempt: int) -> dict[str, Any]:

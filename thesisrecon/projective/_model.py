@@ -333,7 +333,11 @@ def adjust_all(model: ProjectiveModel, iterations: int, sigmas: float) -> None:
         model.P, model.X, Observations(t.view_index[used], t.point_index[used], t.xy[used]),
         loss_px=LOSS_SIGMAS * model.sigma_px, max_iterations=iterations, settled=SETTLED,
     )  # fmt: skip
-    model.P, model.X = _whitened(result.P, result.X, model)
+    # A well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept.
+    frame = whitened_frame(result.X[model.valid])
+    P, X = frame.cameras(result.P), frame.points(result.X)
+    length, size = np.linalg.norm(X, axis=1, keepdims=True), np.linalg.norm(P, axis=(1, 2), keepdims=True)
+    model.P, model.X = P / np.where(size > 0, size, 1.0), X / np.where(length > 0, length, 1.0)
     norm = np.asarray(np.linalg.norm(result.residual_px, axis=1))
     # Residuals of two-view points underestimate the noise: hence the floor.
     model.sigma_px = max(noise_from_distances(norm), model.noise_floor_px)
@@ -361,15 +365,6 @@ def adjust_locally(
     )  # fmt: skip
     model.P, model.X = result.P, result.X
     retriangulate_points(model, sigmas, points=local)
-
-
-def _whitened(P: F64, X: F64, model: ProjectiveModel) -> tuple[F64, F64]:
-    """Transform to a well-conditioned frame: sum XX' = I over the valid points, unit norms, signs kept."""
-    frame = whitened_frame(X[model.valid])
-    P, X = frame.cameras(P), frame.points(X)
-    length = np.linalg.norm(X, axis=1, keepdims=True)
-    norm = np.linalg.norm(P, axis=(1, 2), keepdims=True)
-    return P / np.where(norm > 0, norm, 1.0), X / np.where(length > 0, length, 1.0)
 
 
 def to_reconstruction(model: ProjectiveModel, min_points: int) -> Reconstruction:

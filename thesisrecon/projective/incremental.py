@@ -202,33 +202,24 @@ class IncrementalProjective:
         if P is None or inlier.sum() < self.min_points or inlier.mean() < _MIN_INLIER_RATIO:
             model.reasons[view] = Notice("resection-inliers", int(inlier.sum()), counted(len(k), "point"))
             return False
-        model.deferred[view], P = self._covariance_test(model, view, P, X[inlier], xy[inlier])
-        if model.deferred[view]:
-            return False
-        model.P[view] = P
+        X, xy, loss_px = X[inlier], xy[inlier], _model.LOSS_SIGMAS * model.sigma_px
+        P, covariance = refine_camera(P, X, xy, loss_px=loss_px, iterations=20)
+        model.deferred[view] = False
+        if self.max_projection_std_rel is not None:
+            std_px = _projection_std_px(P, covariance * model.sigma_px**2, model.X[model.valid])
+            limit = self.max_projection_std_rel * float(model.sizes[view].max())
+            quantile = float(np.quantile(std_px, _STD_QUANTILE))
+            if not quantile < limit:
+                model.deferred[view] = True
+                model.reasons[view] = Notice("planar-resection", len(X), min(quantile, 1e6), limit)
+                return False
+        # Depths are positive.
+        model.P[view] = P * np.sign(np.median(X @ P[2]))
         model.registered[view] = True
         model.reasons[view] = ""
         seen = np.bincount(t.point_index[t.view_index == view], minlength=t.n_points) > 0
         _model.retriangulate_points(model, early, points=seen)
         return True
-
-    def _covariance_test(
-        self, model: ProjectiveModel, view: int, P: F64, X: F64, xy: F64
-    ) -> tuple[bool, F64]:
-        """Return whether to defer the camera, and the refined camera with positive depths."""
-        refined, covariance = refine_camera(
-            P, X, xy, loss_px=_model.LOSS_SIGMAS * model.sigma_px, iterations=20
-        )
-        P = refined * np.sign(np.median(X @ refined[2]))
-        if self.max_projection_std_rel is None:
-            return False, P
-        std_px = _projection_std_px(refined, covariance * model.sigma_px**2, model.X[model.valid])
-        limit = self.max_projection_std_rel * float(model.sizes[view].max())
-        quantile = float(np.quantile(std_px, _STD_QUANTILE))
-        if quantile < limit:
-            return False, P
-        model.reasons[view] = Notice("planar-resection", len(X), min(quantile, 1e6), limit)
-        return True, P
 
     def _discard_camera(self, model: ProjectiveModel, pairs: Sequence[TwoView]) -> bool:
         """Remove a wrong camera permanently; False if none is wrong or only two are left."""

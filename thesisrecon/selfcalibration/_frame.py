@@ -10,6 +10,7 @@ import numpy as np
 from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import pixel_from_unit
+from thesisrecon.optimize.bundle.projection import calibrations
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.records import IntrinsicsPrior, Reconstruction
 
@@ -88,12 +89,6 @@ def build_frame(reconstruction: Reconstruction, prior: IntrinsicsPrior, unit: F6
     Q[:, :, 3] /= max(baseline, 1e-12)
     group = np.unique(prior.group[views], return_inverse=True)[1].astype(np.int64)
     back = np.linalg.inv(projective_from_reference)
-    focals = _focal_prior(prior, group, views, unit)
-    return ReferenceFrame(Q[:, :, :3], Q[:, :, 3], views, place, group, unit, back, *focals, prior)
-
-
-def _focal_prior(prior: IntrinsicsPrior, group: I64, views: I64, unit: F64) -> tuple[F64, F64]:
-    """Return mean and standard deviation (G,) of the log focal lengths, NaN and inf where unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         log_f = np.log(prior.mean[views, 0] / unit[views, 0, 0])
     mean, std = np.full(group.max() + 1, np.nan), np.full(group.max() + 1, np.inf)
@@ -102,7 +97,7 @@ def _focal_prior(prior: IntrinsicsPrior, group: I64, views: I64, unit: F64) -> t
         if mine.any():
             mean[g] = np.median(log_f[mine])
             std[g] = max(float(np.median(prior.std[views[mine], 0])), _KNOWN_FOCAL_STD)
-    return mean, std
+    return ReferenceFrame(Q[:, :, :3], Q[:, :, 3], views, place, group, unit, back, mean, std, prior)
 
 
 def require_cameras_of_full_rank(P: F64) -> None:
@@ -171,12 +166,8 @@ class SolverUnknowns:
         values = np.repeat(self.known[None], len(unknowns), axis=0)
         free = self.index >= 0
         values[:, free] = unknowns[:, self.index[free]]
-        K = np.zeros((*values.shape[:2], 3, 3))
-        K[..., 0, 0] = np.exp(np.clip(values[..., 0], -12.0, 12.0))
-        K[..., 1, 1] = K[..., 0, 0] * np.exp(np.clip(values[..., 1], -3.0, 3.0))
-        K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = values[..., 2], values[..., 3], values[..., 4]
-        K[..., 2, 2] = 1.0
-        return K
+        values[..., :2] = np.exp(np.clip(values[..., :2], (-12.0, -3.0), (12.0, 3.0)))
+        return calibrations(values)
 
     def calibration_std(self, unknowns: F64, covariance: F64) -> F64:
         """Propagate a covariance (D, D) of unknowns (D,) to the entries of K (R, 3, 3), to first order."""
@@ -207,22 +198,6 @@ class SolverUnknowns:
 
 def solver_unknowns(frame: ReferenceFrame, prior: IntrinsicsPrior) -> SolverUnknowns:
     """Derive the unknowns of the registered cameras from the prior: std 0 makes a value known."""
-    mean, std = _unit_free(frame, prior)
-    index = np.full(mean.shape, -1, dtype=np.int64)
-    means: list[float] = []
-    stds: list[float] = []
-    for column in range(_N_INTRINSICS):
-        shared = prior.shared[frame.views, column]
-        for number in np.unique(shared[std[:, column] > 0.0]):
-            rows = np.flatnonzero((shared == number) & (std[:, column] > 0.0))
-            index[rows, column] = len(means)
-            means.append(float(mean[rows[0], column]))
-            stds.append(float(std[rows[0], column]))
-    return SolverUnknowns(index, mean, np.array(means), np.array(stds))
-
-
-def _unit_free(frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]:
-    """Return the prior means and standard deviations (R, 5) in the coordinates of the frame."""
     rows, unit = frame.views, frame.pixel_from_unit[frame.views]
     mean, std = np.zeros((len(rows), _N_INTRINSICS)), prior.std[rows, :_N_INTRINSICS].copy()
     focal = prior.mean[rows, 0]
@@ -231,10 +206,19 @@ def _unit_free(frame: ReferenceFrame, prior: IntrinsicsPrior) -> tuple[F64, F64]
     std[unknown, 0] = np.inf
     std[:, 1] /= prior.mean[rows, 1]
     mean[:, 2] = prior.mean[rows, 2] / unit[:, 0, 0]
-    std[:, 2] /= unit[:, 0, 0]
-    std[:, 3] /= unit[:, 0, 0]
+    std[:, 2:4] /= unit[:, :1, 0]
     std[:, 4] /= unit[:, 1, 1]
-    return mean, std
+    index = np.full(mean.shape, -1, dtype=np.int64)
+    means: list[float] = []
+    stds: list[float] = []
+    for column in range(_N_INTRINSICS):
+        shared = prior.shared[rows, column]
+        for number in np.unique(shared[std[:, column] > 0.0]):
+            those = np.flatnonzero((shared == number) & (std[:, column] > 0.0))
+            index[those, column] = len(means)
+            means.append(float(mean[those[0], column]))
+            stds.append(float(std[those[0], column]))
+    return SolverUnknowns(index, mean, np.array(means), np.array(stds))
 
 
 @dataclass(frozen=True)

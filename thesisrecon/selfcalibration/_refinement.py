@@ -17,20 +17,13 @@ SCALE = 0.05  #: distance from a scaled rotation beyond which the loss is linear
 FOCAL_LOG_MEAN, FOCAL_WEIGHT = 0.2, 2e-3
 """Weak prior of an unknown focal length: mean of its logarithm, and weight."""
 GIVEN_WEIGHT = 0.01  #: weight of a given focal length in units of its standard deviation
-UPPER = np.triu_indices(3)
-ENTRY_WEIGHT = np.where(UPPER[0] == UPPER[1], 1.0, np.sqrt(2.0))
+_UPPER = np.triu_indices(3)
+ENTRY_WEIGHT = np.where(_UPPER[0] == _UPPER[1], 1.0, np.sqrt(2.0))
 
 
 def _weighted_entries(M: F64) -> F64:
     """Return the upper triangles (..., 6) of symmetric matrices, whose norm is the Frobenius norm."""
-    return np.asarray(M[..., UPPER[0], UPPER[1]] * ENTRY_WEIGHT, dtype=np.float64)
-
-
-def quadratic_rows(x: F64, y: F64) -> F64:
-    """Return rows (..., n (n + 1) / 2) with r . q = x' Q y for the upper triangle q of a symmetric Q."""
-    pairs = zip(*np.triu_indices(x.shape[-1]), strict=True)
-    terms = [x[..., a] * y[..., b] + (x[..., b] * y[..., a] if a != b else 0.0) for a, b in pairs]
-    return np.stack(terms, axis=-1)
+    return np.asarray(M[..., *_UPPER] * ENTRY_WEIGHT, dtype=np.float64)
 
 
 def dual_image_residuals(frame: ReferenceFrame, K: F64, planes: F64) -> F64:
@@ -95,9 +88,14 @@ def minimize_batch(
     damping: float = 1e-2, decrease: float = 6.0, max_damping: float = 1e10, tolerance: float = 1e-14,
 ) -> tuple[F64, F64]:  # fmt: skip
     """Levenberg-Marquardt on all rows of x (B, D) until every row has finished; minima and costs (B,)."""
+
     # `residuals` maps (B, D) to (B, M) row by row, `loss` these to costs and weights, by default means of
-    # soft-L1 losses.
-    loss = loss or (lambda r: _mean_loss(r, loss_scale))
+    # soft-L1 losses, inf where NaN.
+    def mean_loss(r: F64) -> tuple[F64, F64]:
+        losses, weight = (r**2, np.ones_like(r)) if np.isinf(loss_scale) else soft_l1(r**2, loss_scale)
+        return np.nan_to_num(losses.mean(axis=1), nan=np.inf), weight
+
+    loss = loss or mean_loss
     cost, damped = loss(residuals(x))[0], np.full(len(x), damping)
     for _ in range(iterations):
         r, J = residuals(x), central_differences(residuals, x)
@@ -115,12 +113,6 @@ def minimize_batch(
         if (finished | (damped > max_damping)).all():
             break
     return x, cost
-
-
-def _mean_loss(r: F64, scale: float) -> tuple[F64, F64]:
-    """Means (B,) of the soft-L1 losses of residuals (B, M), inf where NaN, and their weights."""
-    losses, weight = (r**2, np.ones_like(r)) if np.isinf(scale) else soft_l1(r**2, scale)
-    return np.nan_to_num(losses.mean(axis=1), nan=np.inf), weight
 
 
 def refine_hypotheses(frame: ReferenceFrame, theta: F64, *, planes_only: bool = False) -> tuple[F64, F64]:

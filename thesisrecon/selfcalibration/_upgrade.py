@@ -12,14 +12,13 @@ import numpy as np
 
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
-from thesisrecon.geometry.camera_matrix import calibration_matrix
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.relative_pose import pose_in_front
 from thesisrecon.geometry.strata import upgrade_cameras, upgrade_points
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.optimize.bundle import identifiability
 from thesisrecon.optimize.bundle.identifiability import CalibrationProblem
-from thesisrecon.optimize.bundle.projection import MetricCameras, Observations
+from thesisrecon.optimize.bundle.projection import MetricCameras, Observations, calibrations
 from thesisrecon.optimize.least_squares import noise_from_distances
 from thesisrecon.records import (
     IdentifiabilityReport,
@@ -92,9 +91,7 @@ def calibration_of_two_views(
     if len(views) != 2 or not prior.focal_known[views].all():
         return None
     K = np.zeros((len(prior.mean), 3, 3))
-    K[views] = [
-        calibration_matrix(f, aspect * f, x, y, skew=skew) for f, aspect, skew, x, y, *_ in prior.mean[views]
-    ]
+    K[views] = calibrations(prior.mean[views])
     P = np.linalg.solve(K[views], reconstruction.P[views])
     x1, x2 = (reconstruction.X[reconstruction.valid] @ camera.T for camera in P)
     R, t, _ = pose_in_front(fundamental_from_cameras(*P), *(x / x[:, 2:] for x in (x1, x2)))
@@ -148,7 +145,12 @@ def _bundle_problem(
     T, X = T / spread, X / spread
     t, index = reconstruction.tracks, _usable_observations(reconstruction, R, T, X, usable)
     total = len(index)
-    index = index[_subsample(t.point_index[index])]
+    if total > _MAX_OBSERVATIONS:
+        # Every k-th track by length rather than the longest ones, which may lie in one corner of the scene.
+        numbers, lengths = np.unique(t.point_index[index], return_counts=True)
+        order = numbers[np.argsort(-lengths, kind="stable")]
+        count = min(int(len(order) * _MAX_OBSERVATIONS / total) + 1, len(order))
+        index = index[np.isin(t.point_index[index], order[np.arange(count) * len(order) // count])]
     seen = np.isin(views, t.view_index[index])
     if len(index) < 4 * len(views) + 20 or seen.sum() < 3:
         return None
@@ -190,18 +192,6 @@ def _usable_observations(reconstruction: Reconstruction, R: F64, T: F64, X: F64,
     return np.asarray(index[seen[t.point_index[index]] >= 2], dtype=np.int64)
 
 
-def _subsample(point: I64) -> I64:
-    """Return about ``_MAX_OBSERVATIONS`` places, of points spread evenly over track length."""
-    if len(point) <= _MAX_OBSERVATIONS:
-        return np.arange(len(point))
-    numbers, seen = np.unique(point, return_counts=True)
-    order = numbers[np.argsort(-seen, kind="stable")]
-    # Every k-th track rather than the longest ones, which may lie in one corner of the scene.
-    count = min(int(len(order) * _MAX_OBSERVATIONS / len(point)) + 1, len(order))
-    chosen = np.arange(count) * len(order) // count
-    return np.flatnonzero(np.isin(point, order[chosen]))
-
-
 Arguments = ParamSpec("Arguments")
 
 _SAME_LOG_FOCAL = 0.03  # candidates whose log focal lengths differ by less than this are the same
@@ -241,10 +231,7 @@ def as_stage_failure(calibrate: Callable[Arguments, SelfCalibration]) -> Callabl
 
 def square_pixel_calibrations(log_f: F64) -> F64:
     """Return K = diag(f, f, 1) (..., 3, 3) of log focal lengths (...)."""
-    K = np.zeros((*np.shape(log_f), 3, 3))
-    K[..., 0, 0] = K[..., 1, 1] = np.exp(log_f)
-    K[..., 2, 2] = 1.0
-    return K
+    return np.exp(log_f)[..., None, None] * np.diag([1.0, 1.0, 0.0]) + np.diag([0.0, 0.0, 1.0])
 
 
 def group_focals_from_planes(frame: ReferenceFrame, p: F64, f_reference: F64) -> F64:
@@ -269,7 +256,11 @@ def gherardi_fusiello_planes(frame: ReferenceFrame, other: int, f_reference: F64
     K1 = np.stack([f_reference, f_reference, np.ones_like(f_reference)], axis=1)
     K2 = np.stack([f_other, f_other, np.ones_like(f_other)], axis=1)
     t = frame.a[other] / K2
-    rotation = _rotation_to_first_axis(t)
+    # Rotations with R t = (|t|, 0, 0).
+    first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+    second = np.cross(first, np.eye(3)[np.abs(first).argmin(axis=1)])
+    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-300)
+    rotation = np.stack([first, second, np.cross(first, second)], axis=1)
     W = rotation @ ((frame.A[other][None] / K2[:, :, None]) * K1[:, None, :])
     planes = []
     for sign in (1.0, -1.0):
@@ -278,15 +269,6 @@ def gherardi_fusiello_planes(frame: ReferenceFrame, other: int, f_reference: F64
         baseline = sign * np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
         planes.append(-(np.cross(w2, w3) / length - w1) / baseline / K1)
     return np.concatenate(planes)
-
-
-def _rotation_to_first_axis(t: F64) -> F64:
-    """Return rotations R (B, 3, 3) with R t = (|t|, 0, 0)."""
-    first = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-    helper = np.eye(3)[np.abs(first).argmin(axis=1)]
-    second = np.cross(first, helper)
-    second /= np.maximum(np.linalg.norm(second, axis=1, keepdims=True), 1e-300)
-    return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
 def candidates_from_parameters(frame: ReferenceFrame, theta: F64, cost: F64, method: str) -> list[Candidate]:
@@ -401,7 +383,12 @@ def _hartley_zisserman_upgrade(
     if not (np.isfinite(candidate.K).all() and np.isfinite(H).all() and abs(np.linalg.det(H)) > 1e-300):
         return None
     G = np.linalg.inv(H) @ frame.reference_from_projective
-    share = _share_in_front(reconstruction, G)
+    keep, share = reconstruction.inlier, 1.0  # cameras alone do not determine the handedness
+    if keep.any():
+        view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
+        P, X = reconstruction.P @ np.linalg.inv(G), reconstruction.X @ G.T
+        P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
+        share = float((np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0).mean())
     if share < 0.5:
         G, share = np.diag([-1.0, -1.0, -1.0, 1.0]) @ G, 1.0 - share
     if share < min_in_front_ratio:
@@ -409,16 +396,3 @@ def _hartley_zisserman_upgrade(
     K = np.zeros((len(reconstruction.P), 3, 3))
     K[frame.views] = frame.pixel_from_unit[frame.views] @ candidate.K
     return Upgrade(G, K, candidate.cost, candidate.method)
-
-
-def _share_in_front(reconstruction: Reconstruction, G: F64) -> float:
-    """Return the share of inlier observations with positive depth after the upgrade G (4, 4)."""
-    keep = reconstruction.inlier
-    if not keep.any():
-        return 1.0  # cameras alone do not determine the handedness
-    view, point = reconstruction.tracks.view_index[keep], reconstruction.tracks.point_index[keep]
-    P = reconstruction.P @ np.linalg.inv(G)
-    P *= np.where(np.linalg.det(P[:, :, :3]) < 0, -1.0, 1.0)[:, None, None]
-    X = reconstruction.X @ G.T
-    in_front = np.einsum("kj,kj->k", P[view, 2], X[point]) * X[point, 3] > 0
-    return float(in_front.mean())

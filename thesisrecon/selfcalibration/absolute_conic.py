@@ -12,32 +12,13 @@ import numpy as np
 
 from thesisrecon.arrays import F64
 from thesisrecon.errors import Notice, StageFailure
+from thesisrecon.geometry.homogeneous import quadratic_rows, symmetric
 from thesisrecon.geometry.strata import calibration_from_image
+from thesisrecon.optimize.bundle.projection import pinhole_rows
 from thesisrecon.optimize.least_squares import central_differences
 from thesisrecon.selfcalibration import _frame, _refinement
 
-_PLACE = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _REWEIGHTINGS = 4
-
-
-def dual_conic_of_constant_camera(H: F64) -> tuple[F64, F64]:
-    """Solve w* = H w* H' for w* ~ K K' of a constant K (R. Hartley, ECCV 1994), H (R, 3, 3) with det 1.
-
-    Also singular values (6,): the last is 0 for exact homographies, the fifth too for a family of w*.
-    """
-    equations = _transfer_matrix(H.swapaxes(-1, -2)) - np.eye(6)
-    _, s, Vt = np.linalg.svd(
-        (_refinement.ENTRY_WEIGHT[:, None] * equations).reshape(-1, 6), full_matrices=False
-    )
-    w = Vt[5][_PLACE]
-    return (w if np.trace(w) > 0 else -w), s
-
-
-def _transfer_matrix(M: F64) -> F64:
-    """Return the matrices (..., 6, 6) from the entries of a symmetric w to those of M' w M."""
-    return _refinement.quadratic_rows(
-        M[..., _refinement.UPPER[0]].swapaxes(-1, -2), M[..., _refinement.UPPER[1]].swapaxes(-1, -2)
-    )
 
 
 def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) -> F64:
@@ -50,7 +31,9 @@ def _conic_equations(H: F64, constraints: _frame.ConicConstraints, focals: F64) 
     bad = np.asarray(~np.isfinite(H).all(axis=(-2, -1)))
     scaled = np.where(bad[..., None, None], np.eye(3), H) / scale[..., :, None] * reference[:, None, None, :]
     det = np.linalg.det(scaled)
-    carried = _transfer_matrix(np.linalg.inv(scaled / np.cbrt(det)[..., None, None]))
+    # Matrices (B, R, 6, 6) from the entries of w to those of M' w M.
+    M, (i, j) = np.linalg.inv(scaled / np.cbrt(det)[..., None, None]), np.triu_indices(3)
+    carried = quadratic_rows(M[..., i].swapaxes(-1, -2), M[..., j].swapaxes(-1, -2))
     carried[bad] = 0.0
     std = np.repeat(constraints.std[None], len(H), axis=0)
     std[..., :3] /= focals[..., None]
@@ -110,12 +93,17 @@ def solve_conic(H: F64, constraints: _frame.ConicConstraints) -> ImageConic:
         rows = _conic_equations(H[None], constraints, focals)[0]
         back = np.array([focals[0, constraints.first[constraints.reference]]] * 2 + [1.0])
         _, s, Vt = np.linalg.svd(rows, full_matrices=False)
-        w = Vt[5][_PLACE]
+        w = symmetric(Vt[5])
         w = (w if np.trace(w) > 0 else -w) / np.outer(back, back)
         conic = ImageConic(np.asarray(w / np.linalg.norm(w)), s)
         if not conic.definite:
             break
-        focals = np.clip(_focals(H, conic.w), 0.02, 200.0)[None]
+        good = np.asarray(np.isfinite(H).all(axis=(1, 2)))
+        usable = np.asarray(np.where(good[:, None, None], H, np.eye(3)), dtype=np.float64)
+        dual = np.linalg.inv(transferred_conics(usable, conic.w))
+        centred = dual[:, [0, 1], [0, 1]] / dual[:, 2, 2, None] - (dual[:, :2, 2] / dual[:, 2, 2, None]) ** 2
+        found = np.where(good, np.sqrt(np.abs(np.prod(centred, axis=1)) ** 0.5), 1.0)
+        focals = np.clip(found, 0.02, 200.0)[None]
     return conic
 
 
@@ -125,43 +113,32 @@ def transferred_conics(H: F64, w: F64) -> F64:
     return np.asarray(inverse.swapaxes(-1, -2) @ w @ inverse)
 
 
-def _focals(H: F64, w: F64) -> F64:
-    """Return unit-free focal lengths (R,) of the transferred conics, 1 without a homography."""
-    good = np.asarray(np.isfinite(H).all(axis=(1, 2)))
-    usable = np.asarray(np.where(good[:, None, None], H, np.eye(3)), dtype=np.float64)
-    dual = np.linalg.inv(transferred_conics(usable, w))
-    centred = dual[:, [0, 1], [0, 1]] / dual[:, 2, 2, None] - (dual[:, :2, 2] / dual[:, 2, 2, None]) ** 2
-    return np.where(good, np.sqrt(np.abs(np.prod(centred, axis=1)) ** 0.5), 1.0)
-
-
 _DESCENTS = 3
 
 
 @dataclass(frozen=True)
 class LinearAbsoluteConic:
-    """Hartley's method: the image of the absolute conic by linear equations, K by Cholesky factorization.
-
-    With a constant K and no other prior the equations are w* = H w* H', else the linear constraints on w_j.
-    """
+    """Hartley's method: the image of the absolute conic by linear equations, K by Cholesky factorization."""
 
     def calibrations(self, scene: _frame.ProjectiveScene, plane: F64) -> F64:
         """Unit-free calibrations (R, 3, 3) of a plane p (3,); ``StageFailure`` without a unique conic."""
         frame, constraints = scene.frame, scene.constraints
         H = _homographies(frame, plane)
-        one_camera = bool((constraints.first == constraints.first[0]).all())
-        if one_camera and np.isinf(constraints.std).all():
-            dual, s = dual_conic_of_constant_camera(H)
-            definite = (np.linalg.eigvalsh(dual) > 0).all()
-            conic = ImageConic(np.asarray(np.linalg.inv(dual)) if definite else dual, s)
-        else:
-            conic = solve_conic(H, constraints)
+        conic = solve_conic(H, constraints)
         if not conic.determined:
             raise _undetermined_failure(frame, H, conic)
         if not conic.definite:
             values = np.linalg.eigvalsh(conic.w)
             raise StageFailure.of("imaginary-camera", values[0], values[1], values[2])
-        K = np.array([calibration_from_image(w) for w in transferred_conics(H, conic.w)])
-        return _apply_known_values(scene.unknown, K)
+        values = pinhole_rows(np.array([calibration_from_image(w) for w in transferred_conics(H, conic.w)]))
+        values[:, :2] = np.log(values[:, :2])
+        # With a known aspect, fx and fy are two measurements of one focal length; shared values are averaged.
+        unknown = scene.unknown
+        values[:, 0] += np.where(unknown.index[:, 1] < 0, (values[:, 1] - unknown.known[:, 1]) / 2.0, 0.0)
+        free = unknown.index >= 0
+        total = np.bincount(unknown.index[free], values[free], minlength=len(unknown.mean))
+        count = np.bincount(unknown.index[free], minlength=len(unknown.mean))
+        return np.asarray(unknown.calibrations((total / np.maximum(count, 1))[None])[0])
 
 
 @dataclass(frozen=True)
@@ -201,18 +178,6 @@ def _homographies(frame: _frame.ReferenceFrame, plane: F64) -> F64:
         view = frame.views[~np.isfinite(H).all(axis=(1, 2))][0]
         raise StageFailure(Notice("plane-through-camera"), f"image #{view} has no infinite homography")
     return np.asarray(H, dtype=np.float64)
-
-
-def _apply_known_values(unknown: _frame.SolverUnknowns, K: F64) -> F64:
-    """Return calibrations (R, 3, 3) with known values inserted and shared values averaged."""
-    f = K[:, 0, 0]
-    values = np.column_stack([np.log(f), np.log(K[:, 1, 1] / f), K[:, 0, 1], K[:, 0, 2], K[:, 1, 2]])
-    # With a known aspect, fx and fy are two measurements of one focal length.
-    values[:, 0] += np.where(unknown.index[:, 1] < 0, (values[:, 1] - unknown.known[:, 1]) / 2.0, 0.0)
-    free = unknown.index >= 0
-    total = np.bincount(unknown.index[free], values[free], minlength=len(unknown.mean))
-    count = np.bincount(unknown.index[free], minlength=len(unknown.mean))
-    return np.asarray(unknown.calibrations((total / np.maximum(count, 1))[None])[0])
 
 
 def _largest_rotation(H: F64) -> tuple[float, F64]:

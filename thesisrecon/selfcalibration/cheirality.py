@@ -111,12 +111,15 @@ class CheiralityRegion:
 
 def _polytope_of(X: F64, C: F64) -> Polytope | None:
     """The polytope of oriented points (N, 4) and centres (R, 4); None if empty or if all points are one."""
-    v = _deepest_plane(np.concatenate([X, C]))
+    rows = np.concatenate([X, C])
+    # The plane v with rows v >= d, |v| <= 1 and the largest d (HZ 21).
+    A, bounds = np.column_stack([-rows, np.ones(len(rows))]), [(-1, 1)] * 4 + [(None, None)]
+    deepest = scipy.optimize.linprog([0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=bounds)
     extent = np.linalg.svd(X, compute_uv=False)
-    if v is None or not extent[1] > 1e-12 * extent[0]:
+    if deepest.x is None or not deepest.x[4] > 0 or not extent[1] > 1e-12 * extent[0]:
         return None
-    T = _quasi_affine_frame(X, v)
-    rows = unit_rows(np.concatenate([X, C]) @ T.T)
+    T = _quasi_affine_frame(X, np.asarray(deepest.x[:4], dtype=np.float64))
+    rows = unit_rows(rows @ T.T)
     box = _plane_box(rows)
     return None if box is None else Polytope(rows, T, box)
 
@@ -133,16 +136,6 @@ def distinct_planes(planes: F64, cost: F64) -> list[int]:
 
 def unit_rows(A: F64) -> F64:
     return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
-
-
-def _deepest_plane(rows: F64) -> F64 | None:
-    """Return the plane v with rows v >= d, |v| <= 1 and the largest d (HZ 21); None unless d > 0."""
-    A = np.column_stack([-rows, np.ones(len(rows))])
-    bounds = [(-1, 1)] * 4 + [(None, None)]
-    solution = scipy.optimize.linprog([0, 0, 0, 0, -1], A_ub=A, b_ub=np.zeros(len(rows)), bounds=bounds)
-    if solution.x is None or not solution.x[4] > 0:
-        return None
-    return np.asarray(solution.x[:4], dtype=np.float64)
 
 
 def _quasi_affine_frame(X: F64, v: F64) -> F64:
@@ -230,12 +223,9 @@ class CheiralitySearch:
 
 def _local_minima(score: F64) -> I64:
     """Return flat indices of grid cells (S, S, S) not worse than their 6 neighbours, best first."""
-    padded = np.pad(score, 1, constant_values=np.inf)
-    core = padded[1:-1, 1:-1, 1:-1]
-    minimum = np.isfinite(core)
-    for axis in range(3):
-        for shift in (-1, 1):
-            minimum &= core <= np.roll(padded, shift, axis=axis)[1:-1, 1:-1, 1:-1]
+    near = scipy.ndimage.generate_binary_structure(3, 1)
+    least = scipy.ndimage.minimum_filter(score, footprint=near, mode="constant", cval=np.inf)
+    minimum = np.isfinite(score) & (score <= least)
     flat = np.flatnonzero(minimum.ravel())
     return flat[np.argsort(score.ravel()[flat], kind="stable")]
 

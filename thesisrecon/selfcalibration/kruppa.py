@@ -106,16 +106,6 @@ def _minimize_kruppa(
     return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
 
 
-def _residual_and_focal_std(pairs: _Pairs, K: F64) -> tuple[float, float]:
-    """Rms residual of K (R, 3, 3), and the deviation of log f by its change with all focal lengths."""
-    scaled = np.repeat(K[None], 3, axis=0)
-    scaled[:, :, :2, :2] *= np.exp([-_STEP, 0.0, _STEP])[:, None, None, None]
-    lower, middle, upper = _pair_residuals(pairs, scaled)
-    slope = float(np.linalg.norm(upper - lower)) / (2.0 * _STEP)
-    residual = float(np.sqrt(np.mean(np.sum(middle**2, axis=1))))
-    return residual, max(residual, _ROUNDING) / max(slope, 1e-300)
-
-
 @dataclass(frozen=True)
 class KruppaEquations:
     """Self-calibration by the Kruppa equations over all camera pairs.
@@ -159,7 +149,13 @@ class KruppaEquations:
         for log_f in self._scan(pairs, n):
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
             K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
-            residual, focal_std = _residual_and_focal_std(pairs, K)
+            # The deviation of log f by the change of the residuals with all focal lengths.
+            scaled = np.repeat(K[None], 3, axis=0)
+            scaled[:, :, :2, :2] *= np.exp([-_STEP, 0.0, _STEP])[:, None, None, None]
+            lower, middle, upper = _pair_residuals(pairs, scaled)
+            slope = float(np.linalg.norm(upper - lower)) / (2.0 * _STEP)
+            residual = float(np.sqrt(np.mean(np.sum(middle**2, axis=1))))
+            focal_std = max(residual, _ROUNDING) / max(slope, 1e-300)
             weakest = min(weakest, focal_std)
             if min(focal_std, given) < _MAX_FOCAL_STD:
                 found.append((K, K_std, residual))

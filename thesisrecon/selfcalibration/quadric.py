@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thesisrecon.arrays import F64
+from thesisrecon.geometry.homogeneous import quadratic_rows, symmetric
 from thesisrecon.optimize.least_squares import huber, minimize_residuals
 from thesisrecon.records import IntrinsicsPrior, Reconstruction, SelfCalibration
 from thesisrecon.selfcalibration import _frame, _refinement, _upgrade
@@ -33,10 +34,10 @@ def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
     P = frame.P[None].repeat(len(focals), axis=0)
     P[:, :, :2] /= focals[:, None, None, None]
     p1, p2, p3 = P[:, :, 0], P[:, :, 1], P[:, :, 2]
-    w11, w22, w33 = (_refinement.quadratic_rows(p, p) for p in (p1, p2, p3))
+    w11, w22, w33 = (quadratic_rows(p, p) for p in (p1, p2, p3))
     rows = np.stack(
-        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, _refinement.quadratic_rows(p1, p2) / 0.01,
-         _refinement.quadratic_rows(p1, p3) / 0.1, _refinement.quadratic_rows(p2, p3) / 0.1], axis=2,
+        [(w11 - w33) / 9, (w22 - w33) / 9, (w11 - w22) / 0.2, quadratic_rows(p1, p2) / 0.01,
+         quadratic_rows(p1, p3) / 0.1, quadratic_rows(p2, p3) / 0.1], axis=2,
     )  # fmt: skip
     nu = np.linalg.norm(w33, axis=-1)
     q = np.zeros((len(focals), 10))
@@ -46,8 +47,7 @@ def linear_quadric(frame: ReferenceFrame, focals: F64) -> F64:
         # SVD of A, since A'A would lose half the digits.
         q = np.linalg.svd(A, full_matrices=A.shape[1] < 10)[2][:, 9]
         nu = np.abs(np.einsum("bvk,bk->bv", w33, q))
-    upper, Q = np.triu_indices(4), np.zeros((len(q), 4, 4))
-    Q[:, upper[0], upper[1]] = Q[:, upper[1], upper[0]] = q
+    Q = symmetric(q)
     Q *= np.where(np.trace(Q[:, :3, :3], axis1=1, axis2=2) < 0, -1.0, 1.0)[:, None, None]
     return Q
 
@@ -256,8 +256,10 @@ class HypothesesAndRefinement:
             size = int(rng.integers(3, len(others)))
             chosen = np.sort(np.append(rng.choice(others, size, replace=False), frame.reference))
             found.append(quadric_hypotheses(frame.subset(chosen), focals[::4]))
+        # Equal focal lengths of one camera, else all pairs of every other value.
+        pairs = [f.ravel() for f in np.meshgrid(focals[::2], focals[::2])]
         for other in others:
-            f1, f2 = _focal_pairs(focals, frame.group[other] == frame.group[frame.reference])
+            f1, f2 = [focals] * 2 if frame.group[other] == frame.group[frame.reference] else pairs
             found.append(
                 (_upgrade.gherardi_fusiello_planes(frame, int(other), f1, f2), np.concatenate([f1, f1]))
             )
@@ -269,11 +271,3 @@ class HypothesesAndRefinement:
         f = np.concatenate([part[1] for part in found])
         good = np.isfinite(p).all(axis=1) & np.isfinite(f)
         return p[good], _upgrade.group_focals_from_planes(frame, p[good], f[good])
-
-
-def _focal_pairs(focals: F64, same_camera: bool) -> tuple[F64, F64]:
-    """Return pairs to scan: equal focal lengths of one camera, else all pairs of every other value."""
-    if same_camera:
-        return focals, focals
-    first, second = np.meshgrid(focals[::2], focals[::2])
-    return first.ravel(), second.ravel()

@@ -30,6 +30,15 @@ def robust_sigma(residual: F64, leverage: F64, dof: int) -> float:
     return trimmed_noise_scale(size, MAD_FACTOR * float(np.median(size)), parameters=0)
 
 
+def orthonormal_columns(B: F64, point: I64, n: int) -> F64:
+    """B (K, 2, 3) times the inverse roots of the information B'B of its n points."""
+    outer = np.einsum("kra,krb->kab", B, B).reshape(-1, 9)
+    V = np.stack([np.bincount(point, c, minlength=n) for c in outer.T], axis=1).reshape(n, 3, 3)
+    w, U = np.linalg.eigh(V)
+    root = np.where(w > 1e-12 * w[:, 2:], 1.0 / np.sqrt(np.maximum(w, 1e-300)), 0.0)
+    return np.asarray(B @ (U * root[:, None])[point])
+
+
 def camera_blocks(
     reduced: ReducedSystem, R: F64, t: F64, row: I64, column: I64, gauge: F64 | None = None
 ) -> F64:
@@ -78,7 +87,8 @@ def sampled_blocks(solve: Callable[[F64], F64], noise: Iterator[F64], N: F64, wi
 
     edge, e = width * views, len(N) - width * views
     X = np.array([inner(b) for b in islice(noise, SAMPLES)])
-    both = np.concatenate([X[:, :edge].reshape(SAMPLES, views, width), _repeated(X[:, edge:], views)], axis=2)
+    border = np.broadcast_to(X[:, None, edge:], (SAMPLES, views, e))
+    both = np.concatenate([X[:, :edge].reshape(SAMPLES, views, width), border], axis=2)
     blocks = np.einsum("svi,svj->vij", both, both, optimize=True) / SAMPLES
     units = unit_columns(len(N), edge + np.arange(e)).T
     columns = np.array([inner(unit) for unit in units]).reshape(e, len(N))
@@ -86,10 +96,6 @@ def sampled_blocks(solve: Callable[[F64], F64], noise: Iterator[F64], N: F64, wi
     cross = columns[:, :edge].reshape(e, views, width).transpose(1, 2, 0)
     blocks[:, :width, width:], blocks[:, width:, :width] = cross, cross.swapaxes(1, 2)
     return np.asarray(blocks)
-
-
-def _repeated(values: F64, views: int) -> F64:
-    return np.broadcast_to(values[:, None], (len(values), views, values.shape[1]))
 
 
 def bundle_covariances(blocks: F64, width: int, number: I64, focal: F64, scale: float) -> tuple[F64, F64]:

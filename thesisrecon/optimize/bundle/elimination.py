@@ -409,26 +409,6 @@ def substitute_points(
 
 
 @kernel
-def sum_leverages(start: I64, B: F64, leverage: F64) -> None:
-    """Fill the share (K, 2) of each coordinate's variance that its point's unknowns absorb, B V^-1 B'."""
-    M = empty((3, 3))
-    for j in range(len(start) - 1):
-        v00 = v01 = v02 = v11 = v12 = v22 = 0.0
-        for k in range(start[j], start[j + 1]):
-            for i in range(2):
-                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
-                v00, v01, v02 = v00 + b0 * b0, v01 + b0 * b1, v02 + b0 * b2
-                v11, v12, v22 = v11 + b1 * b1, v12 + b1 * b2, v22 + b2 * b2
-        held = invert_cholesky_3x3(v00, v01, v02, v11, v12, v22, M)
-        for k in range(start[j], start[j + 1]):
-            for i in range(2):
-                b0, b1, b2 = B[k, i, 0], B[k, i, 1], B[k, i, 2]
-                t0, t1 = M[0, 0] * b0, M[1, 0] * b0 + M[1, 1] * b1
-                t2 = M[2, 0] * b0 + M[2, 1] * b1 + M[2, 2] * b2
-                leverage[k, i] = t0 * t0 + t1 * t1 + t2 * t2 if held else 1.0
-
-
-@kernel
 def revert_crossing_points(
     start: I64, view_index: I64, row_before: F64, row_after: F64, X_before: F64, X_after: F64
 ) -> None:

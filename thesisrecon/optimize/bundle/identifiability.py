@@ -300,6 +300,12 @@ def identifiability_report(
     variance = np.diagonal(free.intrinsics_covariance, axis1=1, axis2=2)[cameras.group, 3:5].max(axis=1)
     centre = np.sqrt(variance) / problem.longest
     root_share = float(np.sqrt(problem.share))
+    # The rms rotation of the optical axes in units of its standard deviation.
+    assert fit.pose_covariance is not None
+    axis = cameras.R[:, 2].mean(axis=0)
+    tilt = (cameras.R @ (axis / max(float(np.linalg.norm(axis)), 1e-12)))[:, :2]
+    noise = float(np.mean(np.diagonal(fit.pose_covariance, axis1=1, axis2=2)[:, :2]))
+    turned = float(np.sqrt(np.mean(tilt**2) / max(noise, 1e-300))) if np.isfinite(noise) else 0.0
     projective_px = max(problem.projective_px, 3e-5 * float(np.median(problem.longest)))
     evidence |= {
         "focal_long_sides": long_sides,
@@ -307,7 +313,7 @@ def identifiability_report(
         "focal_std_rel_median": float(np.median(std)),
         "focal_std_rel_free": float(np.median(free_std)),
         "principal_point_std_free": float(np.median(centre) * root_share),
-        "rotation_significance": _rotation_significance(cameras.R, fit.pose_covariance) / root_share,
+        "rotation_significance": turned / root_share,
         "excess_equations": float(excess),
         "noise_px": fit.sigma_px,
         "noise_ratio_to_projective": fit.sigma_px / projective_px,
@@ -341,16 +347,6 @@ def _focal_std(fit: MetricBundleResult, problem: CalibrationProblem) -> F64:
     return np.asarray(np.where(np.isfinite(std), std, np.inf), dtype=np.float64)
 
 
-def _rotation_significance(R: F64, covariance: F64 | None) -> float:
-    """Rms rotation of the optical axes in units of its standard deviation, 0 without covariances."""
-    if covariance is None:
-        return 0.0
-    mean = R[:, 2].mean(axis=0)
-    tilt = (R @ (mean / max(float(np.linalg.norm(mean)), 1e-12)))[:, :2]
-    variance = float(np.mean(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]))
-    return float(np.sqrt(np.mean(tilt**2) / max(variance, 1e-300))) if np.isfinite(variance) else 0.0
-
-
 def identifiability_sentences(
     motion: str, evidence: Mapping[str, float], *, identifiable: bool, focal_std: float
 ) -> tuple[str, ...]:
@@ -365,24 +361,23 @@ def identifiability_sentences(
         sentences.append(Notice(kind.replace(" ", "-"), evidence))
     if _has_excess_noise(evidence):
         sentences.append(excess_noise(evidence))
+    if identifiable and is_critical:
+        std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
+        if motion in (TURNTABLE, PLANAR, PARALLEL_AXES) and free_std > 2.0 * std:
+            given = _percent(std), _percent(free_std), _ADVICE[motion]
+            sentences.append(Notice("resolved-by-square-pixels", *given))
+        elif motion in (PLANE, ROTATION):
+            sentences.append(Notice("resolved-by-prior", _percent(std), _ADVICE[motion]))
+        else:
+            sentences.append(Notice("resolved-by-departure", _percent(std)))
     if identifiable:
-        return (*sentences, *_resolution(motion, evidence)) if is_critical else tuple(sentences)
+        return tuple(sentences)
     return (*sentences, *_failure(motion, evidence, is_critical, focal_std))
 
 
 def excess_noise(evidence: Mapping[str, float]) -> str:
     """A clause on a prior of the intrinsics that the images contradict."""
     return Notice("excess-noise", evidence["noise_ratio_to_projective"])
-
-
-def _resolution(motion: str, evidence: Mapping[str, float]) -> list[str]:
-    """Return clauses on how the focal length is determined in spite of the critical motion."""
-    std, free_std = evidence["focal_std_rel_median"], evidence["focal_std_rel_free"]
-    if motion in (TURNTABLE, PLANAR, PARALLEL_AXES) and free_std > 2.0 * std:
-        return [Notice("resolved-by-square-pixels", _percent(std), _percent(free_std), _ADVICE[motion])]
-    if motion in (PLANE, ROTATION):
-        return [Notice("resolved-by-prior", _percent(std), _ADVICE[motion])]
-    return [Notice("resolved-by-departure", _percent(std))]
 
 
 def _failure(motion: str, evidence: Mapping[str, float], is_critical: bool, focal_std: float) -> list[str]:

@@ -80,10 +80,8 @@ def number_unknowns(
     prior = prior or IntrinsicsPrior.unshared(cameras.intrinsics, np.full_like(table, np.inf))
     number = np.full(table.shape, NONE, dtype=np.int64)
     parts = _Parts([], [], [])
-    names = np.arange(len(table))
     for c in np.flatnonzero(free):
-        sharing = names if cameras.shared is None else cameras.shared[:, c]
-        value = np.unique(sharing, return_inverse=True)[1].astype(np.int64)
+        value = np.unique(cameras.shared[:, c], return_inverse=True)[1].astype(np.int64)
         table[:, c], number[:, c] = _number_column(int(c), value, (table[:, c], used), prior, parts)
     observed = len(parts.start)
     if prior.spread is not None:
@@ -93,8 +91,7 @@ def number_unknowns(
                 rows = np.flatnonzero((prior.kind == kind) & used)
                 if not len(rows) or not np.isfinite(spread[rows[0], c]):
                     continue
-                sharing = rows if cameras.shared is None else cameras.shared[rows, c]
-                rows = rows[np.unique(sharing, return_index=True)[1]]
+                rows = rows[np.unique(cameras.shared[rows, c], return_index=True)[1]]
                 parts.add_hierarchical_prior(
                     int(c), number[rows, c], table[rows, c], float(spread[rows[0], c])
                 )

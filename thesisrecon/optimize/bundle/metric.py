@@ -9,28 +9,13 @@ import numpy as np
 from thesisrecon.arrays import B8, F64, I64
 from thesisrecon.errors import require_range
 from thesisrecon.geometry.homogeneous import scene_frame
-from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns
+from thesisrecon.optimize.bundle import covariance, intrinsic_unknowns, projection
 from thesisrecon.optimize.bundle.covariance import similarity_motions
-from thesisrecon.optimize.bundle.elimination import revert_crossing_points, sum_leverages
+from thesisrecon.optimize.bundle.elimination import revert_crossing_points
 from thesisrecon.optimize.bundle.intrinsic_unknowns import IntrinsicColumns, IntrinsicUnknowns
-from thesisrecon.optimize.bundle.iterative import EXACT
 from thesisrecon.optimize.bundle.knowledge import BundleKnowledge, KnowledgeTerms, remaining_gauge
-from thesisrecon.optimize.bundle.projection import (
-    POSE_DOF,
-    Jacobians,
-    MetricCameras,
-    MetricModel,
-    Observations,
-    SortedObservations,
-    Weighting,
-    linearize_metric,
-    metric_cost,
-    move_poses,
-    project_metric,
-    sort_observations,
-)
 from thesisrecon.optimize.bundle.scatter import median_blocks
-from thesisrecon.optimize.bundle.schur import BundleLayout, BundleStep, BundleSystem, build_layout
+from thesisrecon.optimize.bundle.schur import EXACT, BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import Descent, run_levenberg_marquardt
 from thesisrecon.records import IntrinsicsPrior
 
@@ -48,14 +33,15 @@ class BundleOptions:
     """Options of :func:`refine_metric_bundle`: the noise ``sigma_px``, the width ``loss_px`` of Huber's loss.
 
     The adjustment also ends when the predicted gain of the cameras is below ``settled``: half the squared
-    distance of all cameras from the minimum, in standard deviations. Covariances are those of a noise of at
-    least ``noise_floor_px``.
+    distance of all cameras from the minimum, in standard deviations. ``noise`` is measured if asked for, or
+    for covariances, which are those of at least ``noise_floor_px``.
     """
 
     sigma_px: float = 1.0
     loss_px: float = 1.0
     max_iterations: int = MAX_ITERATIONS
     settled: float = 0.0
+    noise: bool = False
     covariance: bool = False
     point_covariance: bool = False
     joint_covariance: bool = False
@@ -77,7 +63,7 @@ class MetricBundleResult:
     largest undamped step of any function of the cameras in its standard deviations, (g' H^-1 g)^(1/2).
     """
 
-    cameras: MetricCameras
+    cameras: projection.MetricCameras
     X: F64
     residual_px: F64
     cost: float
@@ -91,7 +77,7 @@ class MetricBundleResult:
 
 @dataclass(frozen=True)
 class _State:
-    model: MetricModel
+    model: projection.MetricModel
     values: F64
 
 
@@ -103,8 +89,8 @@ class _MetricProblem:
     columns: IntrinsicColumns
     moves: B8
     values: IntrinsicUnknowns
-    weighting: Weighting
-    jacobians: Jacobians
+    weighting: projection.Weighting
+    jacobians: projection.Jacobians
     information: tuple[I64, I64, F64]
     known: KnowledgeTerms | None = None
     #: (7, m) similarities of the world that are free; None: all
@@ -113,11 +99,13 @@ class _MetricProblem:
     def linearize(self, state: _State) -> BundleSystem:
         J, c, known, w = self.jacobians, self.columns, self.known, self.weighting
 
-        def work(rows: slice, obs: Observations) -> float:
-            part = Jacobians(*(a[rows] for a in J))
+        def work(rows: slice, obs: projection.Observations) -> float:
+            part = projection.Jacobians(*(a[rows] for a in J))
             if known is None:
-                return float(linearize_metric(state.model, obs, w, c.own, c.common, part))
-            linearize_metric(state.model, obs, Weighting(w.sigma, np.inf), c.own, c.common, part)
+                return float(projection.linearize_metric(state.model, obs, w, c.own, c.common, part))
+            projection.linearize_metric(
+                state.model, obs, projection.Weighting(w.sigma, np.inf), c.own, c.common, part
+            )
             return known.weigh(rows, state.model, obs, part, w)
 
         cost = self.layout.sum_over_observations(work) + self.values.terms.cost(state.values)
@@ -128,12 +116,14 @@ class _MetricProblem:
         motions = None if self.layout.coarse is None else self._motions(state.model)
         return BundleSystem(cost, self.layout, J, (*self.information, gradient), motions)
 
-    def _motions(self, model: MetricModel) -> F64:
+    def _motions(self, model: projection.MetricModel) -> F64:
         """Motions of the views with their cluster: similarities, and a common change of own intrinsics."""
         C, poses = self.layout.width, similarity_motions(model.R[self.moves], model.t[self.moves])
         W = np.zeros((self.layout.views, C, C + 1))
-        W[:, :POSE_DOF, : POSE_DOF + 1] = poses.reshape(-1, POSE_DOF, POSE_DOF + 1)
-        W[:, POSE_DOF:, POSE_DOF + 1 :] = np.eye(C - POSE_DOF)
+        W[:, : projection.POSE_DOF, : projection.POSE_DOF + 1] = poses.reshape(
+            -1, projection.POSE_DOF, projection.POSE_DOF + 1
+        )
+        W[:, projection.POSE_DOF :, projection.POSE_DOF + 1 :] = np.eye(C - projection.POSE_DOF)
         W[self.columns.pinned[self.moves]] = 0.0
         return W
 
@@ -152,22 +142,24 @@ class _MetricProblem:
         m, layout = state.model, self.layout
         camera_step, point_step = step
         own = camera_step[: layout.size - layout.border].reshape(-1, layout.width)
-        poses = np.zeros((len(m.t), POSE_DOF))
-        poses[self.moves] = own[:, :POSE_DOF]
+        poses = np.zeros((len(m.t), projection.POSE_DOF))
+        poses[self.moves] = own[:, : projection.POSE_DOF]
         R, t = np.empty_like(m.R), np.empty_like(m.t)
-        move_poses(m.R, m.t, poses, R, t)
+        projection.move_poses(m.R, m.t, poses, R, t)
         values = self.values.step(state.values, camera_step[self.columns.place])
         X = m.X + point_step
         before, after = np.column_stack([m.R[:, 2], m.t[:, 2]]), np.column_stack([R[:, 2], t[:, 2]])
         o = layout.observations
         revert_crossing_points(o.start, o.seen.view_index, before, after, m.X, X)
-        return _State(MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values)
+        return _State(
+            projection.MetricModel(R, t, self.values.write(m.intrinsics, values), m.group, X), values
+        )
 
     def cost(self, state: _State) -> float:
-        def work(rows: slice, obs: Observations) -> float:
+        def work(rows: slice, obs: projection.Observations) -> float:
             if self.known is None:
-                return float(metric_cost(state.model, obs, self.weighting))
-            e = project_metric(state.model, obs) / self.weighting.sigma
+                return float(projection.metric_cost(state.model, obs, self.weighting))
+            e = projection.project_metric(state.model, obs) / self.weighting.sigma
             e = self.known.residuals(rows, state.model, obs, e)
             return self.known.cost(rows, e, self.weighting.delta)
 
@@ -175,13 +167,14 @@ class _MetricProblem:
 
     def sigma(self, state: _State, residual: F64) -> float:
         """Return the noise of one coordinate, px, from the residuals at the minimum."""
-        leverage = np.empty_like(residual)
         self.linearize(state)
         o, known = self.layout.observations, self.known
-        sum_leverages(o.start, self.jacobians.B, leverage)
+        # What the unknowns of the points absorb, B V^-1 B'.
+        own = covariance.orthonormal_columns(self.jacobians.B, o.seen.point_index, len(state.model.X))
+        leverage = np.sum(own**2, axis=2)
         moved = int((~self.columns.pinned[:, 0])[self.moves].sum())
         free = covariance.SIMILARITY_DOF if self.gauge is None else self.gauge.shape[1]
-        dof = POSE_DOF * moved + self.values.size - free
+        dof = projection.POSE_DOF * moved + self.values.size - free
         if known is not None:
             residual = known.residuals(slice(None), state.model, o.seen, residual)
             if known.fixed_points is not None:
@@ -191,7 +184,7 @@ class _MetricProblem:
 
 
 def refine_metric_bundle(
-    cameras: MetricCameras, X: F64, observations: Observations, *, free: B8,
+    cameras: projection.MetricCameras, X: F64, observations: projection.Observations, *, free: B8,
     prior: IntrinsicsPrior | None = None, options: BundleOptions | None = None, fixed: B8 | None = None,
     knowledge: BundleKnowledge | None = None,
 ) -> MetricBundleResult:  # fmt: skip
@@ -206,14 +199,14 @@ def refine_metric_bundle(
     options, given = options or BundleOptions(), len(observations.xy)
     if knowledge is not None:
         observations = knowledge.observations(observations)
-    o = sort_observations(observations, len(cameras.R), len(X))
+    o = projection.sort_observations(observations, len(cameras.R), len(X))
     seen_points = np.diff(o.start) > 0
     origin, scale = scene_frame(X[seen_points])
     moves = np.bincount(o.seen.view_index, minlength=len(cameras.R)) > 0
     if fixed is not None:
         moves &= ~fixed
     problem, values, table = _metric_problem(cameras, X, o, (moves, np.asarray(free, bool)), prior, options)
-    start = MetricModel(
+    start = projection.MetricModel(
         np.ascontiguousarray(cameras.R),
         scale * (cameras.t + cameras.R @ origin),
         problem.values.write(table, values),
@@ -221,7 +214,18 @@ def refine_metric_bundle(
         np.ascontiguousarray(scale * (X - origin)),
     )
     if knowledge is not None:
-        problem = _with_knowledge(problem, knowledge, start, (origin, scale), given)
+        centres, points = (p.in_frame(origin, scale) for p in (knowledge.centres, knowledge.points))
+        known = replace(knowledge, centres=centres, points=points)
+        pinned = problem.columns.pinned
+        if known.fixed_poses is not None:
+            pose = np.arange(pinned.shape[1]) < projection.POSE_DOF
+            pinned = pinned | ((known.fixed_poses & moves)[:, None] & pose)
+        problem = replace(
+            problem,
+            columns=replace(problem.columns, pinned=pinned),
+            known=KnowledgeTerms.of(known, o, given),
+            gauge=remaining_gauge(known, start.R, start.t, start.X),
+        )
     found = _minimize(problem, _State(start, values), options)
     state, cost = found.state, found.cost
     end, moved = state.model, problem.moves & ~problem.columns.pinned[:, 0]
@@ -231,8 +235,8 @@ def refine_metric_bundle(
         t=np.where(moved[:, None], end.t / scale - end.R @ origin, cameras.t),
         intrinsics=end.intrinsics,
     )
-    residual = project_metric(end, o.seen)
-    sigma = problem.sigma(state, residual)
+    residual = projection.project_metric(end, o.seen)
+    sigma = problem.sigma(state, residual) if options.noise or options.covariance else np.nan
     covariances: _Covariances = (np.zeros((*table.shape, table.shape[1])), None, None, None)
     if options.covariance:
         noise = max(sigma or options.sigma_px, options.noise_floor_px)
@@ -244,22 +248,6 @@ def refine_metric_bundle(
         *covariances[:2], sigma, covariances[2], float(np.sqrt(2.0 * max(found.remaining, 0.0))),
         covariances[3],
     )  # fmt: skip
-
-
-def _with_knowledge(
-    problem: _MetricProblem, knowledge: BundleKnowledge, start: MetricModel, frame: tuple[F64, float],
-    given: int,
-) -> _MetricProblem:  # fmt: skip
-    """Return the problem with what is known of poses and points; ``given`` observations are of pixels."""
-    columns, pinned = problem.columns, problem.columns.pinned
-    centres, points = (prior.in_frame(*frame) for prior in (knowledge.centres, knowledge.points))
-    knowledge = replace(knowledge, centres=centres, points=points)
-    if knowledge.fixed_poses is not None:
-        pose = np.arange(pinned.shape[1]) < POSE_DOF
-        pinned = pinned | ((knowledge.fixed_poses & problem.moves)[:, None] & pose)
-    terms = KnowledgeTerms.of(knowledge, problem.layout.observations, given)
-    gauge = remaining_gauge(knowledge, start.R, start.t, start.X)
-    return replace(problem, columns=replace(columns, pinned=pinned), known=terms, gauge=gauge)
 
 
 def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) -> Descent[_State]:
@@ -279,7 +267,7 @@ def _minimize(problem: _MetricProblem, state: _State, options: BundleOptions) ->
 
 
 def _metric_problem(
-    cameras: MetricCameras, X: F64, o: SortedObservations, unknown: tuple[B8, B8],
+    cameras: projection.MetricCameras, X: F64, o: projection.SortedObservations, unknown: tuple[B8, B8],
     prior: IntrinsicsPrior | None, options: BundleOptions,
 ) -> tuple[_MetricProblem, F64, F64]:  # fmt: skip
     """Return the problem, the start of its intrinsic unknowns, and the table of intrinsics."""
@@ -297,10 +285,11 @@ def _metric_problem(
         return median_blocks(place, np.ones(len(place), dtype=bool), most=256, least=8)
 
     layout = build_layout(
-        o, columns.block, width=POSE_DOF + len(columns.own), common=columns.border, border=columns.n_border,
-        threads=options.threads, clusters=None if options.point_covariance else clusters,
+        o, columns.block, width=projection.POSE_DOF + len(columns.own), common=columns.border,
+        border=columns.n_border, threads=options.threads,
+        clusters=None if options.point_covariance else clusters,
     )  # fmt: skip
-    weighting = Weighting(options.sigma_px, options.loss_px / options.sigma_px)
+    weighting = projection.Weighting(options.sigma_px, options.loss_px / options.sigma_px)
     Q = values.terms.information().tocoo()
     information = columns.place[Q.row], columns.place[Q.col], Q.data
     buffers = layout.jacobians()
@@ -311,7 +300,7 @@ def _covariances(
     problem: _MetricProblem, state: _State, sigma_px: float, scale: float, options: BundleOptions
 ) -> _Covariances:
     """Return the covariances, lengths in the caller's unit."""
-    problem = replace(problem, weighting=Weighting(sigma_px, problem.weighting.delta))
+    problem = replace(problem, weighting=projection.Weighting(sigma_px, problem.weighting.delta))
     system = problem.linearize(state)
     reduced, sums, _ = system.reduce(1e-10)
     m, seen, layout = state.model, problem.moves, problem.layout
@@ -324,7 +313,7 @@ def _covariances(
         N = covariance.gauge_basis(layout.size, layout.width, m.R[seen], m.t[seen], problem.gauge)
         exact = partial(solve, forcing=EXACT)
         blocks = covariance.sampled_blocks(exact, problem.noise(system), N, layout.width, len(own))
-    poses = np.zeros((len(m.t), POSE_DOF, POSE_DOF))
+    poses = np.zeros((len(m.t), projection.POSE_DOF, projection.POSE_DOF))
     intrinsics, poses[seen] = covariance.bundle_covariances(
         blocks[row == column], layout.width, number, m.intrinsics[:, 0], scale
     )

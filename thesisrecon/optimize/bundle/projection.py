@@ -168,7 +168,18 @@ class MetricCameras:
     t: F64
     intrinsics: F64
     group: I64
-    shared: I64 | None = None
+    shared: I64 = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.shared is None:
+            every = np.arange(len(self.intrinsics))[:, None]
+            object.__setattr__(self, "shared", np.broadcast_to(every, self.intrinsics.shape))
+
+    def of_views(self, views: I64) -> MetricCameras:
+        """The cameras of some views, each with a row of intrinsics of its own."""
+        rows = self.group[views]
+        own = np.arange(len(views), dtype=np.int64)
+        return MetricCameras(self.R[views], self.t[views], self.intrinsics[rows], own, self.shared[rows])
 
     @property
     def K(self) -> F64:
@@ -187,11 +198,11 @@ class MetricCameras:
 
 
 def calibrations(intrinsics: F64) -> F64:
-    """Calibration matrices (V, 3, 3) of rows (V, C) of intrinsics."""
-    f, aspect, skew, cx, cy = intrinsics.T[:5]
+    """Calibration matrices (..., 3, 3) of rows (..., C) of intrinsics."""
+    f, aspect, skew, cx, cy = np.moveaxis(intrinsics, -1, 0)[:5]
     zero, one = np.zeros_like(f), np.ones_like(f)
     rows = [f, skew, cx, zero, aspect * f, cy, zero, zero, one]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+    return np.stack(rows, axis=-1).reshape(*f.shape, 3, 3)
 
 
 def pinhole_rows(K: F64) -> F64:

@@ -11,17 +11,9 @@ import numpy as np
 from thesisrecon._numba import kernel
 from thesisrecon.arrays import B8, F64
 from thesisrecon.geometry.homogeneous import pixel_conditioning, whitened_frame
+from thesisrecon.optimize.bundle import projection
 from thesisrecon.optimize.bundle.elimination import revert_crossing_points
-from thesisrecon.optimize.bundle.projection import (
-    TINY,
-    Jacobians,
-    Observations,
-    Weighting,
-    away_from_zero,
-    loss_value,
-    loss_weight,
-    sort_observations,
-)
+from thesisrecon.optimize.bundle.projection import TINY, away_from_zero, loss_value, loss_weight
 from thesisrecon.optimize.bundle.schur import BundleLayout, BundleStep, BundleSystem, build_layout
 from thesisrecon.optimize.least_squares import run_levenberg_marquardt
 
@@ -81,7 +73,9 @@ def tangent_step(p: F64, v: F64, beta: F64, step: F64, out: F64) -> None:
 
 
 @kernel
-def linearize_projective(state: UnitState, obs: Observations, weighting: Weighting, J: Jacobians) -> float:
+def linearize_projective(
+    state: UnitState, obs: projection.Observations, weighting: projection.Weighting, J: projection.Jacobians
+) -> float:
     """Fill weighted residuals, A (K, 2, 11), B (K, 2, 3): d pi = [[1, 0, -x], [0, 1, -y]] du / u2; cost."""
     cost = 0.0
     for k in range(len(obs.xy)):
@@ -124,7 +118,7 @@ def linearize_projective(state: UnitState, obs: Observations, weighting: Weighti
 
 
 @kernel
-def projective_cost(state: UnitState, obs: Observations, weighting: Weighting) -> float:
+def projective_cost(state: UnitState, obs: projection.Observations, weighting: projection.Weighting) -> float:
     """Return 1/2 sum rho of the residuals."""
     cost = 0.0
     for k in range(len(obs.xy)):
@@ -152,12 +146,12 @@ class _ProjectiveProblem:
     """Reprojection in conditioned pixels; states are unit vectors, steps lie in their tangent spaces."""
 
     layout: BundleLayout
-    weighting: Weighting
-    jacobians: Jacobians
+    weighting: projection.Weighting
+    jacobians: projection.Jacobians
 
     def linearize(self, state: UnitState) -> BundleSystem:
-        def work(rows: slice, obs: Observations) -> float:
-            part = Jacobians(*(a[rows] for a in self.jacobians))
+        def work(rows: slice, obs: projection.Observations) -> float:
+            part = projection.Jacobians(*(a[rows] for a in self.jacobians))
             return float(linearize_projective(state, obs, self.weighting, part))
 
         return BundleSystem(self.layout.sum_over_observations(work), self.layout, self.jacobians)
@@ -180,7 +174,7 @@ class _ProjectiveProblem:
 
 
 def refine_projective_bundle(
-    P: F64, X: F64, observations: Observations, *, loss_px: float = 1.0, max_iterations: int = 10,
+    P: F64, X: F64, observations: projection.Observations, *, loss_px: float = 1.0, max_iterations: int = 10,
     settled: float = 0.0, fixed_views: B8 | None = None,
 ) -> ProjectiveBundleResult:  # fmt: skip
     """Minimise sum rho(|x - P X|^2) over all points and cameras but ``fixed_views`` with Huber's loss (6.7).
@@ -189,7 +183,7 @@ def refine_projective_bundle(
     handles the 15 gauge freedoms. Views and points without observations do not change. The search also ends
     when the predicted gain of the cameras is below ``settled`` times the square of ``loss_px``.
     """
-    o = sort_observations(observations, len(P), len(X))
+    o = projection.sort_observations(observations, len(P), len(X))
     observed = np.bincount(o.seen.view_index, minlength=len(P)) > 0
     seen_points = np.diff(o.start) > 0
     free = observed & ~(np.zeros(len(P), bool) if fixed_views is None else np.asarray(fixed_views, bool))
@@ -200,7 +194,7 @@ def refine_projective_bundle(
     block = np.where(free, np.cumsum(free) - 1, -1)
     none = np.zeros((len(free), 0), dtype=np.int64)
     layout = build_layout(conditioned, block, width=_VIEW_DOF, common=none, border=0)
-    problem = _ProjectiveProblem(layout, Weighting(1.0, loss_px * scale), layout.jacobians())
+    problem = _ProjectiveProblem(layout, projection.Weighting(1.0, loss_px * scale), layout.jacobians())
     cameras, P_norms = _unit_rows(frame.cameras(T @ P).reshape(-1, 12), observed)
     points, X_norms = _unit_rows(frame.points(X), seen_points)
     start = UnitState.at(cameras, points)
@@ -219,7 +213,7 @@ def refine_projective_bundle(
     return ProjectiveBundleResult(P, X, residual, 0.5 * float(below @ (2.0 * distance - below)))
 
 
-def _residuals(P: F64, X: F64, o: Observations) -> F64:
+def _residuals(P: F64, X: F64, o: projection.Observations) -> F64:
     """Return projection minus observation (K, 2) of what is returned; huge in a focal plane."""
     image = np.einsum("kab,kb->ka", P[o.view_index], X[o.point_index])
     w = image[:, 2:]

@@ -18,6 +18,7 @@ from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.optimize.bundle.covariance import (
     gauge_basis,
     invert_in_inner_gauge,
+    orthonormal_columns,
     sparse_inverse,
     unit_columns,
 )
@@ -300,7 +301,7 @@ def linearise_fit(
     centre_columns = weighted.A[:, :, POSE_DOF + 3 : POSE_DOF + 5].copy()
     weighted.A[:, :, POSE_DOF:] *= (number >= 0)[:, None]
     J = _sparse(weighted.A, column, first + values.size)
-    B, at = _orthonormal(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
+    B, at = orthonormal_columns(weighted.B, o.point_index, len(X)), 3 * o.point_index[:, None] + np.arange(3)
     E, residual = _sparse(B, at, 3 * len(X)), weighted.residual.ravel()
     taken = scipy.sparse.csr_matrix(E.T @ J)
     residual -= E @ (E.T @ residual)
@@ -350,15 +351,6 @@ def _sparse(values: F64, column: I64, width: int) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix(
         (values.ravel(), (rows, np.repeat(column, 2, axis=0).ravel())), (2 * K, width)
     )
-
-
-def _orthonormal(B: F64, point: I64, n: int) -> F64:
-    """Return B (K, 2, 3) times the inverse root of its points' information: orthonormal columns."""
-    outer = np.einsum("kra,krb->kab", B, B).reshape(-1, 9)
-    V = np.stack([np.bincount(point, c, minlength=n) for c in outer.T], axis=1).reshape(n, 3, 3)
-    w, U = np.linalg.eigh(V)
-    root = np.where(w > 1e-12 * w[:, 2:], 1.0 / np.sqrt(np.maximum(w, 1e-300)), 0.0)
-    return np.asarray(B @ (U * root[:, None])[point])
 
 
 def _covariance(S: F64 | scipy.sparse.csc_matrix, cameras: MetricCameras, views: I64) -> _Solve:

@@ -19,11 +19,14 @@ from thesisrecon._numba import ThreadPool
 from thesisrecon.arrays import F64, I64
 from thesisrecon.geometry.small_matrices import floored_diagonal, solve_positive
 from thesisrecon.optimize.bundle import elimination
-from thesisrecon.optimize.bundle.iterative import Preconditioner, conjugate_gradients
 from thesisrecon.optimize.bundle.projection import Jacobians, Observations, SortedObservations
 
 CHUNK = 4096
 MANY_VIEWS = 1000  # views above which a system without a band is solved by conjugate gradients
+FORCING = 1e-3
+"""Gain of an iteration, times their number, relative to the whole gain at which a step is accurate enough."""
+EXACT, MOST = 1e-7, 600
+"""That for covariances, and the bound of the iterations."""
 
 Answer = TypeVar("Answer")
 
@@ -119,6 +122,55 @@ def order_views(row: I64, column: I64, n_views: int) -> BandedCholesky:
     place = np.empty(n_views, dtype=np.int64)
     place[order] = np.arange(n_views)
     return BandedCholesky(place, int(np.abs(place[row] - place[column]).max(initial=0)))
+
+
+@dataclass(frozen=True)
+class Preconditioner:
+    """M^-1 = sum_v S_vv^-1 + W (W' S W)^-1 W' for conjugate gradients: the reduced matrix is not formed.
+
+    Inverse blocks (b, C, C) of single views (Schur-Jacobi; Agarwal, Snavely, Seitz and Szeliski, ECCV 2010)
+    reduce noise; clusters of views (``label`` (b,)) that move as one body by ``motions`` W (b, C, m) reduce
+    the long waves that those leave. ``factor`` is the Cholesky factor of W' S W; common columns are coarse
+    unknowns.
+    """
+
+    inverse: F64
+    motions: F64
+    label: I64
+    factor: F64
+
+    def __call__(self, r: F64) -> F64:
+        """Return M^-1 r; (D,)."""
+        (b, C, m), n = self.motions.shape, int(self.label.max()) + 1
+        views, coarse = r[: b * C].reshape(b, C), np.zeros((n, m))
+        np.add.at(coarse, self.label, np.einsum("vcm,vc->vm", self.motions, views))
+        x = scipy.linalg.cho_solve((self.factor, False), np.append(coarse, r[b * C :]), check_finite=False)
+        moved = np.einsum("vcm,vm->vc", self.motions, x[: n * m].reshape(n, m)[self.label])
+        return np.append(moved + np.einsum("vab,vb->va", self.inverse, views), x[n * m :])
+
+
+def conjugate_gradients(
+    multiply: Callable[[F64], F64], precondition: Callable[[F64], F64], rhs: F64, *, forcing: float = FORCING
+) -> F64:
+    """Solve S x = rhs until an iteration gains little (Nash and Sofer 1990); rhs is in the range of S."""
+    x, r = np.zeros_like(rhs), rhs.copy()
+    z = precondition(r)
+    p, product, gained = z, float(r @ z), 0.0
+    for i in range(1, MOST + 1):
+        q = multiply(p)
+        curvature = float(p @ q)
+        if not (product > 0.0 and curvature > 0.0):
+            break
+        step = product / curvature
+        x += step * p
+        r -= step * q
+        gained += step * product
+        if i * step * product <= forcing * gained:
+            break
+        z = precondition(r)
+        before, product = product, float(r @ z)
+        p = z + (product / before) * p
+    return x
 
 
 @dataclass(frozen=True)
@@ -273,9 +325,18 @@ class BundleSystem:
     def reduce(self, damping: float) -> tuple[ReducedSystem, elimination.PointSums, F64]:
         """Eliminate the points; return the damped system, sums of the points, and the damping terms (D,)."""
         (total, points), layout = self.eliminate(damping), self.layout
-        first = layout.index.row[:-1]
+        first, edge = layout.index.row[:-1], layout.size - layout.border
         if self.prior is not None:
-            _add_prior(first, total, self.prior)
+            i, j, w, gradient = self.prior
+            total.rhs[:] -= gradient
+            total.gradient[:] += gradient
+            weight = np.bincount(i[i == j], w[i == j], minlength=layout.size).astype(np.float64)
+            total.diagonal[:] += weight
+            add_diagonal(total, first, weight)
+            inside, off = i >= edge, (i != j) & (j >= edge)
+            total.corner[i[off & inside] - edge, j[off & inside] - edge] += w[off & inside]
+            border = total.border.reshape(edge, layout.border)
+            border[i[off & ~inside], j[off & ~inside] - edge] += w[off & ~inside]
         damped = damping * floored_diagonal(total.diagonal)
         # A column without effect does not move: any positive pivot will do.
         add_diagonal(total, first, np.where(total.diagonal == 0.0, 1.0, damped))
@@ -354,17 +415,3 @@ class BundleSystem:
             return np.asarray(self._multiply(x, still, product=True)[1] + known @ x)
 
         return partial(conjugate_gradients, multiply, precondition)
-
-
-def _add_prior(first: I64, total: elimination.ReducedSums, prior: CameraPrior) -> None:
-    """Add the information and gradient of the prior."""
-    size, border = len(total.rhs), len(total.corner)
-    (i, j, w, gradient), edge = prior, size - border
-    total.rhs[:] -= gradient
-    total.gradient[:] += gradient
-    weight = np.bincount(i[i == j], w[i == j], minlength=size).astype(np.float64)
-    total.diagonal[:] += weight
-    add_diagonal(total, first, weight)
-    inside, off = i >= edge, (i != j) & (j >= edge)
-    total.corner[i[off & inside] - edge, j[off & inside] - edge] += w[off & inside]
-    total.border.reshape(edge, border)[i[off & ~inside], j[off & ~inside] - edge] += w[off & ~inside]
