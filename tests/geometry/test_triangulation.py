@@ -452,6 +452,25 @@ def test_the_mirrored_pose_of_a_small_plane_is_given_where_noise_explains_it():
     assert named[30.0] >= 6
 
 
+def test_all_poses_that_few_points_leave_possible_are_given():
+    wrong = 0
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        X, R = (
+            rng.uniform(-1.0, 1.0, (4, 3)) * [1.0, 1.0, 0.03],
+            Rotation.random(random_state=seed).as_matrix(),
+        )
+        P = compose_camera(GIVEN_K, R, np.array([0.0, 0.0, 30.0]))
+        found = thesisrecon.resect(
+            X, project(P, X) + 0.5 * rng.normal(size=(4, 2)), GIVEN_K, threshold_px=None
+        )
+        poses = [found.R, *found.competing_poses[:, :, :3]]
+        off = [np.degrees(Rotation.from_matrix(one @ R.T).magnitude()) for one in poses]
+        wrong += off[0] > 20.0
+        assert min(off) < 20.0
+    assert wrong > 0
+
+
 @pytest.mark.parametrize("threshold_px", [1.0, None])
 def test_mirrored_points_equal_pixels_and_points_without_a_pose_have_no_camera(threshold_px):
     X, xy = points(30, np.random.default_rng(0))

@@ -19,7 +19,6 @@ from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views._warping import DIRECTIONS, fill_holes, forward_map, sample
 from thesisrecon.views.interpolation import (
     InterpolatedPair,
-    detect_monotonicity_violations,
     disparity_of_right,
     original_from_rectified,
     prepare_interpolation,
@@ -27,6 +26,19 @@ from thesisrecon.views.interpolation import (
 
 SIZE = (160, 120)
 SHIFTS = np.linspace(0.0, 1.0, 7)
+
+
+def detect_monotonicity_violations(disparity):
+    """Find the pixels of a rectified image that violate the monotonicity constraint (figure 1.1).
+
+    If u1 is left of v1 then u2 must be left of v2; then u is left of v in every view between.
+    """
+    slack_px = 0.5  # Largest violation of monotonicity that counts as noise of the disparities
+    at = np.arange(disparity.shape[1]) - disparity.astype(np.float64)
+    padded = np.pad(at, ((0, 0), (1, 1)), constant_values=((0, 0), (-np.inf, np.inf)))
+    rightmost = np.fmax.accumulate(padded[:, :-2], axis=1)
+    leftmost = np.fmin.accumulate(padded[:, :1:-1], axis=1)[:, ::-1]
+    return (rightmost > at + slack_px) | (leftmost < at - slack_px)
 
 
 def sure(disparity):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,7 +24,7 @@ from thesisrecon.matching.pair_selection import PairsOfAdded
 from thesisrecon.pipeline.algorithm1 import algorithm1, claimed, empty_result, last_result, run_adopted
 from thesisrecon.pipeline.matching import FromImages, ImageInput
 from thesisrecon.pipeline.outputs import CONFIG
-from thesisrecon.pipeline.run import Job, Progress, Run, RunOptions, start_run
+from thesisrecon.pipeline.run import Job, Progress, Run, RunOptions, name_images, start_run
 from thesisrecon.results import RunResult
 from thesisrecon.runtime._blas import one_blas_thread
 
@@ -137,7 +138,9 @@ def localize(run: RunResult | str | Path, image: ImageInput, **options: Unpack[R
     Returns
     -------
     Camera
-        In the frame of the run, with ``std`` of its pose.
+        In the frame of the run, with ``std`` of its pose. If the points that it sees leave another pose
+        possible, as those of a small or distant plane do, ``std`` contains the difference, and a
+        ``UserWarning`` names it.
 
     Raises
     ------
@@ -162,6 +165,10 @@ def localize(run: RunResult | str | Path, image: ImageInput, **options: Unpack[R
         added = job.names[-1]
         if added not in found.cameras:
             raise StageFailure.of("not-localised", added, found.refused[added])
+        assert found.metric is not None
+        for text in found.metric.warnings:
+            if getattr(text, "code", "") == "competing-pose":
+                warnings.warn(f"localize: {name_images(text, job.names)}", UserWarning, stacklevel=3)
         return found.cameras[added]
 
 

@@ -5,15 +5,17 @@ The frame of the given cameras stays. Without ``refine`` their poses and intrins
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from thesisrecon import records
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
 from thesisrecon.camera import POSE_STDS, Camera, angles_of_view
 from thesisrecon.errors import Notice, StageFailure, UsageError, counted
+from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import BASE, simplest_row
 from thesisrecon.metric import _model, _resection
@@ -27,6 +29,7 @@ from thesisrecon.optimize.bundle.knowledge import BundleKnowledge
 from thesisrecon.optimize.bundle.metric import refine_metric_bundle
 from thesisrecon.optimize.bundle.projection import MetricCameras, pinhole_rows
 from thesisrecon.optimize.least_squares import noise_from_distances
+from thesisrecon.optimize.ransac import AS_GOOD, other_poses
 from thesisrecon.records import IntrinsicInterval, IntrinsicsPrior, Tracks
 
 START_NOISE, NOISE_FLOOR_PX = 2e-3, 0.02
@@ -191,8 +194,11 @@ def _finished(
     for view in np.flatnonzero(given.known).tolist():
         poses[view] = [stds[view].get(name, np.nan) for name in POSE_STDS]
     poses[:, :3] = np.radians(poses[:, :3])
+    warnings = list[str]()
     if (new := model.registered & ~given.known).any():
         model = _with_stds(model, adjustment, new, stds, poses)
+        for view in np.flatnonzero(new).tolist():
+            warnings += _competing_poses(model, view, poses)
     known = EARLIER if given.of_images else records.GIVEN
     sources = {view: known if given.known[view] else "resection" for view in range(len(stds))}
     intervals = tuple(
@@ -205,7 +211,7 @@ def _finished(
     reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
     return records.MetricResult(
         as_reconstruction(model, reasons), intervals, checked.numbers, not failed, tuple(failed),
-        pose_std=poses,
+        tuple(warnings), pose_std=poses,
     )  # fmt: skip
 
 
@@ -238,6 +244,23 @@ def _with_stds(
     return _model.select_inliers(
         replace(model, cameras=fit.cameras, X=X), sigmas=LATE_SIGMAS, min_angle=_model.MIN_ANGLE
     )
+
+
+def _competing_poses(model: MetricEstimate, view: int, poses: F64) -> Iterator[str]:
+    """Name other poses that explain the points of a view as well; ``poses`` contains the differences then."""
+    t, cameras = model.tracks, model.cameras
+    k = np.flatnonzero(model.inlier & (t.view_index == view))
+    views, X, xy = t.view_index[k], model.X[t.point_index[k]], t.xy[k]
+    R, own, row = cameras.R[view], cameras.t[view], cameras.intrinsics[cameras.group[view]]
+    cost = np.sum((_model.reproject_observations(model, views, t.point_index[k])[0] - xy) ** 2)
+    limit = cost + AS_GOOD * (USUAL_INFLATION * model.sigma_px) ** 2
+    rays = homogenize(_model.normalized_observations(cameras, views, xy))
+    for pose in other_poses(R, own, row, rays, X, xy):
+        if np.sum(pose.residual_px**2) < limit and (X @ pose.R[2] + pose.t[2] > 0.0).all():
+            turn = Rotation.from_matrix(pose.R @ R.T).as_rotvec()
+            poses[view] = np.hypot(poses[view], np.append(turn, R.T @ own - pose.R.T @ pose.t))
+            angle = np.degrees(np.linalg.norm(turn))
+            yield Notice("competing-pose", view, angle, counted(len(k), "point"))
 
 
 def _interval(

@@ -17,9 +17,9 @@ from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.camera_matrix import depth, project
 from thesisrecon.geometry.homogeneous import homogenize, whitened_frame
 from thesisrecon.geometry.triangulation import pose_from_three_points, resect_linear, resect_six
-from thesisrecon.optimize.bundle.partial import refine_camera, refine_pose
+from thesisrecon.optimize.bundle.partial import PoseRefinement, refine_camera, refine_pose
 from thesisrecon.optimize.bundle.projection import pinhole_rows
-from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit
+from thesisrecon.optimize.least_squares import VARIANCE_OF_INLIERS, next_inlier_limit, student_factor
 
 # Data on which all models are tried first, and data on which the remaining ones are scored.
 FIRST, SCORED = 48, 2000
@@ -29,9 +29,10 @@ AT_ONCE = 2**17  # residuals of models computed at once
 WITHOUT = 100_000  # samples without any model after which there is none
 CHANCE = -4.0
 """Logarithm to base 10 of the largest expected number of models of wrong data with as many inliers."""
-_AS_GOOD, _SAME = 9.0, 0.02
+AS_GOOD, _SAME = 9.0, 0.02
 """Largest difference of two poses' squared residuals, in variances, that noise explains (three standard
 deviations), and of the rotations of one pose."""
+_FEW = 6  # this many points or fewer may have other poses although they are not flat
 REACHES = 1.0, 3.0
 """Thresholds at which chance is tested: right data whose noise is the threshold lie within three."""
 
@@ -193,8 +194,8 @@ class Resection(Record):
         Covariance of the entries of P (row-major, rank 11) or, with a given K, of the pose: rotation vector w
         (rad) and translation d of x -> exp(w) x + d in the camera frame.
     competing_poses : ndarray (C, 3, 4)
-        With a given K, [R t] of the mirrored pose if it explains the inliers as well, as it does for small or
-        distant planes (Schweighofer and Pinz, PAMI 28(12), 2006); C = 0 if the pose is determined.
+        With a given K, [R t] of other poses that explain the inliers as well: the mirrored one of small or
+        distant planes (Schweighofer and Pinz, PAMI 28(12), 2006), those of few points; else C = 0.
     """
 
     P: F64
@@ -251,13 +252,18 @@ def resect_robust(
             break
     if threshold_px is not None:
         _require_more_than_chance(X, xy, fit.P, threshold_px, samples, _SAMPLE if K is None else 3)
-    left = (2 * int(fit.inliers.sum()) - unknown) * (1.0 if threshold_px is None else VARIANCE_OF_INLIERS)
-    others = [] if K is None else _mirrored(fit, X, xy)
-    (cost, fit), *others = sorted([(_cost(fit, X, xy), fit), *others], key=lambda one: one[0])
-    sigma = float(np.sqrt(cost / left)) if left > 0 else float("nan")
-    as_good = [one for worse, one in others if worse - cost <= _AS_GOOD * max(sigma, _EXACT_PX) ** 2]
-    poses = np.array([np.column_stack([one.R, one.t]) for one in as_good]).reshape(-1, 3, 4)
-    return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance, competing_poses=poses)
+    left = 2 * int(fit.inliers.sum()) - unknown
+    fits, k = [fit], fit.inliers
+    if K is not None:
+        poses = other_poses(fit.R, fit.t, np.append(pinhole_rows(K), 0.0), rays[k], X[k], xy[k])
+        fits += [_of_pose(pose, K, k) for pose in poses]
+    (cost, fit), *others = sorted([(_cost(one, X, xy), one) for one in fits], key=lambda one: one[0])
+    variance = 1.0 if threshold_px is None else VARIANCE_OF_INLIERS
+    sigma = float(np.sqrt(cost / (left * variance))) if left > 0 else float("nan")
+    limit = AS_GOOD * (student_factor(left) * max(sigma, _EXACT_PX)) ** 2
+    as_good = [one for worse, one in others if worse - cost <= limit]
+    competing = np.array([np.column_stack([one.R, one.t]) for one in as_good]).reshape(-1, 3, 4)
+    return replace(fit, sigma_px=sigma, covariance=sigma**2 * fit.covariance, competing_poses=competing)
 
 
 def _cost(fit: Resection, X: F64, xy: F64) -> float:
@@ -265,15 +271,26 @@ def _cost(fit: Resection, X: F64, xy: F64) -> float:
     return float(_squared_residuals(fit.P[None], homogenize(X[fit.inliers]), xy[fit.inliers]).sum())
 
 
-def _mirrored(fit: Resection, X: F64, xy: F64) -> list[tuple[float, Resection]]:
-    """The other pose near which a flat object looks the same, with its cost; none if it has only one."""
-    centre, normal = X[fit.inliers].mean(axis=0), np.linalg.eigh(np.cov(X[fit.inliers].T))[1][:, 0]
-    place = fit.R @ centre + fit.t
+def other_poses(R: F64, t: F64, row: F64, rays: F64, X: F64, xy: F64) -> list[PoseRefinement]:
+    """Other poses near which flat or few points (N, 3) look as from [R t], refined.
+
+    ``row`` are intrinsics as of ``MetricCameras``, ``rays`` (N, 3) those of the pixels.
+    """
+    centre, normal = X.mean(axis=0), np.linalg.eigh(np.cov(X.T))[1][:, 0]
+    place = R @ centre + t
     view = place / np.linalg.norm(place)
     # Reflected along the normal, which does not move a plane, and the line of sight: pixels hardly move.
-    R = (np.eye(3) - 2.0 * np.outer(view, view)) @ fit.R @ (np.eye(3) - 2.0 * np.outer(normal, normal))
-    other = _refine(np.column_stack([R, place - R @ centre]), fit.K, X, xy, fit.inliers)
-    return [] if np.linalg.norm(other.R - fit.R) < _SAME else [(_cost(other, X, xy), other)]
+    turn = (np.eye(3) - 2.0 * np.outer(view, view)) @ R @ (np.eye(3) - 2.0 * np.outer(normal, normal))
+    starts, found = np.column_stack([turn, place - turn @ centre])[None], list[PoseRefinement]()
+    if len(X) <= _FEW:
+        samples = np.array(list(combinations(range(len(X)), 3)))
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        starts = np.concatenate([starts, pose_from_three_points(X[samples], rays[samples])])
+    for start in starts:
+        pose = refine_pose(start[:, :3], start[:, 3], row, X, xy, free=np.zeros(6, bool), loss_px=np.inf)
+        if all(np.linalg.norm(pose.R - one) >= _SAME for one in (R, *(other.R for other in found))):
+            found.append(pose)
+    return found
 
 
 def _require_more_than_chance(X: F64, xy: F64, P: F64, threshold: float, samples: int, size: int) -> None:
@@ -291,6 +308,10 @@ def _no_camera(evidence: str) -> StageFailure:
     return StageFailure.of("no-camera", evidence)
 
 
+def _of_pose(pose: PoseRefinement, K: F64, inliers: B8) -> Resection:
+    return Resection(compose_camera(K, pose.R, pose.t), K, pose.R, pose.t, inliers, 1.0, pose.covariance)
+
+
 def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resection:
     """The camera of least reprojection error of the inliers near P or [R t], its covariance for 1 px."""
     if K is not None:
@@ -298,8 +319,7 @@ def _refine(start: F64, K: F64 | None, X: F64, xy: F64, inliers: B8) -> Resectio
         pose = refine_pose(
             start[:, :3], start[:, 3], row, X[inliers], xy[inliers], free=np.zeros(6, bool), loss_px=np.inf
         )
-        P = compose_camera(K, pose.R, pose.t)
-        return Resection(P, K, pose.R, pose.t, inliers, 1.0, pose.covariance)
+        return _of_pose(pose, K, inliers)
     P, covariance = refine_camera(start, homogenize(X[inliers]), xy[inliers], loss_px=np.inf)
     K, R, t = decompose_camera(P)
     scale = float(np.sum(compose_camera(K, R, t) * P) / np.sum(P**2))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F32, F64, U8, Record
+from thesisrecon.arrays import F32, F64, U8, Record
 from thesisrecon.camera import rq
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.geometry.two_view import homography_linear
@@ -53,19 +53,6 @@ def _quadrilaterals(H: F64, size: tuple[int, int]) -> tuple[F64, F64, F64]:
     corners = middle + reach
     left, right = (dehomogenize(homogenize(corners) @ side.T) for side in H)
     return corners, left, right
-
-
-def detect_monotonicity_violations(disparity: F32) -> B8:
-    """Find the pixels of a rectified image that violate the monotonicity constraint (figure 1.1).
-
-    If u1 is left of v1 then u2 must be left of v2; then u is left of v in every view between.
-    """
-    slack_px = 0.5  # Largest violation of monotonicity that counts as noise of the disparities
-    at = np.arange(disparity.shape[1]) - disparity.astype(np.float64)
-    padded = np.pad(at, ((0, 0), (1, 1)), constant_values=((0, 0), (-np.inf, np.inf)))
-    rightmost = np.fmax.accumulate(padded[:, :-2], axis=1)
-    leftmost = np.fmin.accumulate(padded[:, :1:-1], axis=1)[:, ::-1]
-    return np.asarray((rightmost > at + slack_px) | (leftmost < at - slack_px))
 
 
 @dataclass(frozen=True, eq=False)
