@@ -21,6 +21,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, pixel_from_unit
 from thesisrecon.selfcalibration import cheirality
+from thesisrecon.selfcalibration._upgrade import group_focals_from_planes
 from thesisrecon.selfcalibration.absolute_conic import FixedPlaneQuadric, LinearAbsoluteConic
 from thesisrecon.selfcalibration.stratified import Stratified, _facing, upgrade_to_affine
 
@@ -70,6 +71,14 @@ def test_eight_points_bound_the_plane(points, bounded):
     assert len(region.points) == points
     assert bool(region.polytopes) == bounded
     assert region.wrong_side_ratio(plane[None])[0] == 0.0
+
+
+def test_the_true_plane_and_one_focal_give_those_of_all_cameras():
+    scene = make_scene(seed=6, zoom=0.3)
+    found, plane = setup(scene, CENTRED_ZOOM, seed=6)
+    f = scene.K[:, 0, 0] / 1536.0
+    log_f = group_focals_from_planes(found.frame, plane[None], f[[found.frame.reference]])
+    np.testing.assert_allclose(np.exp(log_f[0, found.frame.group]), f, rtol=1e-6)
 
 
 def test_local_minima_of_a_grid_are_those_of_a_search_of_all_neighbours():
