@@ -111,17 +111,21 @@ def are_finite(*values: Any) -> bool:
     return all(bool((np.abs(one) <= _LARGEST).all()) for one in values)
 
 
-def _real(caller: str, name: str, value: Any, missing: bool) -> F64:
-    if isinstance(value, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in value):
-        value = np.ma.stack(value) if len({np.shape(one) for one in value}) == 1 else value
+def _read(value: Any) -> tuple[Any, B8]:
+    """What ``__array__`` gives and its mask hides; an array of objects if it cannot be read."""
     try:
         hidden = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else np.zeros(0, bool)
         found = np.asarray(value)
-        if found.dtype.kind in "OV" and not isinstance(value, Mapping | str):
-            found = np.asarray(value, dtype=np.float64)
+        return found.astype(np.float64) if found.dtype.kind in "OV" and found.ndim else found, hidden
     except Exception:
         # Tensors that are not in the memory of the processor raise errors of any kind.
-        found, hidden = np.empty(0, dtype=object), np.zeros(0, bool)
+        return np.empty(0, dtype=object), np.zeros(0, bool)
+
+
+def _real(caller: str, name: str, value: Any, missing: bool) -> F64:
+    if isinstance(value, list | tuple) and any(isinstance(one, np.ma.MaskedArray) for one in value):
+        value = np.ma.stack(value) if len({np.shape(one) for one in value}) == 1 else value
+    found, hidden = _read(value)
     if found.dtype.kind not in "biuf" or value is None or not found.ndim:
         kind = "complex numbers" if found.dtype.kind == "c" else f"{value!r}" if not found.ndim else ""
         kind = kind or f"a {type(value).__name__} of {found.dtype}"
@@ -203,13 +207,7 @@ def eight_bit(levels: U8 | F32) -> tuple[U8, B8 | None]:
 
 
 def _level_array(image: Any) -> Any:
-    try:
-        hidden = np.ma.getmaskarray(image) if isinstance(image, np.ma.MaskedArray) else np.zeros(0, bool)
-        array = np.asarray(image)
-        if array.dtype.kind == "O" and array.ndim:
-            array = array.astype(np.float64)
-    except Exception:
-        array, hidden = np.empty(0, dtype=object), np.zeros(0, bool)
+    array, hidden = _read(image)
     if array.dtype.kind not in "biuf":
         kinds = "a path, a Pillow image or a numpy array of grey levels or colours"
         raise ValueError(f"an image must be {kinds}; got a {type(image).__name__} of {array.dtype}")

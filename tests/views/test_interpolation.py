@@ -172,21 +172,6 @@ def test_rectified_and_turned_photographs_give_the_view_of_a_turned_camera(stage
     np.testing.assert_array_equal(pair.view(1.0), turned)
 
 
-def test_monotonicity_fails_with_a_thin_thing_in_front(stage):
-    d = np.full((20, 50), 3.0, np.float32)
-    assert not detect_monotonicity_violations(d).any()
-    d[:, 30:33] = 13.0
-    violated = detect_monotonicity_violations(d)
-    # Its left rim passes nine pixels and meets the tenth.
-    assert violated[:, 21:33].all()
-    assert violated.mean() == pytest.approx(12 / 50)
-    slanted = (3.0 + 0.3 * np.arange(50) * np.ones((20, 1))).astype(np.float32)
-    assert not detect_monotonicity_violations(slanted).any()
-    # What both photographs see of a broad thing keeps its order; with what it hides it does not.
-    assert not detect_monotonicity_violations(stage.maps[0].disparity).any()
-    assert detect_monotonicity_violations(stage.at(0.0)[1].astype(np.float32)).any()
-
-
 def test_the_right_side_follows_from_the_left_and_exposures_are_interpolated(stage):
     off = np.abs(disparity_of_right(stage.maps[0]).disparity - stage.maps[1].disparity)
     assert np.isfinite(off).mean() > 0.75
@@ -211,19 +196,6 @@ def test_corners_behind_a_camera_are_left_out_and_wrong_calls_refused():
     np.testing.assert_allclose(G / G[2, 2], np.linalg.inv(H) / np.linalg.inv(H)[2, 2], atol=1e-9)
     H[2] = [0.0, 0.0, -1.0]
     refuses(ValueError, "infinity", original_from_rectified, np.stack([H, np.eye(3)]), SIZE, 0.5)
-
-
-def test_crossings_are_those_of_all_pairs():
-    rng = np.random.default_rng(0)
-    y, x = np.indices((14, 23)).astype(float)
-    d = (4.0 + np.sin(x / 6.0) + 0.3 * y).astype(np.float32)
-    d[4:9, 7:13] += 6.0
-    d[rng.random(d.shape) < 0.1] = np.nan
-    at = x.astype(np.float32) - d
-    crossed = np.triu(at[:, :, None] > at[:, None, :] + 0.5)
-    plain = crossed.any(axis=1) | crossed.any(axis=2)
-    np.testing.assert_array_equal(detect_monotonicity_violations(d), plain)
-    assert 0 < plain.sum() < plain.size
 
 
 def forward_warp(image, target, near, **more):

@@ -6,6 +6,7 @@ or dataclasses. ``None`` is written as the word ``none``, since TOML has no null
 
 import dataclasses
 import difflib
+import json
 import math
 import tomllib
 import types
@@ -371,11 +372,9 @@ def _toml_lines(table: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
 
 
 def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
     if isinstance(value, list):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+        return f"[{', '.join(map(_toml_value, value))}]"
+    if isinstance(value, str | bool):
+        # JSON has the same words; TOML wants one character more escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
