@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cache
 from html import escape
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from thesisrecon import __version__
 from thesisrecon.arrays import F64
 from thesisrecon.camera import Camera
 from thesisrecon.errors import made
-from thesisrecon.records import Reconstruction, StageReport, TexturedMesh, as_mesh
+from thesisrecon.records import StageReport, TexturedMesh, as_mesh
 from thesisrecon.report import _assessment as words
 from thesisrecon.report import _data
 from thesisrecon.report import _figures as figures
@@ -33,7 +33,6 @@ _INTRINSICS = {
     "k3": "k3", "k4": "k4", "p1": "p1", "p2": "p2", "angle_of_view_deg": "Angle of view (°)",
     "corner_deg": "Corner from the axis (°)",
 }  # fmt: skip
-T = TypeVar("T")
 
 
 def render_page(
@@ -81,15 +80,6 @@ def _packed(script: str) -> str:
     return base64.b64encode(gzip.compress(script.encode("utf-8"), mtime=0)).decode("ascii")
 
 
-def _figure_content(drawn: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """Return the scripts that draw plotly.js figures by element id, and their values for the template."""
-    scripts = [page_resource("unpack.js"), page_resource("page.js")] if drawn else []
-    library = plotly_script() if drawn else ""
-    # page.js adds the unpacked library as a script, which the policy of the page must list too.
-    allowed = [*scripts, library] if drawn else []
-    return allowed, {"figures": drawn, "figure_scripts": scripts, "plotly": _packed(library)}
-
-
 @dataclass(frozen=True)
 class ModelFrame:
     """A page with the viewer of a model, and its frame in a notebook."""
@@ -115,46 +105,45 @@ class ModelFrame:
         return f'<iframe title="Model" {frame} srcdoc="{escape(self.page)}"></iframe>'
 
 
-class _Pictures:
-    """Makes the pictures of a page, each on its own; ``warnings`` are about those that failed."""
-
-    def __init__(self, warnings: list[str]) -> None:
-        self.warnings = warnings
-
-    def make(self, what: str, draw: Callable[..., T], *given: Any, **options: Any) -> T | None:
-        return made(f"{what} in report.html", lambda: draw(*given, **options), self.warnings, None)
+Draw = Callable[..., Any]
+"""Makes a picture: its name, the function that draws it, and what that is given; None if it fails."""
 
 
 def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> str:
     """Render the page of a run; pictures that cannot be drawn are left out, with one of ``warnings``."""
-    pictures = _Pictures([] if warnings is None else warnings)
+    warnings = [] if warnings is None else warnings
+
+    def make(what: str, draw: Callable[..., Any], *given: Any, **options: Any) -> Any:
+        return made(f"{what} in report.html", lambda: draw(*given, **options), warnings, None)
+
     best, names = data.best_reconstruction, [image.name for image in data.images]
     working = _data.reprojection_distances(best) if best is not None else [np.zeros(0)] * len(data.images)
     distances = [d / photo.scale for d, photo in zip(working, data.images, strict=True)]
     overall = _data.summarize_distances(np.concatenate([np.zeros(0), *distances]))
-    plotted, shown = _figures(data, names, pictures)
-    model = None
-    held_out = None
+    plotted, shown = _figures(data, names, make)
+    model = held_out = straight = None
     if data.model is not None and len(data.model.faces) and data.metric is not None:
         cameras = figures.numbered_cameras(data.metric.reconstruction, names)
-        model = pictures.make("the model", figures.viewer_data, data.model, cameras)
+        model = make("the model", figures.viewer_data, data.model, cameras)
     side = figures.depth_side(_sharing(len(data.depths)))
     depths = [
         (i + 1, names[i], picture)
         for i in _data.pictured(len(names))
         if i in data.depths
-        and (picture := pictures.make("a depth map", figures.draw_depth, data.depths[i], side=side))
+        and (picture := make("a depth map", figures.draw_depth, data.depths[i], side=side))
     ]
     if data.held_out is not None:
-        held_out = pictures.make("the held-out image", figures.draw_held_out, data.held_out)
-    straight = None
+        held_out = make("the held-out image", figures.draw_held_out, data.held_out)
     if data.bent and data.metric is not None:
         first = names.index(next(iter(data.bent)))
         of_first = data.images[first], data.metric.reconstruction, first
-        straight = pictures.make("the straight image", figures.draw_straight, *of_first)
-    scripts, content = _figure_content(plotted)
+        straight = make("the straight image", figures.draw_straight, *of_first)
+    scripts = [page_resource("unpack.js"), page_resource("page.js")] if plotted else []
+    # page.js adds the unpacked library as a script, which the policy of the page must list too.
+    library = plotly_script() if plotted else ""
+    allowed = [*scripts, library] if plotted else []
     model_scripts = [page_resource("viewer.js")] if model is not None else []
-    cards = _cards(data, distances, pictures)
+    cards = _cards(data, distances, make)
     estimated = {"focal_px", "principal_x_px", "principal_y_px", "k1"}.union(
         name for view in data.original_intrinsics for name, found in view.items() if found.std != 0.0
     )
@@ -162,15 +151,16 @@ def render_report(data: _data.ReportData, warnings: list[str] | None = None) -> 
     sizes = {name: len(value) for name, value in lists.items() if len(value) > _data.MAX_PICTURED}
     long = {name: f"{size} entries, see summary.json" for name, size in sizes.items()}
     return render_page(
-        page_resource("template.html.j2"), [*scripts, *model_scripts],
+        page_resource("template.html.j2"), [*allowed, *model_scripts],
         filters={name: getattr(words, name) for name in ("grouped", "decimals", "significant")},
         text=words, data=data, version=__version__, overall=overall, cards=cards, depths=depths, model=model,
         intrinsic_columns=[(name, heading) for name, heading in _INTRINSICS.items() if name in estimated],
-        held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), **content,
-        difference_limit=round(figures.DIFFERENCE_LIMIT), drawn_pairs=_drawn_pairs(data, pictures),
+        held_out=held_out, scale=figures.SCALE, stages=_stages(data.reports), figures=plotted,
+        figure_scripts=scripts, plotly=_packed(library), drawn_pairs=_drawn_pairs(data, make),
+        difference_limit=round(figures.DIFFERENCE_LIMIT),
         shown_points=shown, most_points=figures.MAX_POINTS,
         most_pyramids=figures.MAX_PYRAMIDS, all_points=int(best.valid.sum()) if best is not None else 0,
-        warnings=_warnings(data, pictures.warnings), straight=straight, model_scripts=model_scripts,
+        warnings=_warnings(data, warnings), straight=straight, model_scripts=model_scripts,
         summary_text=json.dumps({**data.summary, **long}, indent=2, ensure_ascii=False, default=str),
     )  # fmt: skip
 
@@ -180,32 +170,22 @@ def _sharing(images: int) -> int:
     return min(images, 2 * _data.MAX_PICTURED)
 
 
-def _figures(data: _data.ReportData, names: Sequence[str], pictures: _Pictures) -> tuple[dict[str, Any], int]:
+def _figures(data: _data.ReportData, names: Sequence[str], make: Draw) -> tuple[dict[str, Any], int]:
     """The figures by id (not "scene", which plotly.js uses), and the number of points in 3D."""
     found: dict[str, Any] = {}
-    points = 0
-
-    def draw_scene(best: Reconstruction) -> tuple[figures.Figure | None, int]:
-        scene = figures.build_scene(best)
-        return (
-            (None, 0)
-            if scene is None
-            else (figures.scene_figure(scene, names, data.colors), len(scene.points))
-        )
-
-    if data.metric is not None:
-        best = data.metric.reconstruction
-        if drawn := pictures.make("the figure of cameras and points", draw_scene, best):
-            found["scene-figure"], points = drawn
+    scene, what = None, "the figure of cameras and points"
+    if data.metric is not None and (scene := make(what, figures.build_scene, data.metric.reconstruction)):
+        found["scene-figure"] = make(what, figures.scene_figure, scene, names, data.colors)
     if data.bent:
-        found["lens-figure"] = pictures.make("the lens", figures.lens_figure, data.bent)
+        found["lens-figure"] = make("the lens", figures.lens_figure, data.bent)
     if data.pairs:
-        matrix = pictures.make("the matrix of pairs", figures.pair_matrix_figure, data.pairs, names)
+        matrix = make("the matrix of pairs", figures.pair_matrix_figure, data.pairs, names)
         found["matrix-figure"] = matrix
+    points = len(scene.points) if scene and found.get("scene-figure") else 0
     return {name: figure for name, figure in found.items() if figure is not None}, points
 
 
-def _cards(data: _data.ReportData, distances: list[F64], pictures: _Pictures) -> list[dict[str, Any]]:
+def _cards(data: _data.ReportData, distances: list[F64], make: Draw) -> list[dict[str, Any]]:
     """Each image: its state, the reason, its residuals if it has a camera, and perhaps its picture."""
     cards, intrinsics, count = [], data.original_intrinsics, len(data.images)
     shown = _data.pictured(count)
@@ -216,7 +196,7 @@ def _cards(data: _data.ReportData, distances: list[F64], pictures: _Pictures) ->
         masked = "" if image.mask is None else f", {1.0 - image.mask.mean():.0%} masked"
         picture = None
         if i in shown:
-            picture = pictures.make("a thumbnail", figures.thumbnail, image, _sharing(count))
+            picture = make("a thumbnail", figures.thumbnail, image, _sharing(count))
         card = {"number": i + 1, "name": image.name, "state": state, "level": level, "reason": reason}
         card |= {"size": f"{width} × {height} px{processed}{masked}", "picture": picture}
         card |= {"residuals": _data.summarize_distances(distances[i])}
@@ -235,7 +215,7 @@ def _state(data: _data.ReportData, i: int) -> tuple[str, str, str]:
     return "not registered", "bad", best.reasons[i] or "no reason was recorded"
 
 
-def _drawn_pairs(data: _data.ReportData, pictures: _Pictures) -> list[dict[str, Any]]:
+def _drawn_pairs(data: _data.ReportData, make: Draw) -> list[dict[str, Any]]:
     """Draw the accepted pairs with most and fewest verified matches, else the best rejected one."""
     accepted = [pair for pair in data.pairs if pair.accepted]
     drawable = accepted or [pair for pair in data.pairs if pair.inliers]
@@ -247,7 +227,7 @@ def _drawn_pairs(data: _data.ReportData, pictures: _Pictures) -> list[dict[str, 
     for title, pair in titles:
         given = pair, data.images[pair.i], data.images[pair.j]
         sides = {"names": (given[1].name, given[2].name), "numbers": (pair.i + 1, pair.j + 1)}
-        if picture := pictures.make(f"the picture of the {title.lower()}", figures.draw_pair, *given):
+        if picture := make(f"the picture of the {title.lower()}", figures.draw_pair, *given):
             drawn.append({"title": title, **sides, "facts": words.pair_text(pair), "picture": picture})
     return drawn
 
