@@ -83,25 +83,19 @@ class Camera(Record):
     lens: Lens = "radial"
 
     def __post_init__(self) -> None:
-        given = {name: getattr(self, name) for name in ("K", "R", "t", "distortion")}
-        if self.distortion is None:
-            del given["distortion"]
-        fields = {
-            name: array.copy() for name, array in zip(given, arrays.numbers("Camera", **given), strict=True)
-        }
-        K, R, t = fields["K"], fields["R"], fields["t"]
-        arrays.require_shapes("Camera", K=(K, (3, 3)), R=(R, (3, 3)), t=(t, (3,)))
-        if "distortion" in fields:
-            arrays.require_shapes("Camera", distortion=(fields["distortion"], ("C",)))
+        found = arrays.checked("Camera", K=(self.K, (3, 3)), R=(self.R, (3, 3)), t=(self.t, (3,)))
+        fields = {name: array.copy() for name, array in zip("KRt", found, strict=True)}
+        if self.distortion is not None:
+            (k,) = arrays.checked("Camera", distortion=(self.distortion, ("C",)))
+            fields["distortion"] = k.copy()
             if self.lens == "radial":
-                _require_radial(fields["distortion"])
-        arrays.require_finite("Camera", *fields.values())
+                _require_radial(k)
         try:
             lens_row(self.lens, self._coefficients)
         except ValueError as error:
             raise ValueError(f"Camera: {error}") from None
-        arrays.require_calibration("Camera", K)
-        arrays.require_rotations("Camera", R)
+        arrays.require_calibration("Camera", fields["K"])
+        arrays.require_rotations("Camera", fields["R"])
         try:
             width, height = (operator.index(side) for side in arrays.sizes_of_images(self.size))
         except (TypeError, ValueError):

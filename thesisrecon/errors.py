@@ -45,7 +45,12 @@ def in_words(value: Any) -> str:
     except (ValueError, RecursionError):
         # Python refuses to print numbers of thousands of digits and infinite nesting.
         text = f"{type(value).__name__} too large to print"
-    return text if len(text) <= 120 else text[:117] + "..."
+    return shortened(text, 120)
+
+
+def shortened(text: str, longest: int = 60) -> str:
+    """Cut the end of a long text."""
+    return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
 def unknown_word(what: str, word: Any, known: Iterable[str]) -> str:

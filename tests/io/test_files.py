@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import refuses
-from thesisrecon.errors import WRITE_ERRNOS, OutputError, UsageError, remedies
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, UsageError, remedies, shortened
 from thesisrecon.io import _files as files
 from validation.studies.robustness import disk_ends
 
@@ -77,8 +77,8 @@ def test_a_long_sentence_keeps_its_beginning_and_its_end():
     said = f"'--seed': '{'9' * 50}' is no integer"
     assert files.shorten_middle(said, len(said)) == said
     assert files.shorten_middle(said, 60) == f"'--seed': '{'9' * 29} ... ' is no integer"
-    assert files.shortened("x" * 60) == "x" * 60
-    assert files.shortened("x" * 61) == "x" * 57 + "..."
+    assert shortened("x" * 60) == "x" * 60
+    assert shortened("x" * 61) == "x" * 57 + "..."
 
 
 def test_only_regular_files_of_a_size_are_read(tmp_path):

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import typer
 
-from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError
-from thesisrecon.io._files import printable, shorten_middle, shortened
+from thesisrecon.errors import WRITE_ERRNOS, OutputError, StageFailure, UsageError, shortened
+from thesisrecon.io._files import printable, shorten_middle
 from thesisrecon.runtime._executors import available_threads
 from thesisrecon.runtime._progress import STAGE_LABELS, print_stages
 from thesisrecon.runtime._signals import CODES, REASONS, with_resume_advice

@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from thesisrecon.errors import Notice, OutputError, UsageError, in_words
+from thesisrecon.errors import Notice, OutputError, UsageError, in_words, shortened
 from thesisrecon.io._outputs import OutputFolder, claim_of, digest_of, has_content, not_ours
 
 MAX_TEXT_BYTES = 2**26  # Limit of text files: far above any list of pairs, far below the memory of a computer
@@ -85,11 +85,6 @@ def as_path(caller: str, name: str, path: Any) -> Path:
         rule = f"a path (str or pathlib.Path) as {name}"
         raise UsageError(f"{caller} needs {rule}; got a {type(path).__name__}")
     return Path(path)
-
-
-def shortened(text: str, longest: int = 60) -> str:
-    """Cut the end of a long text."""
-    return text if len(text) <= longest else text[: longest - 3] + "..."
 
 
 def shorten_middle(text: str, longest: int = 600) -> str:

@@ -21,10 +21,10 @@ import scipy
 
 from thesisrecon.arrays import F64, are_finite, require_calibration
 from thesisrecon.camera import Camera, decompose_camera
-from thesisrecon.errors import Notice, UsageError, in_words
+from thesisrecon.errors import Notice, UsageError, in_words, shortened
 from thesisrecon.geometry.strata import nearest_rotation
 from thesisrecon.io._colmap import MAX_SIDE_PX, PIXEL_CENTRE, is_colmap_model, read_colmap_model
-from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name, shortened
+from thesisrecon.io._files import first_repeated, read_json, read_text, require_image_name
 from thesisrecon.lens import simplest_row
 from thesisrecon.results import SparseModel, SparseView
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from thesisrecon import records
-from thesisrecon.errors import Notice, OutputError, UsageError
+from thesisrecon.errors import Notice, OutputError, UsageError, shortened
 from thesisrecon.io import _files
 from thesisrecon.io._outputs import LOCK_FILE, OutputFolder, claim_folder, claim_of, lock_file, lock_part
 from thesisrecon.records import StageReport
@@ -328,7 +328,7 @@ def _differences(there: Any, here: Any, place: str = "") -> Iterator[str]:
 
 
 def _short(value: Any) -> str:
-    return "not set" if value is None else _files.shortened(json.dumps(value, ensure_ascii=False))
+    return "not set" if value is None else shortened(json.dumps(value, ensure_ascii=False))
 
 
 def is_running(folder: Path) -> bool:

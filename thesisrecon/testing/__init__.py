@@ -109,30 +109,12 @@ def camera_deviations(model: Any, truth: Any) -> CameraDeviations:
 
 
 def pose_errors(R: F64, C: F64, R_true: F64, C_true: F64, X: F64) -> F64:
-    """Errors of poses in the inner gauge, which their stated standard deviations are in.
+    """Errors (V, 6) of poses in the inner gauge, which their stated standard deviations are in.
 
-    Parameters
-    ----------
-    R, C : (V, 3, 3), (V, 3)
-        Rotations (world to camera) and centres.
-    R_true, C_true : (V, 3, 3), (V, 3)
-        The same in another world: the similarity that fits best is taken off, then the motion of all cameras
-        as one that remains to first order (Triggs et al. 2000, 9.5).
-    X : (N, 3)
-        Points of the scene, whose middle and size weight rotations against centres; none: those of C.
-
-    Returns
-    -------
-    (V, 6)
-        Rotation about the axes of each camera (rad), and centre along the axes of the world of C.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from thesisrecon.testing import pose_errors
-    >>> R, C = np.tile(np.eye(3), (4, 1, 1)), np.random.default_rng(0).normal(size=(4, 3))
-    >>> bool(np.abs(pose_errors(R, C, R, 3.0 * C + 1.0, C)).max() < 1e-12)
-    True
+    They are rotations about the axes of each camera (rad), and centres along those of the world of R (world
+    to camera) and C. The truth is in another world: the similarity that fits best is taken off, then the
+    motion of all cameras as one that remains to first order (Triggs et al. 2000, 9.5). The middle and size of
+    the points X (N, 3), or of C, weight rotations against centres.
     """
     import numpy as np
     from scipy.spatial.transform import Rotation

@@ -18,8 +18,8 @@ from PIL import Image as PillowImage
 from thesisrecon import sample
 from thesisrecon.api.models import paired_cameras
 from thesisrecon.arrays import B8, F64, U8
-from thesisrecon.errors import UsageError
-from thesisrecon.io._files import shortened, write_atomically
+from thesisrecon.errors import UsageError, shortened
+from thesisrecon.io._files import write_atomically
 from thesisrecon.io._models import read_calibration, read_model
 from thesisrecon.results import SparseModel, SparseView
 
