@@ -9,6 +9,7 @@ import numpy as np
 
 from thesisrecon import arrays
 from thesisrecon.arrays import B8, F64, Record
+from thesisrecon.errors import Notice
 from thesisrecon.lens import (
     Lens,
     angles_from_axis,
@@ -303,9 +304,7 @@ def rq(M: F64) -> tuple[F64, F64]:
 def _require_radial(distortion: F64) -> None:
     """Refuse numbers after k3: their meaning is not that of OpenCV's calibration files."""
     if np.any(distortion[3:]) or (len(distortion) > 3 and np.any(distortion[2:])):
-        both = "they are k1, k2, p1, p2, k3 in OpenCV, and k1, k2, k3, k4, k5 of a radial lens elsewhere"
-        advice = 'give radial k1, k2, k3, or lens="brown" and k1, k2, p1, p2, k3'
-        raise ValueError(f"Camera got {len(distortion)} distortion numbers, and {both}; {advice}")
+        raise ValueError(Notice("ambiguous-distortion", len(distortion)))
 
 
 def project_camera(K: F64, R: F64, t: F64, X: F64, *, distortion: float | F64 = 0.0) -> F64:

@@ -491,8 +491,7 @@ def as_mesh(caller: str, mesh: TexturedMesh) -> TexturedMesh:
     ``ValueError`` unless faces, colours and texture coordinates fit the vertices, finite where used.
     """
     if not isinstance(mesh, TexturedMesh):
-        given = f"got a {type(mesh).__name__} (a run until 'metric' has no mesh)"
-        raise ValueError(f"{caller} needs a TexturedMesh; {given}")
+        raise ValueError(Notice("no-mesh", caller, type(mesh).__name__))
     missing = ("vertices", "faces", "uv")
     vertices, corners = arrays.numbers(caller, missing=missing, vertices=mesh.vertices, faces=mesh.faces)
     n = len(vertices)
@@ -500,8 +499,7 @@ def as_mesh(caller: str, mesh: TexturedMesh) -> TexturedMesh:
         advice = "; divide homogeneous ones by their last coordinate" if vertices.shape[1:] == (4,) else ""
         raise ValueError(f"{caller} needs vertices (N, 3) of the mesh; got {vertices.shape}{advice}")
     if corners.ndim != 2 or corners.shape[1] not in (3, 4):
-        rule = "faces (M, 3), or (M, 4) of quads, of the mesh"
-        raise ValueError(f"{caller} needs {rule}; got {corners.shape}; divide other polygons into triangles")
+        raise ValueError(Notice("shape-of-faces", caller, corners.shape))
     if not (corners == np.rint(corners)).all():
         raise ValueError(f"{caller} needs faces of whole numbers, the rows of their vertices; some are not")
     faces = corners.astype(np.int64)

@@ -18,7 +18,7 @@ from thesisrecon.api.given import (
 )
 from thesisrecon.arrays import B8, F64, I64, Record
 from thesisrecon.camera import Camera, camera_of_row
-from thesisrecon.errors import counted, require_word
+from thesisrecon.errors import Notice, counted, require_word
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.lens import ANGLE, BASE, DIVISION
 from thesisrecon.optimize.bundle import knowledge, metric, projection
@@ -287,9 +287,7 @@ def _problem(
         (xy,) = arrays.numbers("bundle_adjust", missing=("xy",), xy=xy)
         shape = (len(views), len(X), 2)
         if xy.shape != shape:
-            raise ValueError(
-                f"bundle_adjust of {len(views)} cameras and {len(X)} points needs xy {shape}; got {xy.shape}"
-            )
+            raise ValueError(Notice("shape-of-observations", len(views), len(X), shape, xy.shape))
         point, view = np.nonzero(np.isfinite(xy).all(axis=2).T)
         observed = Observations(view, point, xy[view, point])
     arrays.require_shapes("bundle_adjust", X=(X, ("N", 3)))
@@ -335,16 +333,13 @@ def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequen
     """Gaussian prior of the table of intrinsics (V, 8)."""
     std = np.full(table.shape, np.inf)
     if not isinstance(prior, Mapping):
-        rule = "a mapping of free intrinsics to standard deviations"
-        raise ValueError(f"prior must be {rule}; got a {type(prior).__name__}")
+        raise ValueError(Notice("no-prior", type(prior).__name__))
     for name, value in prior.items():
         if name not in COLUMNS or not free[list(COLUMNS[name])].all():
             raise ValueError(f"prior has {name!r}, which is not among the free intrinsics {tuple(names)}")
         values = arrays.number_or_numbers("bundle_adjust", f"prior[{name!r}]", value)
         if values.shape not in ((), (len(table),)):
-            raise ValueError(
-                f"prior[{name!r}] must be a number or one per camera ({len(table)},); got {value}"
-            )
+            raise ValueError(Notice("prior-of-cameras", name, len(table), value))
         if not ((values >= 0.0).all() if values.ndim else 0.0 < values < np.inf):
             raise ValueError(f"prior[{name!r}] is a standard deviation and must be above 0; got {value}")
         std[:, list(COLUMNS[name])] = values[..., None]
@@ -371,8 +366,7 @@ def _positions(name: str, at: F64 | None, std: float | F64, n: int, seen: I64) -
     (at,) = arrays.numbers("bundle_adjust", missing=(name,), **{name: at})
     widths = arrays.number_or_numbers("bundle_adjust", f"standard deviation of {name}", std)
     if at.shape != (n, 3) or widths.shape not in ((), (3,), (n, 3)):
-        form = f"({n}, 3) with a standard deviation each, (3,) or ({n}, 3)"
-        raise ValueError(f"{name} must have the shape {form}; got {at.shape} and {widths.shape}")
+        raise ValueError(Notice("shape-of-positions", name, n, at.shape, widths.shape))
     known = np.isfinite(at).all(axis=1) & np.isin(np.arange(n), seen)
     widths = np.broadcast_to(widths, (n, 3))[known]
     if not (widths > 0.0).all():
@@ -387,8 +381,7 @@ def _whitening(covariances: F64 | None, dense: tuple[int, ...] | None, observed:
     (Q,) = arrays.numbers("bundle_adjust", covariances=covariances)
     shape = (len(observed.xy),) if dense is None else dense[:2]
     if Q.shape not in (shape, (*shape, 2, 2)):
-        form = f"{shape} or {(*shape, 2, 2)}"
-        raise ValueError(f"covariances must have the shape {form} of the observations; got {Q.shape}")
+        raise ValueError(Notice("shape-of-covariances", shape, (*shape, 2, 2), Q.shape))
     Q = Q if dense is None else Q[observed.view_index, observed.point_index]
     Q = Q[:, None, None] * np.eye(2) if Q.ndim == 1 else Q
     try:
@@ -487,9 +480,7 @@ def _check_convention(start: MetricCameras, X: F64, o: Observations) -> None:
             best, said = misfit, name
     # Less is the error of a start, not of a convention.
     if best < 0.1 * given and given > 0.005 * np.ptp(seen.xy, axis=0).max():
-        now = f"median residual of {best:.2g} px instead of {given:.2g}"
-        rule = "bundle_adjust needs R world to camera and t = -R centre"
-        raise ValueError(f"the pixels fit the poses if {said} ({now}); {rule}: convert them")
+        raise ValueError(Notice("other-convention", said, best, given))
 
 
 def _misfit(residual: F64) -> float:
@@ -523,8 +514,7 @@ def _check(
     behind = float(np.mean(depth <= 0.0)) if len(depth) else 0.0
     # Of most points only if the poses use another convention.
     if behind > 0.5:
-        rule = "R is world to camera and t = -R centre"
-        raise ValueError(f"{behind:.0%} of the observed points lie behind their cameras; {rule}")
+        raise ValueError(Notice("points-behind-cameras", behind))
     seen, points = np.unique(view), np.unique(point)
     own = sum(len(np.unique(start.shared[seen, c])) for c in np.flatnonzero(free)) if not bound else 0
     fixed = [
@@ -536,6 +526,4 @@ def _check(
     unknowns = POSE_DOF * (len(seen) - fixed[0]) + 3 * (len(points) - fixed[1]) + own
     unknowns -= 0 if any(fixed) or priors else 7
     if 2 * len(view) + priors < unknowns or len(seen) < (1 if fixed[1] or priors else 2):
-        given = f"{len(view)} observations in {len(seen)} views give {2 * len(view)} equations"
-        rule = "bundle_adjust needs two views and as many equations as unknowns"
-        raise ValueError(f"{rule}; {given} for {unknowns} unknowns")
+        raise ValueError(Notice("few-equations", len(view), len(seen), 2 * len(view), unknowns))

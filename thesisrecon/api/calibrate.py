@@ -10,7 +10,7 @@ from thesisrecon.arrays import F64, I64, checked, numbers, require_shapes, sizes
 from thesisrecon.config import KINDS, PipelineConfig, SelfCalibrator
 from thesisrecon.config.intrinsics import prior_for
 from thesisrecon.config.text import Config, as_config
-from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.errors import Notice, StageFailure, UsageError, unknown_word
 from thesisrecon.geometry.homogeneous import homogenize, pixel_from_unit
 from thesisrecon.pipeline.run import stream
 from thesisrecon.records import Reconstruction, SelfCalibration
@@ -194,9 +194,7 @@ def _projective(
     """The projective reconstruction that was given, or that of plain cameras."""
     if not isinstance(given, Reconstruction):
         if sizes is None:
-            way = "reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
-            message = f"{caller} needs the sizes (width, height) of the images with plain cameras: {way}"
-            raise ValueError(message)
+            raise ValueError(Notice("cameras-without-sizes", caller))
         try:
             return reconstruction_from_cameras(given, sizes=sizes, X=X, xy=xy, stratum="projective")
         except ValueError as error:
@@ -204,13 +202,7 @@ def _projective(
             raise ValueError(str(error).replace("reconstruction_from_cameras", caller)) from None
     if given.stratum == "projective":
         return given
-    advice = (
-        "its calibration is its field K already; to estimate it again pass the projective one, such as "
-        "result.projective, or reconstruction_from_cameras(P, sizes=sizes, stratum='projective')"
-        if given.stratum == "metric"
-        else "pass the projective one that it was made from"
-    )
-    raise ValueError(f"{caller} takes a projective reconstruction; got {given.stratum}: {advice}")
+    raise ValueError(Notice(f"no-projective-but-{given.stratum}", caller))
 
 
 def _method(

@@ -10,7 +10,7 @@ from thesisrecon import arrays
 from thesisrecon.api.given import calibrated_arrays, checked_sizes
 from thesisrecon.arrays import F64, I64, Stratum
 from thesisrecon.camera import compose_camera, decompose_camera
-from thesisrecon.errors import require_word
+from thesisrecon.errors import Notice, require_word
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.optimize.bundle.partial import TriangulationMethod, triangulate_points
 from thesisrecon.optimize.ransac import Budget, Resection, resect_robust
@@ -214,8 +214,7 @@ def require_inside(view: I64, xy: F64, sizes: I64) -> None:
     # Pixels this far outside show that the size is wrong, for example height x width.
     if len(reach) and reach.max() > 0.1:
         k = int(reach.argmax())
-        what = f"its size {tuple(size[k].tolist())} by {reach[k]:.0%} of the long side"
-        raise ValueError(f"pixels of view {view[k]} lie outside {what}; sizes are (width, height)")
+        raise ValueError(Notice("pixels-outside", view[k], tuple(size[k].tolist()), reach[k]))
 
 
 def _checked_points(
@@ -247,15 +246,10 @@ def require_threshold(threshold_px: float | None, *points: F64) -> None:
         return
     given = arrays.number("the search", "threshold_px", threshold_px, "a positive number or None")
     if not 0.0 < given < np.inf:
-        raise ValueError(
-            f"threshold_px must be positive and finite, or None for no search; got {threshold_px}"
-        )
+        raise ValueError(Notice("no-threshold", threshold_px))
     extents = [float(np.ptp(xy, axis=0).max()) for xy in points if len(xy)]
     if extents and 0.0 < (extent := min(extents)) <= threshold_px:
-        raise ValueError(
-            f"threshold_px must be smaller than the extent of the points, {extent:.3g}, which it cannot tell "
-            f"from wrong ones otherwise; got {threshold_px:g}"
-        )
+        raise ValueError(Notice("large-threshold", extent, threshold_px))
 
 
 def search_budget(confidence: float, max_samples: int) -> Budget:

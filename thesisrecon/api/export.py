@@ -13,7 +13,7 @@ from thesisrecon._numba import ThreadPool
 from thesisrecon.api.given import Model, as_sparse_model
 from thesisrecon.arrays import B8, F64, I64, flag, rows_of_views
 from thesisrecon.camera import viewing_rays
-from thesisrecon.errors import UsageError, require_word
+from thesisrecon.errors import Notice, UsageError, require_word
 from thesisrecon.geometry.homogeneous import dehomogenize, homogenize
 from thesisrecon.imaging.pinholes import FACES, WIDE, is_wide, seen_faces
 from thesisrecon.imaging.resampling import undistort_image
@@ -134,9 +134,7 @@ def export(
         gave = f"the {len(model.views)} images gave {len(undistorted.views)} pinhole images"
         notes.append(f"{gave}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees")
     if images is None:
-        raise UsageError(
-            "the model does not record the folder of its images; give it with --images (images=)"
-        )
+        raise UsageError(Notice("images-not-recorded"))
     paths = _images.find_images(images, model.names)
     may_mask = masks is not None or divided or any(map(_images.may_be_transparent, paths))
     found = {} if masks is None else _images.find_masks(Path(masks), model.names)[0]
@@ -174,8 +172,7 @@ def require_separate(
     there = [path for path in written if path.exists()]
     lost = next((path for path in given if path.exists() and any(map(path.samefile, there))), None)
     if lost is not None:
-        message = f"the export to {folder} would replace the originals in {lost}; export to another folder"
-        raise UsageError(message)
+        raise UsageError(Notice("export-over-originals", folder, lost))
 
 
 def _require_cameras(model: SparseModel, to: str) -> None:
@@ -189,8 +186,7 @@ def _require_cameras(model: SparseModel, to: str) -> None:
         if view.distortion is None:
             raise UsageError(f"the lens model of image {view.name} is unknown; it cannot be exported")
         if to == "colmap" and has_skew(view.K):
-            advice = "colmap-undistorted removes it from the images"
-            raise UsageError(f"{to} has no camera model with skew, but image {view.name} has skew; {advice}")
+            raise UsageError(Notice("export-with-skew", to, view.name))
 
 
 def _rounding_notes(model: SparseModel) -> list[str]:
@@ -273,8 +269,7 @@ def _undistorted(model: SparseModel, *, keep_lens: bool = False) -> tuple[Sparse
         views.append(replace(view, name=name, K=K, size=size, distortion=np.zeros(3)))
         pinholes.append([_Pinhole(views[-1], None)])
     if (twice := first_repeated((view.name for view in views), as_files=True)) is not None:
-        rule = f"two images of the model would be written as {twice} (regardless of case)"
-        raise UsageError(f"{rule}; rename one of them")
+        raise UsageError(Notice("exported-twice", twice))
     return replace(model, views=views, xy=xy, view_index=view_index), pinholes
 
 
@@ -343,10 +338,7 @@ def _pinhole_frame(view: SparseView) -> tuple[F64, tuple[int, int]]:
     K[:2, 2] = centre - first
     if not (np.isfinite(K).all() and size.min() >= 16):
         k = ", ".join(f"{value:.3g}" for value in distortion)
-        place = f"distortion {k}, principal point {original[0, 2]:.0f}, {original[1, 2]:.0f}"
-        advice = "the camera is not plausible, so export the model as colmap"
-        what = f"the undistorted image of {view.name} would be {size[0]} x {size[1]} px"
-        raise UsageError(f"{what} ({place}); {advice}")
+        raise UsageError(Notice("implausible-pinhole", view.name, *size, k, *original[:2, 2]))
     return K, (int(size[0]), int(size[1]))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from thesisrecon.arrays import F64, I64, numbers, require_shapes, sizes_of_images
 from thesisrecon.camera import Camera, camera_of_row
-from thesisrecon.errors import UsageError, in_words
+from thesisrecon.errors import Notice, UsageError, in_words
 from thesisrecon.geometry.camera_matrix import pose_of_camera
 from thesisrecon.io._files import require_image_name
 from thesisrecon.io._images import ImageSet
@@ -52,8 +52,7 @@ def as_sparse_model(model: Model, what: str = "a model") -> SparseModel:
                 raise UsageError(f"{what}, a {type(model).__name__}, cannot be read ({error})") from None
             return read_model(folder)
     if not isinstance(model, RunResult):
-        kinds = "a path, a RunResult, a SparseModel, a metric Reconstruction or Cameras, by name or in a list"
-        raise UsageError(f"{what} must be {kinds}; got {in_words(model)} ({type(model).__name__})")
+        raise UsageError(Notice("no-model", what, in_words(model), type(model).__name__))
     # Imported on use: models in memory need no stages.
     from thesisrecon.pipeline.outputs import folder_with, save_result
 
@@ -78,8 +77,7 @@ def _model_of_cameras(cameras: Mapping[str, Camera] | Sequence[Camera]) -> Spars
         cameras = {f"image-{i:0{width}d}": camera for i, camera in enumerate(cameras)}
     for name, camera in cameras.items():
         if not isinstance(camera, Camera):
-            rule = "Camera(K, R, t, size) or Camera.from_matrix(P, size) of each image"
-            raise UsageError(f"a model of cameras needs {rule}; {name} is a {type(camera).__name__}")
+            raise UsageError(Notice("no-camera-in-model", name, type(camera).__name__))
         require_image_name(name, "a model of cameras")
     numbers_of: dict[bytes, int] = {}
     views = []
@@ -119,8 +117,7 @@ def given_cameras(
     """
     found = [cameras.get(image.name) for image in inputs.images]
     if not any(found) and inputs.images:
-        names = f"the first image is {inputs.images[0].name}, the first camera that of {next(iter(cameras))}"
-        raise UsageError(f"no image has a known camera: {names}")
+        raise UsageError(Notice("no-known-camera", inputs.images[0].name, next(iter(cameras))))
     for image, camera in zip(inputs.images, found, strict=True):
         if camera is not None and camera.size != image.original_size:
             sizes = "{} x {} pixels, its known camera {} x {}".format(*image.original_size, *camera.size)
@@ -135,8 +132,7 @@ def cameras_of_model(model: SparseModel, path: object) -> dict[str, Camera]:
         if view.K is None or view.size is None:
             raise UsageError(f"{path} gives {view.name} no intrinsics, or no width and height")
         if view.distortion is None:
-            advice = "write undistorted images with thesisrecon export --to colmap-undistorted"
-            raise UsageError(f"{path} gives {view.name} a lens of an unknown kind; {advice}")
+            raise UsageError(Notice("unknown-lens", path, view.name))
         pose = view.K, view.R, view.t
         cameras[view.name] = camera_of_row(
             pose, view.size, view.distortion, std=view.std, as_stored=model.as_stored
@@ -160,15 +156,13 @@ def as_cameras(
             raise ValueError(f"{caller} got no camera for {missing[0]}; the first camera is that of {first}")
         for name, camera in cameras.items():
             if not isinstance(camera, Camera):
-                rule = "a thesisrecon.Camera by each name"
-                raise ValueError(f"{caller} needs {rule}; that of {name} is a {type(camera).__name__}")
+                raise ValueError(Notice("no-camera-by-name", caller, name, type(camera).__name__))
         return [cameras[name] for name in names or cameras]
     given: list[Any] = list(cameras) if isinstance(cameras, Sequence) else []
     if given and all(isinstance(one, Camera) for one in given):
         return given
     if len(given) != 3 or any(isinstance(one, Camera | str) for one in given):
-        kinds = "cameras as thesisrecon.Camera, result.reconstruction, or a tuple (K, R, t) of arrays"
-        raise ValueError(f"{caller} needs {kinds}; got a {type(cameras).__name__}")
+        raise ValueError(Notice("no-camera-input", caller, type(cameras).__name__))
     if sizes is None:
         raise ValueError(f"{caller} needs sizes (V, 2) or (2,), width and height, with (K, R, t)")
     K, R, t = calibrated_arrays(caller, *given)

@@ -18,7 +18,7 @@ from thesisrecon.api.given import Model, as_sparse_model, cameras_of_model
 from thesisrecon.api.lenses import undistort_points
 from thesisrecon.arrays import B8, F64, Record, number, numbers, whole_number
 from thesisrecon.camera import Camera
-from thesisrecon.errors import UsageError, counted, in_words, require_word
+from thesisrecon.errors import Notice, UsageError, counted, in_words, require_word
 from thesisrecon.geometry.homogeneous import scene_frame
 from thesisrecon.geometry.strata import estimate_similarity, rotation_errors_deg
 from thesisrecon.io._files import as_path, name_without_suffix, read_json
@@ -118,8 +118,7 @@ def align_to_positions(
     if isinstance(positions, str | PathLike):
         positions, origin = read_positions(Path(positions))
     if not isinstance(positions, Mapping):
-        kinds = "positions by image name, or a CSV file"
-        raise UsageError(f"alignment needs {kinds}; got a {type(positions).__name__}")
+        raise UsageError(Notice("no-positions", type(positions).__name__))
     whole_number("align_to_positions", "seed", seed, 0)
     model = as_sparse_model(model)
     centres = {view.name: view.centre for view in model.views}
@@ -163,10 +162,7 @@ def _require_lengths(positions: F64) -> None:
     inside = max(first, second) <= 180.0 and min(first, second) <= 90.0
     # Sites are smaller than 0.1 degrees (11 km) and far from (0, 0); lengths of this kind: a rig of 10 cm.
     if inside and spread < 0.1 and float(np.linalg.norm(centre)) > 100.0 * spread:
-        raise UsageError(
-            "the positions look like latitude and longitude in degrees, which are no lengths; give a file "
-            "whose header names the columns lat, lon and alt, or subtract an offset if they are lengths"
-        )
+        raise UsageError(Notice("positions-in-degrees"))
 
 
 def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel:
@@ -203,8 +199,7 @@ def scaled(model: Model, name1: str, name2: str, distance: float) -> SparseModel
     distance = number("scaled", "distance", distance, "a positive number")
     now = float(np.linalg.norm(centres[name1] - centres[name2]))
     if not (0.0 < distance < math.inf and now > 0.0):
-        have = f"got {distance:g}, and the cameras of {name1} and {name2} are {now:g} apart in the model"
-        raise UsageError(f"the scale needs a positive distance of two different cameras; {have}")
+        raise UsageError(Notice("no-distance-of-cameras", distance, name1, name2, now))
     return model.transformed(Similarity.scaling(distance / now))
 
 
@@ -257,15 +252,11 @@ def scaled_by_points(
     for name, given in pixels.items():
         (ends,) = numbers("scaled_by_points", pixels=given)
         if ends.shape != (2, 2) or not np.isfinite(ends).all():
-            raise UsageError(
-                f"the scale needs two points, (2, 2) numbers, in each image; {name} has {given!r}"
-            )
+            raise UsageError(Notice("no-two-points", name, given))
         xy.append(ends)
     distance = number("scaled_by_points", "distance", distance, "a positive number")
     if len(xy) < 2 or not 0.0 < distance < math.inf:
-        raise UsageError(
-            f"the scale needs two images and a positive distance; got {len(xy)} and {distance:g}"
-        )
+        raise UsageError(Notice("no-distance-of-points", len(xy), distance))
     chosen = [cameras[name] for name in pixels]
     seen = np.stack([undistort_points(ends, one) for ends, one in zip(xy, chosen, strict=True)])
     ends = triangulate(np.stack([one.P for one in chosen]), seen)
@@ -274,9 +265,7 @@ def scaled_by_points(
     longest = max(max(one.size) for one in chosen)
     now = float(np.linalg.norm(X[0] - X[1]))
     if not (np.isfinite(X).all() and now > 0.0 and off < 0.01 * longest):
-        raise UsageError(
-            f"the pixels do not show the same two points: they are {off:.0f} px from those that fit best"
-        )
+        raise UsageError(Notice("other-points", off))
     return model.transformed(Similarity.scaling(distance / now))
 
 
@@ -351,9 +340,7 @@ def load(out: str | Path) -> RunResult:
     folder = as_path("load", "out", out)
     summary, run = read_json(folder / results.SUMMARY), read_json(folder / RUN_FILE)
     if not isinstance(summary, dict) or not isinstance(run, dict):
-        raise UsageError(
-            f"{folder} holds no {results.SUMMARY} and {RUN_FILE}; no run has finished in this folder"
-        )
+        raise UsageError(Notice("no-run", folder, results.SUMMARY, RUN_FILE))
     try:
         return load_run(folder, summary, run)
     except ChangedRecord as error:
@@ -447,8 +434,7 @@ def compare_models(
     tolerance = number("compare_models", "max_time_difference", max_time_difference)
     offset = number("compare_models", "time_offset", time_offset)
     if not (tolerance >= 0.0 and np.isfinite(offset)):
-        rule = "max_time_difference of at least 0 and a finite time_offset"
-        raise ValueError(f"compare_models needs {rule}; got {tolerance:g} and {offset:g}")
+        raise ValueError(Notice("no-time-difference", tolerance, offset))
     pairs = paired_cameras(first, second, notes, tolerance, offset)
     left, right = [first.views[i] for i, _ in pairs], [second.views[j] for _, j in pairs]
     R, R_b = (np.array([view.R for view in views]) for views in (left, right))
@@ -479,8 +465,7 @@ def compare_models(
 def _model(model: Model, which: str) -> SparseModel:
     found = as_sparse_model(model, f"the {which} model of a comparison")
     if not len(found.views):
-        rule = "a path or a model in memory with at least one camera"
-        raise UsageError(f"the {which} model of a comparison must be {rule}; it has none")
+        raise UsageError(Notice("model-without-camera", which))
     return found
 
 
@@ -504,10 +489,7 @@ def _pairs_by_time(
     least = np.abs(times - times_b[nearest])
     pairs = [(int(i), int(nearest[i])) for i in np.flatnonzero(mutual & (least <= tolerance))]
     if not pairs:
-        rule = (
-            "give a larger max_time_difference, or the time_offset that is added to the times of the second"
-        )
-        raise UsageError(f"the nearest times of the models are {least.min():.6g} s apart; {rule}")
+        raise UsageError(Notice("no-common-times", least.min()))
     most = max(float(least[i]) for i, _ in pairs)
     counts = f"{len(pairs)} of {len(times)} and {counted(len(times_b), 'camera')}"
     given = f"at most {most:.3g} s apart (tolerance {tolerance:g} s, offset {offset:g} s)"
@@ -549,8 +531,7 @@ def paired_cameras(
         notes.append(f"no name is common; the {len(a.views)} cameras were paired by their order alone")
         return [(i, i) for i in range(len(a.views))]
     names = (f"{_few(model.names)} in the {which}" for which, model in (("first", a), ("second", b)))
-    advice = "give models of the same images, or a trajectory of as many cameras"
-    raise UsageError(f"the models have no common camera: {' and '.join(names)}; {advice}")
+    raise UsageError(Notice("no-common-camera", " and ".join(names)))
 
 
 def _number_of_dtu(name: str) -> str:

@@ -110,8 +110,7 @@ def reconstruct(
     frames = None if every is None else _frame_source(images, every, run)
     if isinstance(images, str | Path):
         if Path(images).is_file() and frames is None:
-            message = f"{images} is a file; give a folder of images, or a video and --every N (every=N)"
-            raise UsageError(message)
+            raise UsageError(Notice("file-of-images", images))
     else:
         images = _images.list_of_images("reconstruct", images)
     run.images_folder = _images.images_folder(images) if frames is None else frames.home(run.directory.path)
@@ -147,8 +146,7 @@ def _frame_source(images: _images.ImageSource, every: int, run: Run) -> FrameSou
     if not isinstance(images, str | Path):
         raise UsageError("every needs a video or a folder of frames, not a list of images")
     if isinstance(run.config.pairs, ListedPairs):
-        message = "pairs by name cannot be combined with every, which chooses the images; use window:N"
-        raise UsageError(message)
+        raise UsageError(Notice("pairs-of-frames"))
     return FrameSource(Path(images), every)
 
 

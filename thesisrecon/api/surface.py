@@ -13,7 +13,7 @@ from thesisrecon.arrays import F32, F64, I64, U8, number, numbers, resizing_tran
 from thesisrecon.camera import Camera
 from thesisrecon.config import DepthEstimator
 from thesisrecon.config.text import Config, as_config
-from thesisrecon.errors import StageFailure, UsageError, counted
+from thesisrecon.errors import Notice, StageFailure, UsageError, counted
 from thesisrecon.imaging.pinholes import pinhole_numbers, pinhole_view
 from thesisrecon.io import _images
 from thesisrecon.lens import stacked_rows
@@ -116,8 +116,7 @@ def match_rectified(
             raise ValueError(f"match_rectified needs max_disparity_px of at least 0, finite; got {most:g}")
         return match(images[0], images[1], max_disparity_px=most)
     if not -np.inf < least <= most < np.inf:
-        rule = "finite min_disparity_px <= max_disparity_px"
-        raise ValueError(f"match_rectified needs {rule}; got {least:g} and {most:g}")
+        raise ValueError(Notice("disparity-range", least, most))
     first = int(np.floor(least))
     # One image moves to the right by whole columns, so that disparities begin at 0.
     places = max(-first, 0), max(first, 0)
@@ -276,8 +275,7 @@ def fuse_depth_maps(
         raise ValueError("fuse_depth_maps needs the cameras of plain depths")
     views = as_cameras("fuse_depth_maps", cameras, sizes)
     if len(views) != len(depth_maps):
-        message = f"fuse_depth_maps needs a camera per depth map; got {len(views)} and {len(depth_maps)}"
-        raise ValueError(message)
+        raise ValueError(Notice("camera-per-depth-map", len(views), len(depth_maps)))
     given = enumerate(zip(depth_maps, views, strict=True))
     return model.surface_of([_plain(i, depth, view) for i, (depth, view) in given], threads=threads)
 
@@ -352,9 +350,8 @@ def _scene(
     scaled = []
     for name, image, view in zip(names, read, views, strict=True):
         if image.original_size != view.size:
-            what = f"image {name} has (width, height) {image.original_size}, its camera is for {view.size}"
-            rule = f"cameras in pixels of the images {_images.rotation_words(view.as_stored)}"
-            raise ValueError(f"{what}; give {rule}, or Camera.scaled(...)")
+            words = _images.rotation_words(view.as_stored)
+            raise ValueError(Notice("camera-of-another-size", name, image.original_size, view.size, words))
         scaled.append(_scaled(view, image.scale, image.size))
     model = _model(scaled)
     if isinstance(cameras, records.Reconstruction) and len(cameras.tracks.xy):
@@ -392,8 +389,7 @@ def _model(views: Sequence[Camera]) -> records.Reconstruction:
 def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
     (limits,) = numbers("depth_maps", depth_range=depth_range)
     if limits.shape not in ((2,), (n, 2)):
-        message = f"depth_range needs shape (2,) or ({n}, 2), nearest and farthest; got {limits.shape}"
-        raise ValueError(message)
+        raise ValueError(Notice("shape-of-depth-range", n, limits.shape))
     limits = np.broadcast_to(limits, (n, 2))
     if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (limits[:, 1] > limits[:, 0]).all()):
         raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
@@ -409,8 +405,6 @@ def _plain(number: int, depth: F32 | F64, camera: Camera) -> records.DepthMap:
         raise ValueError(f"plain depths need (H, W) and a camera without distortion; got {z.shape}")
     height, width = z.shape
     if abs(width / camera.size[0] - height / camera.size[1]) > 1.0 / min(camera.size):
-        raise ValueError(
-            f"depth map {number} of {width} x {height} px needs a camera of its shape; got {camera.size}"
-        )
+        raise ValueError(Notice("camera-of-depth-map", number, width, height, camera.size))
     own = _scaled(camera, width / camera.size[0], (width, height))
     return records.DepthMap(number, own.P, z, z / np.float32(own.K[0, 0]), np.isfinite(z).astype(np.uint8))

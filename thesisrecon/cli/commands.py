@@ -375,9 +375,7 @@ def exercises(
         typer.echo((home / f"{name}.py").read_text("utf-8"), nl=False)
         return
     if file is None or not file.is_file():
-        raise UsageError(
-            f"exercises check takes your file, as: thesisrecon exercises check {name} my.py; got {file}"
-        )
+        raise UsageError(Notice("no-solution-file", name, file))
     # A process of its own: an endless loop can be ended.
     command = [sys.executable, str(home / "grader.py"), name, str(file)]
     try:

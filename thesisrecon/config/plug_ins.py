@@ -57,8 +57,7 @@ def _require_inside(who: str, xy: F64, size: tuple[int, int] | None, name: str) 
     outside = ((xy < -0.5) | (xy > np.subtract(size or (np.inf, np.inf), 0.5))).any(axis=1)
     if size is not None and outside.any():
         x, y = xy[outside][0]
-        where = f"outside the image of {size[0]} x {size[1]} px (its first pixel centre is (0, 0))"
-        raise UsageError(f"{who} returned {name} with ({x:g}, {y:g}) {where}")
+        raise UsageError(Notice("returned-outside", who, name, x, y, *size))
 
 
 def _matches(
