@@ -69,13 +69,7 @@ def require_word(what: str, word: Any, known: Iterable[str]) -> str:
 
 
 class Notice(str):
-    """Text of a warning, failed check or reason of ``messages.toml``, which states cause and remedy too.
-
-    Parameters
-    ----------
-    code, *values : str, object
-        Key of the message, kept as an attribute, and the values of its text.
-    """
+    """Text of the key ``code`` of ``messages.toml``, which states cause and remedy too, with its values."""
 
     code: str
 
@@ -167,15 +161,7 @@ class WorkersLost(UsageError):
 
 
 class OutputError(UsageError):
-    """A file or folder that cannot be written, for example for a full disk or missing permission.
-
-    Parameters
-    ----------
-    place, error : path or str, OSError
-        File or folder, whose old content is unchanged, and the cause.
-    kept : path
-        Run folder to resume from, if any.
-    """
+    """A file or folder, whose old content is unchanged, cannot be written; ``kept``: run to resume from."""
 
     def __init__(self, place: str | PathLike[str], error: OSError, kept: str | PathLike[str] = "") -> None:
         self.place, self.error, self.kept = place, error, kept

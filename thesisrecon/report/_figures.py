@@ -236,33 +236,26 @@ def lens_figure(cameras: Mapping[str, Camera]) -> Figure:
     """
     traces = list[Figure]()
     for (name, camera), color in zip(cameras.items(), cycle(HUES_OF_LENSES), strict=False):
-        half = np.array(camera.angles_of_view) * [0.5, 1.0]
         corners = np.array([[x, y] for x in (0, camera.size[0]) for y in (0, camera.size[1])]) - 0.5
         far = max(corners - camera.K[:2, 2], key=lambda corner: float(np.linalg.norm(corner)))
-        radii = np.linspace(0.0, np.linalg.norm(far), 65)
-        rays = viewing_rays(
-            camera.K, camera.K[:2, 2] + np.linspace(0.0, 1.0, 65)[:, None] * far, camera.lens_row
-        )
-        angle = np.degrees(angles_from_axis(rays))
-        straight = np.degrees(np.arctan(radii / camera.K[0, 0]))
+        radii, steps = np.linspace(0.0, np.linalg.norm(far), 65), np.linspace(0.0, 1.0, 65)
+        rays = viewing_rays(camera.K, camera.K[:2, 2] + steps[:, None] * far, camera.lens_row)
+        pinhole = np.arctan(radii / camera.K[0, 0])
+        for label, angle, line in (
+            (escape(name), angles_from_axis(rays), {"color": color}),
+            ("pinhole", pinhole, {"color": color, "dash": "dot", "width": 1}),
+        ):
+            known = [None if np.isnan(v) else round(float(v), 3) for v in np.degrees(angle)]
+            curve = {"x": np.round(radii, 1).tolist(), "y": known, "name": label, "line": line}
+            traces.append({"type": "scatter", "mode": "lines", "hoverinfo": "skip", **curve})
+        half = np.array(camera.angles_of_view) * [0.5, 1.0]
         std = [(camera.std or {}).get(key, np.nan) for key in ("angle_of_view_deg", "corner_deg")]
-        bars = 1.96 * np.array(std) * [0.5, 1.0]
-        known = np.isfinite(half + bars)
-        at = np.array([max(camera.size) / 2.0, radii[-1]])
-        line: Figure = {
-            "type": "scatter",
-            "mode": "lines",
-            "x": np.round(radii, 1).tolist(),
-            "hoverinfo": "skip",
-        }
-        kept = [None if np.isnan(value) else round(float(value), 3) for value in angle]
-        traces.append({**line, "y": kept, "name": escape(name), "line": {"color": color}})
-        dashes = {"color": color, "dash": "dot", "width": 1}
-        traces.append({**line, "y": np.round(straight, 3).tolist(), "line": dashes, "name": "pinhole"})
+        bars, at = 1.96 * np.array(std) * [0.5, 1.0], np.array([max(camera.size) / 2.0, radii[-1]])
+        shown = np.isfinite(half + bars)
         traces.append({
-            "type": "scatter", "mode": "markers", "x": at[known].tolist(), "y": half[known].tolist(),
+            "type": "scatter", "mode": "markers", "x": at[shown].tolist(), "y": half[shown].tolist(),
             "marker": {"color": color, "size": 7}, "showlegend": False,
-            "error_y": {"type": "data", "array": bars[known].tolist(), "thickness": 2},
+            "error_y": {"type": "data", "array": bars[shown].tolist(), "thickness": 2},
             "hovertemplate": "%{y:.2f} degrees<extra></extra>",
         })  # fmt: skip
     axis = {"rangemode": "tozero", "gridcolor": "#d5dbe0", "fixedrange": True}
