@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 import thesisrecon
-from thesisrecon.api.views import match_images, prepare_pair, prepare_trilinear_views
+from thesisrecon.api.views import prepare_pair, prepare_trilinear_views
 from thesisrecon.views.tensor import VirtualCamera
 
 folder = thesisrecon.sample("courtyard")
@@ -40,7 +40,7 @@ for axis, s in zip(axes, (0.0, 0.5, 1.0), strict=True):
 
 cameras = thesisrecon.read_cameras(folder / "cameras.json")
 one, two, three = (cameras[name].scaled(0.5) for name in names)
-views = prepare_trilinear_views(match_images(first, second), K=two.K)
+views = prepare_trilinear_views(first, second, K=two.K)
 R = three.R @ two.R.T
 t = (three.t - R @ two.t) / np.linalg.norm(one.centre - two.centre)
 there = views.render(VirtualCamera(R, t, three.K, three.size))

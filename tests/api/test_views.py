@@ -12,7 +12,7 @@ import thesisrecon
 from tests.conftest import refuses
 from tests.synthetic import texture
 from thesisrecon.api import views as between
-from thesisrecon.api.views import match_images, prepare_trilinear_views
+from thesisrecon.api.views import prepare_trilinear_views
 from thesisrecon.config import ImageOptions, PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions
 from thesisrecon.errors import StageFailure, UsageError
@@ -128,9 +128,12 @@ SCENE = load_fixture_scene()
 SMALL = PipelineConfig(images=ImageOptions(max_size_px=512))
 
 
+TWO = SCENE.image_paths[6], SCENE.image_paths[7]
+
+
 @pytest.fixture(scope="module")
-def found():
-    return match_images(SCENE.image_paths[6], SCENE.image_paths[7], config=SMALL)
+def guessed():
+    return prepare_trilinear_views(*TWO, config=SMALL)
 
 
 def _photograph(k):
@@ -142,8 +145,8 @@ def _psnr(a, b):
     return 10.0 * np.log10(255.0**2 / np.mean((a.astype(np.float64) - b) ** 2))
 
 
-def test_calibrated_photographs_show_a_third_one_and_themselves(found):
-    views = prepare_trilinear_views(found, K=SCENE.K[6], config=SMALL)
+def test_calibrated_photographs_show_a_third_one_and_themselves(guessed):
+    views = prepare_trilinear_views(*TWO, K=SCENE.K[6], config=SMALL)
     R, C = SCENE.R, SCENE.C
     baseline = np.linalg.norm(C[7] - C[6])
     np.testing.assert_allclose(views.pair.t, R[7] @ (C[6] - C[7]) / baseline, atol=0.01)
@@ -153,14 +156,13 @@ def test_calibrated_photographs_show_a_third_one_and_themselves(found):
     gain = truth[100:300, 130:400].mean() / picture[100:300, 130:400].mean()
     inner = (slice(60, -60), slice(80, -80))
     assert _psnr(gain * picture[inner], truth[inner]) > _psnr(_photograph(7)[inner], truth[inner]) + 3.0
-    guessed = prepare_trilinear_views(found, config=SMALL)
     np.testing.assert_allclose(guessed.pair.K1[0], [512.0, 0.0, 255.5])
     reported = replace(SMALL, intrinsics=IntrinsicsOptions(focal="known", focal_px=900.0))
-    assert prepare_trilinear_views(found, config=reported).pair.K1[0, 0] == 450.0
+    assert prepare_trilinear_views(*TWO, config=reported).pair.K1[0, 0] == 450.0
     first, second = (guessed.render(camera_at(guessed.pair, s, sizes=guessed.sizes)) for s in (0.0, 1.0))
-    assert np.mean(second != found.images[1].rgb) < 1e-3
+    assert np.mean(second != guessed.levels[1][..., :3]) < 1e-3
     # Rounding leaves a corner to its neighbours.
-    assert np.mean(first != found.images[0].rgb) < 1e-3
+    assert np.mean(first != guessed.levels[0][..., :3]) < 1e-3
 
 
 def test_a_view_between_photographs_has_no_ghost_of_either():
@@ -185,18 +187,17 @@ def test_the_front_door_refuses_wrong_motions_before_it_reads_anything():
     refuses(UsageError, r"there is no image file no\.jpg", *given, np.zeros(3))
 
 
-def test_the_front_door_makes_a_picture_and_the_same_one_again(found):
+def test_the_front_door_makes_a_picture_and_the_same_one_again(guessed):
     motion = np.eye(3), np.array([0.1, 0.0, 0.0])
-    picture = thesisrecon.synthesize_view(SCENE.image_paths[6], SCENE.image_paths[7], *motion, config=SMALL)
+    picture = thesisrecon.synthesize_view(*TWO, *motion, config=SMALL)
     assert picture.shape == (384, 512, 3)
     assert picture.dtype == np.uint8
-    views = prepare_trilinear_views(found, config=SMALL)
-    camera = VirtualCamera(*motion, views.pair.K2, views.sizes[1])
-    np.testing.assert_array_equal(picture, views.render(camera, threads=2))
+    camera = VirtualCamera(*motion, guessed.pair.K2, guessed.sizes[1])
+    np.testing.assert_array_equal(picture, guessed.render(camera, threads=2))
 
 
 def test_cameras_in_one_place_are_refused():
     """As of one camera with another principal point."""
     picture = _photograph(6)
     halves, words = [picture[:, :-32].copy(), picture[:, 32:].copy()], "no parallax: the camera only rotated"
-    refuses(StageFailure, words, match_images, *halves, config=SMALL)
+    refuses(StageFailure, words, prepare_trilinear_views, *halves, config=SMALL)

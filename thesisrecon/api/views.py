@@ -1,6 +1,5 @@
 """New views: interpolated between two images (1.2), by the trilinear tensor (1.3), rendered from a model."""
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -9,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from thesisrecon import arrays
 from thesisrecon.api.pairs import match_pair
-from thesisrecon.arrays import F32, F64, U8, Record
+from thesisrecon.arrays import F32, F64, U8
 from thesisrecon.camera import Camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import prior_from_options
@@ -21,7 +20,7 @@ from thesisrecon.io._images import eight_bit_images, read_image, read_levels, re
 from thesisrecon.records import DisparityMap, Image, RenderedView, TexturedMesh, TwoView, as_mesh
 from thesisrecon.runtime._blas import one_blas_thread
 from thesisrecon.stereo._postprocessing import match_both_sides
-from thesisrecon.stereo.correspondence import RectifiedPair, brightness_gain
+from thesisrecon.stereo.correspondence import brightness_gain
 from thesisrecon.stereo.rectification import PlanarRectification
 from thesisrecon.views import interpolation, tensor
 from thesisrecon.views.render import render_mesh
@@ -213,46 +212,26 @@ def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None
             raise StageFailure.of("forward-motion", x, y, image.name)
 
 
-@dataclass(frozen=True, eq=False)
-class MatchedImages(Record):
-    """Two images with their sparse and dense correspondences."""
-
-    images: tuple[Image, Image]  #: at working size
-    pair: TwoView  #: verified matches and F
-    dense: RectifiedPair
-    exif_focal_px: F64  #: (2,) of the originals, NaN = unknown
-
-
-def match_images(image1: Any, image2: Any, *, config: Config | None = None, seed: int = 0) -> MatchedImages:
-    """Match two images sparsely and densely, for :func:`prepare_trilinear_views`."""
-    config = as_config(config)
-    read = [
-        read_image(source, max_size_px=config.images.max_size_px)
-        for source in eight_bit_images(image1, image2)
-    ]
-    first, second = (found.images[0] for found in read)
-    pair = match_pair(first, second, config=config, seed=seed)
-    dense = config.dense.match_two_views(first, second, pair.F, pair.xy1, pair.xy2)
-    focals = np.array([float(found.exif_focal_px[0]) for found in read])
-    return MatchedImages((first, second), pair, dense, focals)
-
-
 def prepare_trilinear_views(
-    found: MatchedImages, *, K: ArrayLike | None = None, config: Config | None = None
+    image1: Any, image2: Any, *, K: ArrayLike | None = None, config: Config | None = None, seed: int = 0
 ) -> tensor.TensorSynthesis:
-    """Prepare two matched images for views of any camera by the trilinear tensor (section 1.3).
+    """Match two images of any pose for views of any camera by the trilinear tensor (section 1.3).
 
     ``render(camera)`` of the result computes a view. K (3, 3) or (2, 3, 3) are the intrinsics in pixels of
     the given images. If None, the prior of ``config.intrinsics``; without a focal length there, a typical
     one: the views are then correct up to a projective transformation of space. A ``StageFailure`` if the
-    matches contradict F, or no solution has the scene in front of both cameras.
+    images do not match, the matches contradict F, or no solution has the scene in front of both cameras.
     """
     config = as_config(config)
-    K1, K2 = _intrinsics(found, K, config)
-    pair = tensor.pair_from_fundamental(found.pair.F, found.pair.xy1, found.pair.xy2, K1=K1, K2=K2)
-    first, second = found.images
-    places = found.dense.correspondences(0, first.size), found.dense.correspondences(1, second.size)
-    return tensor.prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=found.dense.gain)
+    size = config.images.max_size_px
+    read = [read_image(one, max_size_px=size) for one in eight_bit_images(image1, image2)]
+    first, second = (found.images[0] for found in read)
+    K1, K2 = _intrinsics((first, second), [found.exif_focal_px[0] for found in read], K, config)
+    found = match_pair(first, second, config=config, seed=seed)
+    dense = config.dense.match_two_views(first, second, found.F, found.xy1, found.xy2)
+    pair = tensor.pair_from_fundamental(found.F, found.xy1, found.xy2, K1=K1, K2=K2)
+    places = dense.correspondences(0, first.size), dense.correspondences(1, second.size)
+    return tensor.prepare_synthesis(pair, (first.rgb, second.rgb), places, gain=dense.gain)
 
 
 @one_blas_thread()
@@ -288,7 +267,7 @@ def synthesize_view(
 
     Notes
     -----
-    For many views of one pair call ``match_images`` and ``prepare_trilinear_views`` once.
+    For many views of one pair call ``prepare_trilinear_views`` once.
 
     Examples
     --------
@@ -304,8 +283,7 @@ def synthesize_view(
     rotation, translation = arrays.numbers("synthesize_view", rotation=rotation, translation=translation)
     _given_intrinsics(K)
     tensor.VirtualCamera(rotation, translation, np.eye(3), (1, 1))
-    found = match_images(image1, image2, config=config, seed=seed)
-    views = prepare_trilinear_views(found, K=K, config=config)
+    views = prepare_trilinear_views(image1, image2, K=K, config=config, seed=seed)
     return views.render(tensor.VirtualCamera(rotation, translation, views.pair.K2, views.sizes[1]))
 
 
@@ -322,17 +300,19 @@ def _given_intrinsics(K: ArrayLike | None) -> F64 | None:
     return both
 
 
-def _intrinsics(found: MatchedImages, K: ArrayLike | None, config: PipelineConfig) -> tuple[F64, F64]:
+def _intrinsics(
+    images: tuple[Image, Image], exif_focal_px: list[float], K: ArrayLike | None, config: PipelineConfig
+) -> tuple[F64, F64]:
     """K of both images in pixels at working size: given, from the prior, or typical."""
-    scales = np.array([image.scale for image in found.images])
+    scales = np.array([image.scale for image in images])
     given = _given_intrinsics(K)
     if given is not None:
         first, second = map(arrays.resizing_transform, scales)
         return first @ given[0], second @ given[1]
-    sizes = [image.original_size for image in found.images]
-    prior = prior_from_options(config.intrinsics, sizes, found.exif_focal_px, scales).mean
+    sizes = [image.original_size for image in images]
+    prior = prior_from_options(config.intrinsics, sizes, np.array(exif_focal_px), scales).mean
     both = []
-    for image, (f, aspect, skew, u, v, _) in zip(found.images, prior.tolist(), strict=True):
+    for image, (f, aspect, skew, u, v, _) in zip(images, prior.tolist(), strict=True):
         f = f if np.isfinite(f) else float(tensor.default_intrinsics(image.size)[0, 0])
         both.append(calibration_matrix(f, aspect * f, u, v, skew=skew))
     return both[0], both[1]

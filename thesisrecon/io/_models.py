@@ -175,7 +175,6 @@ _DEGREES = (
 )
 _LENGTHS = ({"x", "east", "easting", "e"}, {"y", "north", "northing", "n"})
 _QUALITY = {"error", "accuracy", "acc", "sigma", "std", "stdev", "variance"}
-_ORDER = [0, 1, 2, 3]  # Columns without a header: name,x,y,z
 
 
 class Positions(NamedTuple):
@@ -185,36 +184,23 @@ class Positions(NamedTuple):
     origin: Place | None = None  #: latitude and longitude in degrees, height in metres
 
 
-class _Header(NamedTuple):
-    columns: Sequence[int]  #: of the name and of three coordinates
-    width: int
-    degrees: bool = False
-
-
 def read_positions(path: Path) -> Positions:
     """Read camera positions: "name,x,y,z" per line, or columns of a header; degrees become metres."""
-    header, found = _Header(_ORDER, 4), dict[str, Place]()
+    columns, width, degrees, found = [0, 1, 2, 3], 4, False, dict[str, Place]()
     for number, cells in _rows(path):
         if number == 0:
-            header = _header_of(cells, path)
+            columns, width, degrees = _columns_of(cells, path)
             continue
-        places = [cells[k].strip() for k in header.columns] if len(cells) == header.width else []
-        try:
-            name, *values = places
-            x, y, z = map(float, values)
-            if name in found or not are_finite((x, y, z)):
-                raise ValueError
-            if header.degrees and (abs(x) > 90.0 or abs(y) > 360.0):
-                raise ValueError
-        except ValueError:
+        name, values = _named_numbers([cells[k] for k in columns] if len(cells) == width else [])
+        outside = degrees and len(values) == 3 and (abs(values[0]) > 90.0 or abs(values[1]) > 360.0)
+        if len(values) != 3 or name in found or outside or not are_finite(values):
             what = "name,x,y,z with finite numbers"
-            if header.degrees:
+            if degrees:
                 what = "the name, latitude, longitude and height of an image, in decimal degrees and metres"
-            raise UsageError(
-                Notice("no-position-in-line", number, path, what, shortened(",".join(cells).strip()))
-            ) from None
-        found[name] = x, y, z
-    if not header.degrees or not found:
+            line = shortened(",".join(cells).strip())
+            raise UsageError(Notice("no-position-in-line", number, path, what, line))
+        found[name] = values[0], values[1], values[2]
+    if not degrees or not found:
         return Positions(found)
     metres, origin = east_north_up(np.array([*found.values()]))
     placed = {name: (e, n, u) for name, (e, n, u) in zip(found, metres.tolist(), strict=True)}
@@ -225,16 +211,21 @@ def read_point_pairs(path: Path) -> dict[str, list[list[float]]]:
     """Read the pixels of two points in images, "name,x1,y1,x2,y2" per line."""
     found = {}
     for number, cells in _rows(path):
-        try:
-            name, *values = (cell.strip() for cell in cells)
-            x1, y1, x2, y2 = map(float, values)
-        except ValueError:
-            if number == 0:
-                continue
+        name, values = _named_numbers(cells)
+        if len(values) == 4:
+            found[name] = [values[:2], values[2:]]
+        elif number > 0:
             what, line = "name,x1,y1,x2,y2: the pixels of two points", shortened(",".join(cells).strip())
-            raise UsageError(Notice("no-position-in-line", number, path, what, line)) from None
-        found[name] = [[x1, y1], [x2, y2]]
+            raise UsageError(Notice("no-position-in-line", number, path, what, line))
     return found
+
+
+def _named_numbers(cells: Sequence[str]) -> tuple[str, list[float]]:
+    """The name and the numbers of cells; none if one is no number."""
+    try:
+        return cells[0].strip(), [float(cell) for cell in cells[1:]]
+    except (ValueError, IndexError):
+        return "", []
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -261,7 +252,8 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         yield number, cells
 
 
-def _header_of(cells: Sequence[str], path: Path) -> _Header:
+def _columns_of(cells: Sequence[str], path: Path) -> tuple[list[int], int, bool]:
+    """Columns of name and coordinates by the words of a header, those of a line, and if they are degrees."""
     words = [set(re.findall("[a-z]+", cell.lower())) for cell in cells]
     words = [set() if found & _QUALITY else found for found in words]
 
@@ -276,10 +268,10 @@ def _header_of(cells: Sequence[str], path: Path) -> _Header:
     name = column(_NAME, (x, y, z))
     name = name if name is not None else next((k for k in range(len(cells)) if k not in (x, y, z)), None)
     if x is not None and y is not None and z is not None and name is not None:
-        return _Header((name, x, y, z), len(cells), degrees)
+        return [name, x, y, z], len(cells), degrees
     if degrees:
         raise UsageError(Notice("header-of-positions", path, shortened(",".join(cells))))
-    return _Header(_ORDER, 4)
+    return [0, 1, 2, 3], 4, False
 
 
 def east_north_up(places: F64, origin: Place | None = None) -> tuple[F64, Place]:
