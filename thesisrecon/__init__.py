@@ -1,7 +1,8 @@
 """Metric 3D reconstruction from uncalibrated images by the classical algorithms of multiple-view geometry.
 
 The stub ``__init__.pyi`` is the one list of public names and of the modules that define them. A module is
-imported when one of its names is first used, so that ``import thesisrecon`` takes no time.
+imported when one of its names is first used, so that ``import thesisrecon`` takes no time. Each call raises
+``ValueError`` for arrays of a wrong shape, numbers that are not finite and invalid options.
 """
 
 import re

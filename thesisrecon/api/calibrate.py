@@ -239,8 +239,6 @@ def kruppa(F: F64, sizes: I64) -> F64:
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong, a matrix is not finite or has rank 1, or the sizes differ.
     StageFailure
         If the equations do not determine the focal length, or have several solutions.
 

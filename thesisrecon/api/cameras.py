@@ -71,9 +71,6 @@ def resect(
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong, numbers are not finite, or K is not upper triangular with positive focal
-        lengths and K33 = 1.
     StageFailure
         If there are too few points, no more inliers than chance explains, all points lie in one plane and K
         is not given, or points are behind the camera that fits them, as in left-handed coordinates.

@@ -104,11 +104,6 @@ def essential_from_fundamental(
         E, the three singular values before, and the covariance (9, 9) of E to first order, NaN without that
         of F.
 
-    Raises
-    ------
-    ValueError
-        If a shape is wrong or a number is not finite.
-
     Examples
     --------
     >>> import numpy as np
@@ -173,11 +168,6 @@ def decompose_essential(
     EssentialPoses
         The poses with more matches in front first: ``R[0]``, ``t[0]`` is that of the cameras.
 
-    Raises
-    ------
-    ValueError
-        If a shape is wrong or a number is not finite.
-
     Examples
     --------
     >>> import numpy as np
@@ -214,11 +204,6 @@ def seven_point(xy1: F64, xy2: F64) -> F64:
     -------
     ndarray (S, 3, 3)
         The one or three solutions, of rank 2 and unit norm; none if the matches are dependent.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong or a number is not finite.
 
     Examples
     --------

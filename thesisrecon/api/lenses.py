@@ -45,11 +45,6 @@ def undistort_points(xy: F64, camera: Camera, K: F64 | None = None) -> F64:
     ndarray (N, 2)
         Pixels of a pinhole camera, NaN beyond the range of the lens.
 
-    Raises
-    ------
-    ValueError
-        If a shape is wrong or K is no calibration matrix.
-
     Examples
     --------
     >>> import numpy as np
@@ -89,11 +84,6 @@ def undistort_image(
     -------
     UndistortedImage
         The image, where it has content, and its pinhole camera with the pose of ``camera``.
-
-    Raises
-    ------
-    ValueError
-        If the image is not of the size of the camera, or K is no calibration matrix.
 
     Examples
     --------

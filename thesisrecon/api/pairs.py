@@ -167,8 +167,6 @@ def estimate_homography(
 
     Raises
     ------
-    ValueError
-        If the shapes differ or coordinates are not finite.
     StageFailure
         If there are too few matches, no more inliers than chance explains, or they do not determine H
         (collinear points, for example).
@@ -225,8 +223,6 @@ def estimate_trifocal(
 
     Raises
     ------
-    ValueError
-        If the shapes are wrong or values are not finite.
     StageFailure
         If there are too few matches, or they do not determine the tensor, exactly or within their noise:
         points of one plane or line, pure rotation, random matches.
@@ -300,8 +296,6 @@ def estimate_fundamental(
 
     Raises
     ------
-    ValueError
-        If the method is unknown, the shapes differ or coordinates are not finite.
     StageFailure
         If there are too few or collinear matches, or no F has 8 matches within the threshold.
 
@@ -423,11 +417,6 @@ def detect_corners(
     -------
     Features
         Corners ``xy`` (N, 2) in pixels, strongest first, with ``response`` (N,) and ``scale`` (N,).
-
-    Raises
-    ------
-    ValueError
-        If the image or an option is invalid.
 
     Examples
     --------

@@ -74,8 +74,6 @@ def estimate_essential(
 
     Raises
     ------
-    ValueError
-        If the shapes differ, coordinates are not finite, or K is no calibration matrix.
     StageFailure
         If there are too few matches, or no more inliers than chance explains.
 
@@ -122,11 +120,6 @@ def recover_pose(E: F64, xy1: F64, xy2: F64, K1: Calibration, K2: Calibration | 
     -------
     RelativePose
         R, t and the depths of the matches.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, or K is no calibration matrix.
 
     Examples
     --------

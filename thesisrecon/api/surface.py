@@ -49,8 +49,6 @@ def rectify(
 
     Raises
     ------
-    ValueError
-        If an array has the wrong shape.
     StageFailure
         If the pair has no parallax or too few matches, or with ``planar`` an epipole lies inside an image.
 

@@ -260,8 +260,6 @@ def synthesize_view(
 
     Raises
     ------
-    ValueError
-        If the rotation, translation, K or seed is invalid.
     StageFailure
         If the images cannot be read, do not match or show no parallax, or the camera does not see the scene.
 
@@ -340,11 +338,6 @@ def render(
     Returns
     -------
     RenderedView
-
-    Raises
-    ------
-    ValueError
-        If ``samples`` is below 1, or the mesh is invalid.
 
     Examples
     --------
