@@ -9,10 +9,12 @@
 
 Optional are ``ours(case)``, the result of the library; ``bound(case)``, the least error; ``vector(output,
 case)``, the numbers in which results are compared; ``faults(output, case)``, sentences on what is not
-fulfilled; ``FLOOR``, an error that always passes; ``CASES``, the number of data sets.
+fulfilled; ``seen(output, case)``, the same from what the function called; ``FLOOR``, an error that always
+passes; ``CASES``, the number of data sets.
 
-A wrong result is compared with those of all mistakes, and with those of the solution with one expression of
-its source changed (``variants.py``): the nearest, if it is near, is named.
+A wrong result is compared with those of all mistakes. If none is equal, a change of the results or of the
+arguments that makes it right, and arguments that do not matter, are searched (``causes.py``), then results of
+the solution with one expression of its source changed (``variants.py``). The nearest, if near, is named.
 """
 
 import ast
@@ -20,15 +22,16 @@ import copy
 import importlib
 import importlib.util
 import inspect
+import signal
 import sys
 import time
 import traceback
 import warnings
 from collections import Counter
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import variants
 
 HERE = Path(__file__).parent
 CLOSE = 0.35
@@ -183,15 +186,18 @@ def _ratio(check, change, output, good, case):
             wrong = checked("", change(*copy.deepcopy(case.inputs)), check.RETURNS)
             wrong, good, own = (_vector(check, one, case) for one in (wrong, good, output))
             # A result of zeros is near all small results.
-            scale = min(_distance(good, wrong), _distance(0 * wrong, wrong))
+            scale = min(_distance(good, wrong), _distance(0 * wrong, wrong) or np.inf)
             ratio = _distance(own, wrong) / scale
     except Exception:  # a change may break the solution in any way
         return np.inf
     return ratio if np.isfinite(ratio) else np.inf
 
 
-def _mistake(name, check, outputs, right, cases):
-    """The sentence of the mistake whose results are nearest, or None if none is near."""
+def _mistake(name, check, outputs, right, cases, *, cause, known):
+    """The sentence that explains wrong results, or None.
+
+    ``cause`` makes one that is in no table; if faults are ``known``, expressions are not changed.
+    """
     every = list(zip(outputs, right, cases, strict=True))
     off = [_distance(_vector(check, o, case), _vector(check, g, case)) for o, g, case in every]
     wrong = [one for one, far in zip(every, off, strict=True) if far > 1e-3 * max(off)]
@@ -199,28 +205,53 @@ def _mistake(name, check, outputs, right, cases):
         sentence: [_ratio(check, lambda *given, of=change: of(check.solve, *given), *one) for one in wrong]
         for sentence, change in check.MISTAKES.items()
     }
-    listed = min(table, key=lambda sentence: np.median(table[sentence]), default=None)
-    near = np.median(table[listed]) if listed else np.inf
-    if near < EQUAL:
-        return listed
-    found = _changed_expression(name, check, wrong)
-    if found is not None or near < CLOSE:
-        return found or listed
+    if (sentence := _listed(table, EQUAL) or cause()) is not None or known:
+        return sentence
+    return _changed_expression(name, check, wrong) or _listed(table, CLOSE)
+
+
+def _listed(table, limit):
+    """The mistake of the table nearest to the results, or None if none is within a limit."""
+    nearest = min(table, key=lambda sentence: np.median(table[sentence]), default=None)
+    if nearest is None or np.median(table[nearest]) < limit:
+        return nearest
     # Chance may choose another one of several mistakes in each data set.
-    best = [min(table, key=lambda sentence, k=k: table[sentence][k]) for k in range(len(wrong))]
-    if all(table[sentence][k] < CLOSE for k, sentence in enumerate(best)):
-        kinds = {sentence.split(":")[0] for sentence in best}
-        return kinds.pop() if len(kinds) == 1 else Counter(best).most_common(1)[0][0]
-    return None
+    count = len(table[nearest])
+    best = [min(table, key=lambda sentence, k=k: table[sentence][k]) for k in range(count)]
+    if any(table[sentence][k] >= limit for k, sentence in enumerate(best)):
+        return None
+    kinds = {sentence.split(":")[0] for sentence in best}
+    return kinds.pop() if len(kinds) == 1 else Counter(best).most_common(1)[0][0]
+
+
+@contextmanager
+def _limited():
+    """Stop a variant that does not end, such as a search that diverges."""
+
+    def stop(*_):
+        raise TimeoutError
+
+    if not hasattr(signal, "setitimer"):  # as on Windows
+        yield
+        return
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS / 5)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 def _changed_expression(name, check, wrong):
     """The sentence of the variant of the solution that gives the wrong results, or None."""
     end, found, least = time.process_time() + SECONDS, None, EQUAL
+    variants = importlib.import_module("variants")
     for words, function in variants.of(HERE / "solutions", name):
         if time.process_time() > end:
             break
-        ratio = _ratio(check, function, *wrong[0])
+        with _limited():
+            ratio = _ratio(check, function, *wrong[0])
         if ratio >= least:
             continue
         ratio = np.median([ratio, *(_ratio(check, function, *one) for one in wrong[1:])])
@@ -236,16 +267,40 @@ def grade(name, function, path=None):
     check = importlib.import_module(f"checks.{name}")
     check.solve = solution(name)
     cases = [check.data(np.random.default_rng(seed)) for seed in range(getattr(check, "CASES", 5))]
-    right = [checked(name, check.solve(*copy.deepcopy(case.inputs)), check.RETURNS) for case in cases]
-    unit = check.UNIT
-    reference = _rms([check.error(one, case) for one, case in zip(right, cases, strict=True)])
+    unit, outputs, seen, start = check.UNIT, [], [], time.process_time()
     try:
-        outputs = [checked(name, _called(name, function, case.inputs, path), check.RETURNS) for case in cases]
+        for case in cases:
+            outputs.append(checked(name, _called(name, function, case.inputs, path), check.RETURNS))
+            seen = seen or getattr(check, "seen", lambda *_: [])(outputs[-1], case)
     except Refused as refused:
         return False, [str(refused)]
-    with np.errstate(all="ignore"):
-        errors = [check.error(one, case) for one, case in zip(outputs, cases, strict=True)]
-    error = _rms(errors)
+    slow = time.process_time() - start > SECONDS / 20
+    right = [checked(name, check.solve(*copy.deepcopy(case.inputs)), check.RETURNS) for case in cases]
+    reference = _rms([check.error(one, case) for one, case in zip(right, cases, strict=True)])
+    allowed = max(getattr(check, "LIMIT", 1.25) * reference, getattr(check, "FLOOR", 1e-6))
+
+    def judged(outputs):
+        """Error of results, and the first faults."""
+        with np.errstate(all="ignore"):
+            of = getattr(check, "faults", lambda *_: [])
+            error = _rms([check.error(one, case) for one, case in zip(outputs, cases, strict=True)])
+            return error, next(filter(None, map(of, outputs, cases)), [])
+
+    def passes(make):
+        try:
+            error, faults = judged([checked(name, one, check.RETURNS) for one in make()])
+        except Exception:  # what is tried may break in any way
+            return False
+        return error <= allowed and not faults
+
+    def cause():
+        def call(function, inputs):
+            return checked(name, _called(name, function, inputs, path), check.RETURNS)
+
+        finder = importlib.import_module("causes")
+        return finder.of(check, function, call, outputs, right, cases, passes, slow=slow)
+
+    error, faults = judged(outputs)
     beside = [f"solution {reference:.3g}"]
     if hasattr(check, "ours"):
         ours = _rms([check.error(check.ours(case), case) for case in cases])
@@ -253,15 +308,12 @@ def grade(name, function, path=None):
     if hasattr(check, "bound"):
         beside.append(f"bound {_rms([check.bound(case) for case in cases]):.3g}")
     lines = [f"error {error:.3g} {unit}, RMS over {len(cases)} data sets ({', '.join(beside)})"]
-    with np.errstate(all="ignore"):
-        of = getattr(check, "faults", lambda *_: [])
-        faults = next(filter(None, map(of, outputs, cases)), [])
-    allowed = max(getattr(check, "LIMIT", 1.25) * reference, getattr(check, "FLOOR", 1e-6))
-    if error <= allowed and not faults:
+    if error <= allowed and not faults and not seen:
         return True, lines
-    if error <= allowed:
-        return False, [*lines, *(f"reason: {fault}" for fault in faults)]
-    if (sentence := _mistake(name, check, outputs, right, cases)) is not None:
+    if seen or error <= allowed:
+        return False, [*lines, *(f"reason: {fault}" for fault in seen or faults)]
+    known = slow and faults
+    if (sentence := _mistake(name, check, outputs, right, cases, cause=cause, known=known)) is not None:
         return False, [*lines, f"reason: {sentence}"]
     unknown = f"no usual mistake explains the error; it must be at most {allowed:.3g}"
     return False, [*lines, *(f"reason: {fault}" for fault in faults or [unknown])]

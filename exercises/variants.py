@@ -20,6 +20,12 @@ def of(folder, name):
         order[first], order[second] = second, first
         words = f"{names[first]} and {names[second]} are swapped"
         yield words, lambda *given, order=order: _compiled(tree, name)(*(given[k] for k in order))
+    for first, second in _pairs_of_indices(tree):
+        first.slice, second.slice = second.slice, first.slice
+        made = _compiled(ast.fix_missing_locations(tree), name)
+        words = f"indices are exchanged: it is `{ast.unparse(second)}` in the place of `{ast.unparse(first)}`"
+        first.slice, second.slice = second.slice, first.slice
+        yield words, made
     for owner, field, place, node in list(_places(tree)):
         for new, kind in _changes(node):
             _put(owner, field, place, new)
@@ -31,6 +37,15 @@ def of(folder, name):
             finally:
                 _put(owner, field, place, node)
             yield f"{kind}: the result is that of `{words}`", made
+
+
+def _pairs_of_indices(tree):
+    """Pairs of elements of one array with different indices."""
+    read = [n for n in ast.walk(tree) if isinstance(n, ast.Subscript) and isinstance(n.ctx, ast.Load)]
+    for first, second in itertools.combinations(read, 2):
+        same = ast.dump(first.value) == ast.dump(second.value)
+        if same and ast.dump(first.slice) != ast.dump(second.slice):
+            yield first, second
 
 
 def _joined(folder, name):
@@ -161,9 +176,21 @@ def _of_operation(left, op, right):
         yield ast.BinOp(right, op, left), "factors in another order"
         if isinstance(left, ast.BinOp) and isinstance(left.op, ast.MatMult):
             yield left.right, "two factors are missing"
+            for before, after in itertools.product(_other_forms(left.left), _other_forms(right)):
+                chain = ast.BinOp(ast.BinOp(before, op, left.right), op, after)
+                yield chain, "outer factors in another form"
         for template, kind in (("A.T", "transposed"), ("np.linalg.inv(A)", "inverted")):
             yield ast.BinOp(_expression(template, left), op, right), kind
             yield ast.BinOp(left, op, _expression(template, right)), kind
+
+
+def _other_forms(node):
+    """A factor transposed, inverted, or without what is done to it."""
+    inner = node.value if getattr(node, "attr", "") == "T" else node
+    if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "inv":
+        inner = node.args[0]
+    forms = [inner, _expression("A.T", inner), _expression("np.linalg.inv(A)", inner)]
+    return [form for form in forms if ast.unparse(form) != ast.unparse(node)]
 
 
 def _of_call(node):

@@ -27,6 +27,10 @@ def _pixels(K, r, t, X):
     return divided((X @ R.transpose(0, 2, 1) + t[:, None]) @ K.T)
 
 
+def _distances(K, r, t, X, xy):
+    return np.linalg.norm(_pixels(K, r, t, X) - xy, axis=2)
+
+
 def error(output, case):
     return np.sqrt(np.mean(np.sum((_pixels(case.K, *output) - case.exact) ** 2, axis=2)))
 
@@ -46,8 +50,20 @@ def ours(case):
 
 def faults(output, case):
     K, *_, xy = case.inputs
-    own, least = (np.sum((_pixels(K, *one) - xy) ** 2) for one in (output, solve(*case.inputs)))  # noqa: F821
-    return ["the sum of squared residuals is not at its minimum"] if own > 1.001 * least else []
+    own, best = (_distances(K, *one, xy) for one in (output, solve(*case.inputs)))  # noqa: F821
+    if np.sum(own**2) <= 1.001 * np.sum(best**2):
+        return []
+    r, t, X = output
+    R = Rotation.from_rotvec(r)
+    readings = {"R' X + t": (-r, t), "R (X - t)": (r, -R.apply(t)), "R (X + t)": (r, R.apply(t))}
+    for words, (turned, moved) in readings.items():
+        if np.sum(_distances(K, turned, moved, X, xy) ** 2) < np.sum(own**2) / 4:
+            return [f"the residuals are those of {words}, not of R X + t"]
+    if np.sum(own**4) < np.sum(best**4):
+        return ["the squares are squared again: least_squares takes the residuals, and squares them itself"]
+    if np.sum(own) < np.sum(best):
+        return ["the sum of distances is least, not that of their squares"]
+    return ["the sum of squared residuals is not at its minimum"]
 
 
 def vector(output, case):

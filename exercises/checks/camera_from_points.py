@@ -40,8 +40,11 @@ def vector(output, _):
     return np.concatenate([K.ravel() / 500, R.ravel(), t / 3])
 
 
-def faults(output, _):
+def faults(output, case):
     K, R, _t = output
+    M = dlt(*case.inputs)[:, :3]
+    if abs(np.sum(R @ K * M)) > (1 - 1e-6) * np.linalg.norm(R @ K) * np.linalg.norm(M):
+        return ["the QR decomposition is P = R K; it must be RQ, P = K R"]
     found = rotation_faults(R)
     if np.abs(np.tril(K, -1)).max() > 1e-6 * np.abs(K).max():
         found.append("K is not upper triangular")
@@ -60,12 +63,6 @@ def _first(solve, X, xy):
     """As the RQ decomposition returns it."""
     P = dlt(X, xy)
     K, R = rq(P[:, :3])
-    return K / K[2, 2], R, np.linalg.inv(K) @ P[:, 3]
-
-
-def _by_qr(solve, X, xy):
-    P = dlt(X, xy)
-    R, K = np.linalg.qr(P[:, :3])
     return K / K[2, 2], R, np.linalg.inv(K) @ P[:, 3]
 
 
@@ -98,7 +95,6 @@ MISTAKES = {
     "t has another scale than K [R t]: take the K before the division by K[2, 2]": _t_of_unscaled,
     "the focal lengths are negative: change the signs of columns of K and of rows of R": _negative,
     "signs are as the decomposition returns them; make the diagonal of K positive, and det R = 1": _first,
-    "the QR decomposition is P = R K; it must be RQ, P = K R": _by_qr,
     "K is not divided by K[2, 2]": _unscaled,
     "x and y are swapped": lambda solve, X, xy: solve(X, xy[:, ::-1]),
 }

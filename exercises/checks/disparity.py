@@ -72,19 +72,33 @@ def _flip(solve, left, right, count, penalty):
     return solve(right[:, ::-1], left[:, ::-1], count, penalty)[:, ::-1]
 
 
-def _columns(left, right, count, penalty):
-    S = costs(left, right, count).transpose(1, 0, 2).copy()
-    jump = penalty * np.abs(np.arange(count)[:, None] - np.arange(count))
-    came = np.zeros(S.shape, int)
-    for y in range(1, S.shape[1]):
-        total = S[:, y - 1, None, :] + jump
-        came[:, y] = total.argmin(axis=2)
-        S[:, y] += total.min(axis=2)
-    d = np.zeros(S.shape[:2], int)
+def _path(S, jump):
+    """Disparities of least cost along the second axis."""
+    S, came, d = S.copy(), np.zeros(S.shape, int), np.zeros(S.shape[:2], int)
+    for x in range(1, S.shape[1]):
+        total = S[:, x - 1, None, :] + jump
+        came[:, x] = total.argmin(axis=2)
+        S[:, x] += total.min(axis=2)
     d[:, -1] = S[:, -1].argmin(axis=1)
-    for y in range(S.shape[1] - 1, 0, -1):
-        d[:, y - 1] = came[np.arange(len(d)), y, d[:, y]]
-    return d.T
+    for x in range(S.shape[1] - 1, 0, -1):
+        d[:, x - 1] = came[np.arange(len(d)), x, d[:, x]]
+    return d
+
+
+def _columns(_, left, right, count, penalty):
+    jump = penalty * np.abs(np.arange(count)[:, None] - np.arange(count))
+    return _path(costs(left, right, count).transpose(1, 0, 2), jump).T
+
+
+def _jumps(of):
+    """Another penalty for a difference of two disparities."""
+    return lambda solve, left, right, count, penalty: _path(
+        costs(left, right, count), penalty * of(np.arange(count)[:, None] - np.arange(count))
+    )
+
+
+def _mirrored(solve, left, right, count, penalty):
+    return solve(left[:, ::-1], right[:, ::-1], count, penalty)[:, ::-1]
 
 
 MISTAKES = {
@@ -99,7 +113,8 @@ MISTAKES = {
     "the disparities are larger by 1": lambda solve, *inputs: solve(*inputs) + 1,
     "the disparities are smaller by 1": lambda solve, *inputs: solve(*inputs) - 1,
     "the sign of the disparities is wrong": lambda solve, *inputs: -solve(*inputs),
-    "the paths run along columns, not rows": lambda solve, l, r, count, penalty: _columns(
-        l, r, count, penalty
-    ),
+    "the paths run along columns, not rows": _columns,
+    "the cost is that of right(x + d); it is right(x - d)": _mirrored,
+    "the penalty is the same for each jump; it is penalty |d - k|": _jumps(lambda d: (d != 0).astype(float)),
+    "the penalty grows with the square of d - k; it is penalty |d - k|": _jumps(np.square),
 }

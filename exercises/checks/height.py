@@ -59,6 +59,9 @@ MISTAKES = {
     "the ratio is inverted: alpha is in the denominator": (
         lambda solve, v, l, b, t, kb, kt, known: known**2 / solve(v, l, b, t, kb, kt, known)
     ),
+    "alpha is inverted: z is the ratio over alpha": lambda solve, v, l, b, t, kb, kt, known: (
+        ratio(v, l, b, t) * ratio(v, l, kb[None], kt[None]) / known
+    ),
     "base and top are swapped": _formula(lambda v, l, b, t: ratio(v, l, t, b)),
     "heights are ratios of lengths in pixels: the perspective is missing": _formula(
         lambda v, l, b, t: _norm(b - t)

@@ -61,7 +61,12 @@ def _transposed(solve, xy1, xy2):
     return np.linalg.inv(T2) @ _in_normalised(solve, xy1, xy2).T @ T1
 
 
+def _affine(solve, xy1, xy2):
+    return np.vstack([np.linalg.lstsq(homogeneous(xy1), xy2)[0].T, [0, 0, 1]])
+
+
 MISTAKES = {
+    "H is affine: its last row is not 0 0 1": _affine,
     "H is inverted: it maps image 2 to image 1": lambda solve, a, b: solve(b, a),
     "H is transposed: reshape h by rows": lambda solve, a, b: solve(a, b).T,
     "H is transposed: reshape h by rows, before the normalisation is undone": _transposed,

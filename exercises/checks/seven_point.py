@@ -33,7 +33,10 @@ def vector(F, _):
 
 def faults(F, case):
     s = np.linalg.svd(SCALE @ F @ SCALE)[1]
-    if (s[:, 2] > 1e-6 * s[:, 0]).any():
+    off = s[:, 2] > 1e-6 * s[:, 0]
+    if off.all():
+        return ["det F is not 0: the roots are not those of the sum of F1 and F2 that is returned"]
+    if off.any():
         return ["the rank of an F is not 2: are complex roots left out?"]
     n = len(ours(case))
     return [] if len(F) == n else [f"{len(F)} solutions are returned; there are {n}"]

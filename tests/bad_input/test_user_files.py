@@ -258,5 +258,6 @@ def test_files_of_the_user_survive_without_overwrite(stock, tmp_path):
 @pytest.mark.slow
 def test_files_of_the_user_survive_in_a_thousand_folders(stock, tmp_path):
     # They take longer than the limit of the tests of this folder.
-    signal.alarm(0)
+    for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+        signal.setitimer(timer, 0)
     search(range(QUICK, QUICK + MANY), stock, tmp_path)

@@ -28,6 +28,8 @@ from thesisrecon.io._images import eight_bit_images, full_image, read_image, rea
 from thesisrecon.pipeline.matching import ImageInput, match_images
 from thesisrecon.records import Features, Image, TwoView
 from thesisrecon.runtime._blas import one_blas_thread
+from thesisrecon.runtime._executors import available_threads
+from thesisrecon.runtime._precompilation import precompile
 
 
 @one_blas_thread()
@@ -58,18 +60,16 @@ def match_pair(
 
     Examples
     --------
-    >>> from thesisrecon import PipelineConfig, match_pair
-    >>> from thesisrecon.config import ImageOptions
-    >>> from thesisrecon.io._images import demo_images
-    >>> first, second = demo_images()[:2]
-    >>> pair = match_pair(first, second, config=PipelineConfig(images=ImageOptions(max_size_px=640)))
+    >>> from thesisrecon import match_pair, sample
+    >>> first, second = sorted((sample("courtyard") / "images").iterdir())[:2]
+    >>> pair = match_pair(first, second)
     >>> pair.F.shape, len(pair.xy1) > 60
     ((3, 3), True)
     """
     config = as_config(config)
-    size = config.images.max_size_px
     sources = eight_bit_images(image1, image2)
-    images = [read_image(image, max_size_px=size).images[0] for image in sources]
+    images = [read_image(image, max_size_px=config.images.max_size_px).images[0] for image in sources]
+    precompile("matches", available_threads(), lambda *_: None)
     pair = match_images(config, (images[0], images[1]), seed)
     if not pair.accepted:
         raise StageFailure(Notice("unmatched-pair"), pair.reason)
