@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from thesisrecon import records
 from thesisrecon.arrays import B8, F64, I64, rows_of_views
@@ -257,7 +257,7 @@ def _competing_poses(model: MetricEstimate, view: int, poses: F64) -> Iterator[s
     rays = homogenize(_model.normalized_observations(cameras, views, xy))
     for pose in other_poses(R, own, row, rays, X, xy):
         if np.sum(pose.residual_px**2) < limit and (X @ pose.R[2] + pose.t[2] > 0.0).all():
-            turn = Rotation.from_matrix(pose.R @ R.T).as_rotvec()
+            turn = scipy.spatial.transform.Rotation.from_matrix(pose.R @ R.T).as_rotvec()
             poses[view] = np.hypot(poses[view], np.append(turn, R.T @ own - pose.R.T @ pose.t))
             angle = np.degrees(np.linalg.norm(turn))
             yield Notice("competing-pose", view, angle, counted(len(k), "point"))
