@@ -27,7 +27,6 @@ from thesisrecon.metric._model import (
     MetricEstimate,
     camera_rows,
     reproject_observations,
-    residual_norms,
 )
 from thesisrecon.optimize.bundle.knowledge import NO_PRIOR, BundleKnowledge, PositionPrior
 from thesisrecon.optimize.bundle.metric import (
@@ -172,16 +171,6 @@ def tail_width(norms: F64, sigma: float) -> float:
     # Over that of the length of 2-D normal noise (Rayleigh).
     wide = float(np.quantile(norms, 0.9)) / 2.1460
     return float(np.clip(wide / sigma, 1.0, 3.0))
-
-
-def with_initial_gate(model: MetricEstimate) -> MetricEstimate:
-    """Widen loss and gates, but not ``sigma_px`` (the weight of the prior), to the residuals at the start."""
-    norms = residual_norms(model)
-    norms = norms[np.isfinite(norms)]
-    if not len(norms):
-        return model
-    wider = max(1.0, noise_from_distances(norms) / model.sigma_px)
-    return replace(model, tail=wider, loss_sigmas=2.0 * wider)
 
 
 def richer_models(contradicted: B8, prior: IntrinsicsPrior) -> Iterator[tuple[int, ...]]:

@@ -79,26 +79,21 @@ def check_views(model: _model.MetricEstimate, *, sigmas: float) -> PerViewChecks
 
 
 def triangulable_observations(model: _model.MetricEstimate) -> B8:
-    """Observations (K,) of points seen by two or more registered views with a baseline between them."""
-    t = model.tracks
+    """Observations (K,) of points seen by two or more registered views with a baseline between them.
+
+    A baseline above 0.002 of the distance has a usable parallax.
+    """
+    t, centres = model.tracks, model.cameras.centres
     near = model.registered[t.view_index]
-    seen = np.bincount(t.point_index[near], minlength=t.n_points)
-    return np.asarray(near & (seen >= 2)[t.point_index] & _from_two_places(model, near)[t.point_index])
-
-
-def _from_two_places(model: _model.MetricEstimate, near: B8) -> B8:
-    """(N,) whether the views of a point have a baseline above 0.002 of the distance, a usable parallax."""
-    t = model.tracks
-    centres = model.cameras.centres
-    view, point = t.view_index[near], t.point_index[near]
-    known = model.inlier[near]
-    if not known.any():
-        return np.ones(t.n_points, dtype=bool)
-    distance = np.median(np.linalg.norm(model.X[point[known]] - centres[view[known]], axis=1))
-    first, apart = np.zeros(t.n_points, dtype=np.int64), np.zeros(t.n_points)
-    first[point[::-1]] = view[::-1]
-    np.maximum.at(apart, point, np.linalg.norm(centres[view] - centres[first[point]], axis=1))
-    return np.asarray(apart > 2e-3 * float(distance))
+    view, point, known = t.view_index[near], t.point_index[near], model.inlier[near]
+    useful = np.bincount(point, minlength=t.n_points) >= 2
+    if known.any():
+        distance = np.median(np.linalg.norm(model.X[point[known]] - centres[view[known]], axis=1))
+        first, apart = np.zeros(t.n_points, dtype=np.int64), np.zeros(t.n_points)
+        first[point[::-1]] = view[::-1]
+        np.maximum.at(apart, point, np.linalg.norm(centres[view] - centres[first[point]], axis=1))
+        useful &= apart > 2e-3 * float(distance)
+    return np.asarray(near & useful[t.point_index])
 
 
 def _share(view: I64, good: B8, counted: B8, n: int) -> F64:

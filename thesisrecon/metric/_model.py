@@ -78,15 +78,6 @@ def seen_views(tracks: Tracks) -> int:
     return int(np.count_nonzero(np.bincount(tracks.view_index)))
 
 
-def with_enough_points(model: MetricEstimate) -> MetricEstimate:
-    """The model with a selection of points that cover every image: known points first, then long tracks."""
-    if len(model.tracks.xy) <= MAX_OBSERVATIONS and seen_views(model.tracks) <= MANY_VIEWS:
-        return model
-    length = np.bincount(model.tracks.point_index, minlength=model.tracks.n_points)
-    points = _select_spread_points(model, np.lexsort((-length, ~model.valid)), LONG_PER_VIEW)
-    return restrict_points(model, points)
-
-
 def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEstimate, I64]:
     """Select among the points of all ``tracks`` those of the least residuals first; return their numbers too.
 
@@ -105,11 +96,11 @@ def with_precise_points(model: MetricEstimate, tracks: Tracks) -> tuple[MetricEs
     # It weighs as much as six residuals.
     noise = (total + 6 * variance) / np.maximum(2 * count - 3 + 6, 1)
     order = np.argsort(np.where(model.valid, noise, np.inf), kind="stable")
-    points = _select_spread_points(model, order, PRECISE_PER_VIEW)
+    points = select_spread_points(model, order, PRECISE_PER_VIEW)
     return restrict_points(model, points), points
 
 
-def _select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I64:
+def select_spread_points(model: MetricEstimate, order: I64, per_view: int) -> I64:
     """Select points in the ``order`` until every view (``per_view``) and cell has enough of them."""
     t = model.tracks
     cell = np.clip(t.xy / model.sizes[t.view_index] * CELLS, 0, CELLS - 1).astype(np.int64)
@@ -199,19 +190,6 @@ def with_tracks(model: MetricEstimate, tracks: Tracks) -> MetricEstimate:
     return retriangulate_tracks(model, sigmas=LATE_SIGMAS)
 
 
-def with_expected_centres(model: MetricEstimate, prior: IntrinsicsPrior) -> MetricEstimate:
-    """The model with principal points over 3 standard deviations off, a false minimum, moved back."""
-    first = np.unique(model.cameras.group, return_index=True)[1]
-    mean, std = prior.mean[first][:, CENTRE], prior.std[first][:, CENTRE]
-    intrinsics = model.cameras.intrinsics.copy()
-    off = np.abs(intrinsics[:, CENTRE] - mean)
-    far = np.any(off > 3.0 * std, axis=1, keepdims=True)
-    if not far.any():
-        return model
-    intrinsics[:, CENTRE] = np.where(far, mean, intrinsics[:, CENTRE])
-    return replace(model, cameras=replace(model.cameras, intrinsics=intrinsics))
-
-
 def inlier_mask(model: MetricEstimate, *, sigmas: float) -> B8:
     """Observations (K,) within the gate and in front of their registered camera, at any angle."""
     t = model.tracks
@@ -242,13 +220,6 @@ def residual_norms(model: MetricEstimate) -> F64:
     view, point = t.view_index[model.inlier], t.point_index[model.inlier]
     xy, _ = reproject_observations(model, view, point)
     return np.asarray(np.linalg.norm(xy - t.xy[model.inlier], axis=1))
-
-
-def truncated_cost(model: MetricEstimate, gate_px: float) -> float:
-    """Mean of min(r^2, gate^2) / gate^2 over all observations, those without camera or point included."""
-    squared = np.ones(len(model.tracks.xy))
-    squared[model.inlier] = np.minimum(residual_norms(model) ** 2 / gate_px**2, 1.0)
-    return float(squared.mean())
 
 
 def inlier_ratios(model: MetricEstimate) -> F64:

@@ -72,8 +72,12 @@ class MetricRefinement:
             advice = ", or set a larger focal_std_rel" if wide > 0.0 else ""
             raise StageFailure.of("focal-against-images", advice, len(trials), wide)
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
-        costs = np.array([_model.truncated_cost(m, gate) for m in models])
-        model, rejected = register_missing_cameras(models[int(costs.argmin())], adjustment, rng)
+        # One minus the truncated quadratic cost of all observations.
+        near = [np.maximum(1.0 - (_model.residual_norms(m) / gate) ** 2, 0.0).sum() for m in models]
+        best = int(
+            np.argmax([float(share) / len(m.tracks.xy) for share, m in zip(near, models, strict=True)])
+        )
+        model, rejected = register_missing_cameras(models[best], adjustment, rng)
         model, adjustment = _lens.with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
         model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
@@ -171,10 +175,19 @@ def _start(
     model = _model.upgraded_model(reconstruction, upgrade, adjustment.prior)
     if model is None:
         return None
-    model = _model.with_enough_points(model)
+    # In large sets a selection of points that cover every image: known points first, then long tracks.
+    t = model.tracks
+    if len(t.xy) > _model.MAX_OBSERVATIONS or _model.seen_views(t) > _model.MANY_VIEWS:
+        order = np.lexsort((-np.bincount(t.point_index, minlength=t.n_points), ~model.valid))
+        points = _model.select_spread_points(model, order, _model.LONG_PER_VIEW)
+        model = _model.restrict_points(model, points)
     # Without distortion the noise is overestimated: keep the gate at least as wide as before.
     gentle = replace(adjustment, noise_floor_px=max(0.1, adjustment.noise_floor_px))
-    model = _adjustment.with_initial_gate(model)
+    # Loss and gates, but not the weight of the prior, begin with the residuals at the start.
+    norms = _model.residual_norms(model)
+    if len(norms := norms[np.isfinite(norms)]):
+        wider = max(1.0, noise_from_distances(norms) / model.sigma_px)
+        model = replace(model, tail=wider, loss_sigmas=2.0 * wider)
     start = _adjustment.FOCAL_AND_CENTRE if adjustment.prior.lens is None else WITHOUT_K2_K3
     for _ in range(3):
         if model.valid.sum() < 20:
@@ -232,7 +245,13 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     adjustment = replace(adjustment, inflation=scatter.inflation)
     if hierarchical is not None:
         model, adjustment = _uncertainty.apply_hierarchical_prior(model, adjustment, hierarchical)
-    model = _iterate_inliers(_model.with_expected_centres(model, adjustment.prior), adjustment)
+    # Principal points over 3 standard deviations off, a false minimum, are moved back.
+    rows, first = model.cameras.intrinsics.copy(), np.unique(model.cameras.group, return_index=True)[1]
+    mean, std = (a[first][:, _model.CENTRE] for a in (adjustment.prior.mean, adjustment.prior.std))
+    far = np.any(np.abs(rows[:, _model.CENTRE] - mean) > 3.0 * std, axis=1, keepdims=True)
+    rows[:, _model.CENTRE] = np.where(far, mean, rows[:, _model.CENTRE])
+    model = replace(model, cameras=replace(model.cameras, intrinsics=rows))
+    model = _iterate_inliers(model, adjustment)
     fit, alone = adjustment.linearised(model), replace(adjustment, hierarchical=None)
     scatter = block_scatter(fit)
     single = scatter if hierarchical is None else block_scatter(alone.linearised(model))

@@ -202,28 +202,22 @@ def _write_exports(
     points, shown = metric.X[metric.valid, :3] / metric.X[metric.valid, 3:], colors[metric.valid]
     path = directory.path / "points.ply"
     made(path.name, lambda: write_point_cloud(path, points, shown), warnings, None)
-    _write_model(directory, result, colors, warnings)
-    return colors, warnings + _write_surface(directory, result, max_mb, threads)
-
-
-def _write_model(directory: RunDirectory, result: RunResult, colors: U8, warnings: list[str]) -> None:
-    """Write ``sparse/0`` in original pixels, all of it or nothing; add warnings."""
-    images, metric = result.images, result.metric
-    assert metric is not None
 
     def write() -> int:
         names, scales = [image.name for image in images], np.array([1 / image.scale for image in images])
         sizes = np.array([image.original_size for image in images])
         return write_colmap_model(
-            directory.path / "sparse" / "0", metric.reconstruction, names,
+            directory.path / "sparse" / "0", metric, names,
             colors=colors, groups=result.groups, scales=scales, original_sizes=sizes,
         )  # fmt: skip
 
+    # In original pixels, all of it or nothing.
     if skewed := made("sparse/0", write, warnings, -1):
         directory.remove(COLMAP_FILES)
     if skewed > 0:
-        cameras = counted(int(metric.reconstruction.registered.sum()), "camera")
+        cameras = counted(int(metric.registered.sum()), "camera")
         warnings.append(Notice("no-colmap-skew", skewed, cameras))
+    return colors, warnings + _write_surface(directory, result, max_mb, threads)
 
 
 def _run_facts(run: Run, until: str) -> dict[str, Any]:

@@ -120,7 +120,7 @@ def select_tracks_with_parallax(tracks: Tracks, pairs: Sequence[TwoView]) -> B8:
 
 def select_tracks(tracks: Tracks, usable: B8, *, points_per_view: int) -> B8:
     """Select the longest ``usable`` tracks (N,), of each cell of a grid over the image in turn."""
-    t, length = _select_observations(tracks, usable[tracks.point_index]), np.bincount(tracks.point_index)
+    t, length = select_observations(tracks, usable[tracks.point_index]), np.bincount(tracks.point_index)
     longest_first = -length[t.point_index]
     in_cell = _places(observation_cells(t), longest_first)
     keep = np.zeros(tracks.n_points, dtype=bool)
@@ -156,17 +156,13 @@ def working_tracks(tracks: Tracks, pairs: Sequence[TwoView], *, points_per_view:
     """Return the selected tracks with parallax, renumbered in the same order, and which (N,) they are."""
     usable = select_tracks_with_parallax(tracks, pairs)
     keep = select_tracks(tracks, usable, points_per_view=points_per_view)
-    t = _select_observations(tracks, keep[tracks.point_index])
+    t = select_observations(tracks, keep[tracks.point_index])
     number = np.cumsum(keep) - 1
     return replace(t, point_index=number[t.point_index], n_points=int(keep.sum())), keep
 
 
-def tracks_of_views(tracks: Tracks, views: B8) -> Tracks:
-    """Return the observations of some views (V,); views and points keep their numbers."""
-    return _select_observations(tracks, views[tracks.view_index])
-
-
-def _select_observations(t: Tracks, k: B8) -> Tracks:
+def select_observations(t: Tracks, k: B8) -> Tracks:
+    """Some of the observations (K,); views and points keep their numbers."""
     return replace(t, view_index=t.view_index[k], point_index=t.point_index[k], xy=t.xy[k])
 
 

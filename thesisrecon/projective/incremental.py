@@ -107,7 +107,7 @@ class IncrementalProjective:
         if attempt >= len(ranked):
             tried = f"all {len(ranked)} accepted image pairs were tried"
             raise StageFailure(Notice("no-other-initial-pair"), tried)
-        seen = _model.tracks_of_views(tracks, core)
+        seen = _model.select_observations(tracks, core[tracks.view_index])
         selected, keep = _model.working_tracks(seen, inside, points_per_view=self.points_per_view)
         best = self._best_model(selected, inside, sizes, ranked[attempt:], rng)
         for view in np.flatnonzero(~core):

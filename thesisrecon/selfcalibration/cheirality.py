@@ -118,7 +118,14 @@ def _polytope_of(X: F64, C: F64) -> Polytope | None:
     extent = np.linalg.svd(X, compute_uv=False)
     if deepest.x is None or not deepest.x[4] > 0 or not extent[1] > 1e-12 * extent[0]:
         return None
-    T = _quasi_affine_frame(X, np.asarray(deepest.x[:4], dtype=np.float64))
+    # The transform that sends the plane v to infinity and whitens the points.
+    v = np.asarray(deepest.x[:4], dtype=np.float64)
+    basis = np.linalg.svd(v[None])[2][1:]
+    Y = X @ basis.T / (X @ v)[:, None]
+    centre = Y.mean(axis=0)
+    value, vector = np.linalg.eigh(np.cov((Y - centre).T))
+    whiten = vector @ np.diag(np.maximum(value, np.finfo(np.float64).eps * value.max()) ** -0.5) @ vector.T
+    T = np.concatenate([whiten @ (basis - np.outer(centre, v)), v[None]])
     rows = unit_rows(rows @ T.T)
     box = _plane_box(rows)
     return None if box is None else Polytope(rows, T, box)
@@ -136,19 +143,6 @@ def distinct_planes(planes: F64, cost: F64) -> list[int]:
 
 def unit_rows(A: F64) -> F64:
     return np.asarray(A / np.maximum(np.linalg.norm(A, axis=1, keepdims=True), 1e-300), dtype=np.float64)
-
-
-def _quasi_affine_frame(X: F64, v: F64) -> F64:
-    """Return the transform (4, 4) that sends the plane v to infinity and whitens the points."""
-    basis = np.linalg.svd(v[None])[2][1:]
-    Y = X @ basis.T / (X @ v)[:, None]
-    centre = Y.mean(axis=0)
-    value, vector = np.linalg.eigh(np.cov((Y - centre).T))
-    whiten = vector @ np.diag(np.maximum(value, np.finfo(np.float64).eps * value.max()) ** -0.5) @ vector.T
-    T = np.zeros((4, 4))
-    T[:3] = whiten @ (basis - np.outer(centre, v))
-    T[3] = v
-    return T
 
 
 def _plane_box(rows: F64) -> F64 | None:

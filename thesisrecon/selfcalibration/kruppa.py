@@ -146,7 +146,13 @@ class KruppaEquations:
         """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
         found, weakest = [], np.inf
         given = float(unknown.std[unknown.focals].max(initial=0.0))
-        for log_f in self._scan(pairs, n):
+        # The best local minima of one common log focal length.
+        grid = np.linspace(np.log(self.focal_range[0]), np.log(self.focal_range[1]), self.focal_steps)
+        K = _upgrade.square_pixel_calibrations(np.repeat(grid[:, None], n, axis=1))
+        cost = _kruppa_cost(pairs, K, loss_scale=self.loss_scale)
+        padded = np.pad(cost, 1, constant_values=np.inf)
+        minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
+        for log_f in grid[minima[np.argsort(cost[minima], kind="stable")][: self.starts]].tolist():
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
             K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
             # The deviation of log f by the change of the residuals with all focal lengths.
@@ -166,15 +172,6 @@ class KruppaEquations:
             f"{counted(len(pairs.i), 'pair')} of views agree with "
             + ("any focal length" if weakest > 1.0 else f"focal lengths within {weakest:.0%}"),
         )
-
-    def _scan(self, pairs: _Pairs, n: int) -> list[float]:
-        """Return the best local minima of one common log focal length."""
-        grid = np.linspace(np.log(self.focal_range[0]), np.log(self.focal_range[1]), self.focal_steps)
-        K = _upgrade.square_pixel_calibrations(np.repeat(grid[:, None], n, axis=1))
-        cost = _kruppa_cost(pairs, K, loss_scale=self.loss_scale)
-        padded = np.pad(cost, 1, constant_values=np.inf)
-        minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
-        return [float(grid[k]) for k in minima[np.argsort(cost[minima], kind="stable")][: self.starts]]
 
 
 def _plane_for_focals(frame: ReferenceFrame, log_f: F64) -> tuple[F64, float]:

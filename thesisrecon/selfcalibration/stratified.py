@@ -109,24 +109,17 @@ def upgrade_to_affine(reconstruction: Reconstruction, plane: F64) -> Reconstruct
     P = np.where(reconstruction.registered[:, None, None], transform(G, reconstruction.P, "cameras"), 0.0)
     affine = replace(reconstruction, stratum="affine", P=P, X=X, valid=valid)
     affine = replace(affine, P=_facing(affine))
-    T = _nominal_frame(affine)
-    X[valid] = transform(T, X[valid], "points")
-    return replace(affine, P=transform(T, affine.P, "cameras"), X=X)
-
-
-def _nominal_frame(affine: Reconstruction) -> F64:
-    """Return the affine transform (4, 4) that places the camera with most observations at the origin."""
-    tracks, keep = affine.tracks, affine.inlier & affine.valid[affine.tracks.point_index]
+    tracks, keep = affine.tracks, affine.inlier & valid[affine.tracks.point_index]
     seen = np.bincount(tracks.view_index[keep], minlength=len(affine.P)) * affine.registered
-    view = int(np.argmax(seen))
-    T = np.eye(4)
+    view, T = int(np.argmax(seen)), np.eye(4)
     T[:3] = np.linalg.solve(pixel_from_unit(affine.sizes)[view], affine.P[view])
     T[:3] /= max(float(np.linalg.norm(T[:3, :3])), 1e-300)
     if not seen[view] or abs(np.linalg.det(T)) < _NEAR_INFINITY:
-        return np.eye(4)
-    depth = affine.X[tracks.point_index[keep & (tracks.view_index == view)]] @ T[2]
+        return affine
+    depth = X[tracks.point_index[keep & (tracks.view_index == view)]] @ T[2]
     T[:3] /= max(float(np.median(depth)), 1e-300)
-    return T
+    X[valid] = transform(T, X[valid], "points")
+    return replace(affine, P=transform(T, affine.P, "cameras"), X=X)
 
 
 def _facing(affine: Reconstruction) -> F64:
