@@ -210,24 +210,9 @@ class _Evidence:
         distance = (self.of_matches * lines).sum(axis=1) / np.sqrt(squared + 1e-300)
         return np.where(Y[:, 2] > 0.0, off, np.inf), distance
 
-    def in_front(self, R: F64, t: F64) -> B8:
-        """Matches (N,) with a point in front of both cameras."""
-        epipole, theirs = self.centres @ R.T + t, self.theirs @ R.T
-        normal = np.cross(self.of_matches, theirs)
-        depths = [np.cross(epipole, ray) for ray in (theirs, self.of_matches)]
-        return np.asarray(np.all([(normal * depth).sum(axis=1) > 0.0 for depth in depths], axis=0))
-
     def cost(self, pose: tuple[F64, F64], gate: float) -> float:
         """Truncated quadratic cost of a pose."""
         return float(np.minimum((np.concatenate(self.residuals(*pose)) / gate) ** 2, 1.0).sum())
-
-    def start(self, gate: float, rng: np.random.Generator) -> tuple[F64, F64] | None:
-        """The pose of three points with the least cost."""
-        chosen = draw_samples(rng, 300, len(self.X), 3)
-        unit = self.of_points / np.linalg.norm(self.of_points, axis=1, keepdims=True)
-        poses = pose_from_three_points(self.X[chosen], unit[chosen])
-        found = [(pose[:, :3], pose[:, 3]) for pose in poses]
-        return min(found, key=lambda pose: self.cost(pose, gate), default=None)
 
     def refined(self, pose: tuple[F64, F64], noise: float, gate: float) -> tuple[F64, F64]:
         """The pose near ``pose`` with the least robust cost."""
@@ -252,37 +237,34 @@ def confirmed_pose(
 
     Its other matches determine the pose up to the length of the translation, which needs few points only.
     """
-    evidence = _evidence(model, rows)
-    if len(evidence.X) < FEWEST_POINTS or len(evidence.theirs) < MIN_MATCHES:
-        return None
-    focal = model.cameras.intrinsics[model.cameras.group[view], 0]
-    noise = model.gate_px / focal
-    gate = EARLY_SIGMAS * noise
-    pose = evidence.start(2.0 * gate, rng)
-    if pose is None:
-        return None
-    pose = evidence.refined(pose, noise, gate)
-    points, matches = (np.abs(residual) < LATE_SIGMAS * noise for residual in evidence.residuals(*pose))
-    # The matches of a wrong pose intersect behind a camera, or anywhere.
-    matches &= evidence.in_front(*pose)
-    return pose if _agree(points, FEWEST_POINTS) and _agree(matches, MIN_MATCHES) else None
-
-
-def _agree(agreeing: B8, fewest: int) -> bool:
-    return int(agreeing.sum()) >= max(fewest, AGREEING * len(agreeing))
-
-
-def _evidence(model: MetricEstimate, rows: I64) -> _Evidence:
-    """The points of the model that a view of observations ``rows`` sees, and its other matches."""
     t, cameras = model.tracks, model.cameras
     known, own = model.valid[t.point_index[rows]], np.full(t.n_points, -1)
     k, own[t.point_index[rows[~known]]] = rows[known], rows[~known]
     other = np.flatnonzero(model.registered[t.view_index] & (own[t.point_index] >= 0))
-    rays = (
+    if len(k) < FEWEST_POINTS or len(other) < MIN_MATCHES:
+        return None
+    of_points, of_matches, theirs = (
         homogenize(_model.normalized_observations(cameras, t.view_index[i], t.xy[i]))
         for i in (k, own[t.point_index[other]], other)
     )
-    of_points, of_matches, theirs = rays
     R, centres = cameras.R[t.view_index[other]], cameras.centres[t.view_index[other]]
     theirs = np.einsum("nji,nj->ni", R, theirs)
-    return _Evidence(model.X[t.point_index[k]], of_points, of_matches, theirs, R, centres)
+    evidence = _Evidence(model.X[t.point_index[k]], of_points, of_matches, theirs, R, centres)
+    noise = model.gate_px / cameras.intrinsics[cameras.group[view], 0]
+    gate = EARLY_SIGMAS * noise
+    # From the best pose of three points.
+    chosen = draw_samples(rng, 300, len(k), 3)
+    unit = of_points / np.linalg.norm(of_points, axis=1, keepdims=True)
+    poses = [(p[:, :3], p[:, 3]) for p in pose_from_three_points(evidence.X[chosen], unit[chosen])]
+    if not poses:
+        return None
+    start = min(poses, key=lambda one: evidence.cost(one, 2.0 * gate))
+    pose = evidence.refined(start, noise, gate)
+    points, matches = (np.abs(residual) < LATE_SIGMAS * noise for residual in evidence.residuals(*pose))
+    # The matches of a wrong pose intersect behind a camera, or anywhere.
+    epipole, theirs = centres @ pose[0].T + pose[1], theirs @ pose[0].T
+    normal = np.cross(of_matches, theirs)
+    for ray in (theirs, of_matches):
+        matches &= (normal * np.cross(epipole, ray)).sum(axis=1) > 0.0
+    agree = ((points, FEWEST_POINTS), (matches, MIN_MATCHES))
+    return pose if all(a.sum() >= max(fewest, AGREEING * len(a)) for a, fewest in agree) else None

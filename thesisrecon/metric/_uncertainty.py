@@ -141,19 +141,6 @@ def estimate_spread(value: F64, std: F64, total: F64) -> float:
     return max(float(np.hypot(tau, 0.3 * np.median(std))), 1e-6)
 
 
-def apply_hierarchical_prior(
-    model: MetricEstimate, adjustment: MetricAdjustment, hierarchical: HierarchicalPrior
-) -> tuple[MetricEstimate, MetricAdjustment]:
-    """Add the hierarchical prior, and share k2 and k3 among cameras of one zoom setting."""
-    shared = model.cameras.shared.copy()
-    for kind in np.unique(hierarchical.kind[hierarchical.kind >= 0]):
-        rows = np.flatnonzero(hierarchical.kind == kind)
-        if hierarchical.spread[rows[0], FOCAL] < 0.01:
-            shared[rows, K1 + 1 :] = shared[rows[0], K1 + 1 :]
-    model = replace(model, cameras=replace(model.cameras, shared=shared))
-    return model, replace(adjustment, hierarchical=hierarchical)
-
-
 @dataclass(frozen=True)
 class FocalShrinkage:
     """Relative deviation (V,) of the focal by own matches; weight tau^2 / (tau^2 + s^2), 1 if alone."""

@@ -74,9 +74,8 @@ class MetricRefinement:
         gate = 3.0 * float(np.median([m.sigma_px for m in models]))
         # One minus the truncated quadratic cost of all observations.
         near = [np.maximum(1.0 - (_model.residual_norms(m) / gate) ** 2, 0.0).sum() for m in models]
-        best = int(
-            np.argmax([float(share) / len(m.tracks.xy) for share, m in zip(near, models, strict=True)])
-        )
+        shares = [float(share) / len(m.tracks.xy) for share, m in zip(near, models, strict=True)]
+        best = int(np.argmax(shares))
         model, rejected = register_missing_cameras(models[best], adjustment, rng)
         model, adjustment = _lens.with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
@@ -244,7 +243,14 @@ def finish_metric(model: MetricEstimate, adjustment: MetricAdjustment) -> _Finis
     # Correlated errors do not average out: without the inflation they would overrule every prior.
     adjustment = replace(adjustment, inflation=scatter.inflation)
     if hierarchical is not None:
-        model, adjustment = _uncertainty.apply_hierarchical_prior(model, adjustment, hierarchical)
+        shared = model.cameras.shared.copy()
+        for kind in np.unique(hierarchical.kind[hierarchical.kind >= 0]):
+            those = np.flatnonzero(hierarchical.kind == kind)
+            # Cameras of one zoom setting share k2 and k3.
+            if hierarchical.spread[those[0], _model.FOCAL] < 0.01:
+                shared[those, K1 + 1 :] = shared[those[0], K1 + 1 :]
+        model = replace(model, cameras=replace(model.cameras, shared=shared))
+        adjustment = replace(adjustment, hierarchical=hierarchical)
     # Principal points over 3 standard deviations off, a false minimum, are moved back.
     rows, first = model.cameras.intrinsics.copy(), np.unique(model.cameras.group, return_index=True)[1]
     mean, std = (a[first][:, _model.CENTRE] for a in (adjustment.prior.mean, adjustment.prior.std))

@@ -124,6 +124,11 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
     axis, (z_i, z_j) = axes[:, 2], metric.R[[i, j], 2]
     views = np.arctan2(np.linalg.norm(np.cross(z_i, z_j), axis=1), np.sum(z_i * z_j, axis=1))
     H, offset = metric.infinite_homographies(), metric.C - metric.C.mean(axis=0)
+    # Distances of the centres from a common circular motion about one line along the axis.
+    seen = metric.R @ (np.eye(3) - np.outer(axis, axis))
+    places = np.einsum("vab,vb->va", seen, metric.C)
+    coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
+    c = np.linalg.lstsq(coefficients.reshape(-1, 3), right.ravel(), rcond=1e-9)[0]
     return {
         "scene_planarity_ratio": _planarity_ratio(metric.X),
         "centre_spread_over_distance": _rms(offset) / metric.distance,
@@ -133,7 +138,7 @@ def measure_motion(metric: UpgradedCameras) -> dict[str, float]:
         "rotation_rms_deg": float(np.degrees(_rms(rotations))),
         "optical_axis_rms_deg": float(np.degrees(_rms(views[:, None]))),
         "rotation_axis_spread_deg": float(np.degrees(np.sqrt(max(spread[1], 0.0)))),
-        "turntable_residual_over_distance": _turntable_residual(metric, axis) / metric.distance,
+        "turntable_residual_over_distance": _rms(right - coefficients @ c) / metric.distance,
         "axial_translation_over_distance": _rms((offset @ axis)[:, None]) / metric.distance,
     }
 
@@ -200,15 +205,6 @@ def projective_infinity_shifts(A: F64, a: F64) -> dict[str, float]:
 
 def _rms(vectors: F64) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
-
-
-def _turntable_residual(metric: UpgradedCameras, axis: F64) -> float:
-    """Rms distance of the centres from a common circular motion about one line along ``axis``."""
-    seen = metric.R @ (np.eye(3) - np.outer(axis, axis))
-    places = np.einsum("vab,vb->va", seen, metric.C)
-    coefficients, right = seen - seen.mean(axis=0), places - places.mean(axis=0)
-    c = np.linalg.lstsq(coefficients.reshape(-1, 3), right.ravel(), rcond=1e-9)[0]
-    return _rms(right - coefficients @ c)
 
 
 def _planarity_ratio(X: F64) -> float:

@@ -120,7 +120,13 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     block = median_blocks(fit.X, np.bincount(fit.observations.point_index, minlength=len(fit.X)) > 0)
     curvature = _loss_correction(fit.residual.reshape(-1, 2), fit.loss_sigmas)
     ratio, large = (curvature * _block_ratio(fit, rows, b) for b in (block, block % _LARGE_BLOCKS))
-    alone = curvature * _point_ratio(fit, rows)
+    # The same ratio with every point a block of its own, whose effect on the fit is negligible. Not over the
+    # variance: priors contribute to it without points.
+    point, squares = np.repeat(fit.observations.point_index, 2), np.zeros(len(rows))
+    for n, c in enumerate(rows):
+        squares[n] = np.sum(np.bincount(point, (fit.J @ c) * fit.residual) ** 2)
+    expected = np.sum((fit.J @ rows.T) ** 2, axis=0) - np.sum((fit.taken @ rows.T) ** 2, axis=0)
+    alone = curvature * (squares / np.maximum(expected, 1e-300))
     valid = np.isfinite(ratio) & (alone > 0.0)
     estimated, number = values.number >= 0, values.number
     covariance = rows[len(poses) :, first:]
@@ -395,16 +401,6 @@ def _block_ratio(fit: LinearisedFit, rows: F64, block: I64) -> F64:
         expected += np.sum(half * rows, axis=1) - np.sum(fit.solve(half.T).T * half, axis=1)
         squares += (rows @ (J.T @ fit.residual[here])) ** 2
     return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
-
-
-def _point_ratio(fit: LinearisedFit, rows: F64) -> F64:
-    """Return the same ratio with every point a block of its own, whose effect on the fit is negligible."""
-    squares, point = np.zeros(len(rows)), np.repeat(fit.observations.point_index, 2)
-    for n, c in enumerate(rows):
-        squares[n] = np.sum(np.bincount(point, (fit.J @ c) * fit.residual) ** 2)
-    # Not the variance: priors contribute to it without points.
-    expected = np.sum((fit.J @ rows.T) ** 2, axis=0) - np.sum((fit.taken @ rows.T) ** 2, axis=0)
-    return np.asarray(squares / np.maximum(expected, 1e-300))
 
 
 def _loss_correction(weighted: F64, delta: float) -> float:
