@@ -12,7 +12,7 @@ from thesisrecon.camera import angles_of_view
 from thesisrecon.errors import Notice
 from thesisrecon.lens import ANGLE, DIVISION, directions_of_image
 from thesisrecon.metric import _model
-from thesisrecon.metric._adjustment import MetricAdjustment, best_predictors, predicts_better, with_prior
+from thesisrecon.metric._adjustment import MetricAdjustment, best_predictors, predicts_better
 from thesisrecon.metric._model import BASES, FOCAL, K1, LATE_SIGMAS, MetricEstimate, refitted_lens
 from thesisrecon.optimize.bundle.identifiability import TOLERANCES
 from thesisrecon.optimize.bundle.projection import LENS
@@ -61,14 +61,6 @@ def _angles(model: MetricEstimate) -> F64:
     ])  # fmt: skip
 
 
-def with_decentring(
-    model: MetricEstimate, adjustment: MetricAdjustment
-) -> tuple[MetricEstimate, MetricAdjustment]:
-    """The model of a nearly straight lens with the lens model "brown", which is decentred."""
-    free = replace(adjustment, decentred=True)
-    return with_prior(model, free, replace(adjustment.prior, lens_model="brown"))
-
-
 def _settled(model: MetricEstimate, adjustment: MetricAdjustment) -> MetricEstimate:
     """Adjust all and triangulate again, until the points beyond the first view angles have joined."""
     for _ in range(3):
@@ -100,7 +92,23 @@ def undetermined_lens(
         if worst.std <= MAX_CORNER_STD * worst.value:
             return ()
         where = f"the corners are {worst.value:.1f} ± {worst.std:.1f} degrees from the axis"
-    return (Notice("lens-undetermined", where, _reason(model, motion)),)
+    # Points in the middle, parallel views of a plane, or forward motion.
+    flat, parallel = (
+        motion[name] < TOLERANCES[name] for name in ("scene_planarity_ratio", "infinity_shift_beyond_roll")
+    )
+    views, reach = np.flatnonzero(model.registered), reach_of_points(model)
+    steps = np.diff(model.cameras.centres[views], axis=0)
+    along = np.abs(np.einsum("va,va->v", steps, model.cameras.R[views[:-1], 2]))
+    why = "add images that turn the camera, with the same points in the middle and at the corners"
+    if reach < MIN_REACH:
+        why = (
+            f"99 % of the points lie within {reach:.0%} of the half diagonal. Fill the images with the scene"
+        )
+    elif flat and parallel:
+        why = "parallel views of a flat scene exchange its relief and the lens (Wu, 2014). Tilt the camera"
+    elif np.median(along / np.maximum(np.linalg.norm(steps, axis=1), 1e-300)) > FORWARD:
+        why = "the camera moved along its axis. Add images from the sides"
+    return (Notice("lens-undetermined", where, why),)
 
 
 def reach_of_points(model: MetricEstimate) -> float:
@@ -109,22 +117,3 @@ def reach_of_points(model: MetricEstimate) -> float:
     sizes = model.sizes[t.view_index[model.inlier]]
     off = 2.0 * t.xy[model.inlier] - (sizes - 1.0)
     return float(np.quantile(np.linalg.norm(off, axis=1) / np.linalg.norm(sizes, axis=1), 0.99))
-
-
-def _reason(model: MetricEstimate, motion: Mapping[str, float]) -> str:
-    """Why the lens is not determined: points in the middle, parallel views of a plane, or forward motion."""
-    views = np.flatnonzero(model.registered)
-    if (reach := reach_of_points(model)) < MIN_REACH:
-        return (
-            f"99 % of the points lie within {reach:.0%} of the half diagonal. Fill the images with the scene"
-        )
-    flat, parallel = (
-        motion[name] < TOLERANCES[name] for name in ("scene_planarity_ratio", "infinity_shift_beyond_roll")
-    )
-    if flat and parallel:
-        return "parallel views of a flat scene exchange its relief and the lens (Wu, 2014). Tilt the camera"
-    steps = np.diff(model.cameras.centres[views], axis=0)
-    along = np.abs(np.einsum("va,va->v", steps, model.cameras.R[views[:-1], 2]))
-    if np.median(along / np.maximum(np.linalg.norm(steps, axis=1), 1e-300)) > FORWARD:
-        return "the camera moved along its axis. Add images from the sides"
-    return "add images that turn the camera, with the same points in the middle and at the corners"

@@ -273,7 +273,8 @@ def _finished_with_decentring(
     limit = scipy.special.chdtri(2, 1e-3)
     narrow &= adjustment.shares_a_lens(model)
     if narrow and decentring_score(finished.fit, _model.DECENTRING_STD) > limit:
-        free = _lens.with_decentring(model, adjustment)
+        prior = replace(adjustment.prior, lens_model="brown")
+        free = _adjustment.with_prior(model, replace(adjustment, decentred=True), prior)
         decentred = finish_metric(*free)
         if _adjustment.predicts_better(finished[:2], decentred[:2]):
             return *free, decentred

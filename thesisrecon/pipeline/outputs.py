@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import wait
 from dataclasses import replace
 from pathlib import Path
@@ -285,7 +285,11 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
     sizes = projective[0].sizes.tolist() if projective else scaled
     names = [view["name"] for view in views]
     unread = {one["name"]: one["reason"] for one in summary["refused"] if one["name"] not in names}
-    features = tuple(stages["features"].values())
+    features, further = tuple(stages["features"].values()), list[RunResult]()
+    for group in summary.get("groups", ()):
+        part, own = (read_json(folder / group["folder"] / name) for name in (SUMMARY, RUN_FILE))
+        if group["registered"] and isinstance(part, dict) and isinstance(own, dict):
+            further.append(load_run(folder / group["folder"], part, own))
     images = tuple(
         image_without_pixels(view["name"], size, (view["width_px"], view["height_px"]))
         for view, size in zip(views, sizes, strict=True)
@@ -297,7 +301,7 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         mesh=stages["model"].get("model"), held_out=stages["model"].get("held-out"),
         reports=tuple(report for report in reports if report is not None),
         warnings=tuple(summary["warnings"]), summary=summary, failure=summary["failure"] or "",
-        further_models=tuple(_further_models(folder, summary)),
+        further_models=tuple(further),
     )  # fmt: skip
     attempts = list[RunResult]()
     # A run of known cameras has no projective model.
@@ -310,13 +314,6 @@ def load_run(folder: Path, summary: Mapping[str, Any], run: Mapping[str, Any]) -
         calibration = stages["selfcalibration"].get(item)
         attempts.append(replace(result, projective=model, calibration=calibration, metric=metric))
     return with_image_names(best_result(attempts or [result]))
-
-
-def _further_models(folder: Path, summary: Mapping[str, Any]) -> Iterator[RunResult]:
-    for group in summary.get("groups", ()):
-        part, run = (read_json(folder / group["folder"] / name) for name in (SUMMARY, RUN_FILE))
-        if group["registered"] and isinstance(part, dict) and isinstance(run, dict):
-            yield load_run(folder / group["folder"], part, run)
 
 
 def _keys(folder: Path) -> dict[str, str]:

@@ -10,7 +10,7 @@ from typing import ParamSpec
 
 import numpy as np
 
-from thesisrecon.arrays import B8, F64, I64
+from thesisrecon.arrays import F64, I64
 from thesisrecon.errors import Notice, StageFailure, counted
 from thesisrecon.geometry.homogeneous import pixel_from_unit
 from thesisrecon.geometry.relative_pose import pose_in_front
@@ -143,7 +143,14 @@ def _bundle_problem(
     # A very distant point has no information on the focal length and dominates the conditioning.
     usable &= np.linalg.norm(X - np.median(X[usable], axis=0), axis=1) < 100.0 * spread
     T, X = T / spread, X / spread
-    t, index = reconstruction.tracks, _usable_observations(reconstruction, R, T, X, usable)
+    # Inliers of finite points in front of their cameras, at least two per point and ten per view.
+    t = reconstruction.tracks
+    there = reconstruction.registered[t.view_index] & usable[t.point_index]
+    index = np.flatnonzero(reconstruction.inlier & there)
+    place = np.searchsorted(views, t.view_index[index])
+    index = index[np.einsum("kj,kj->k", R[place, 2], X[t.point_index[index]]) + T[place, 2] > 1e-6]
+    index = index[np.bincount(t.view_index[index], minlength=t.n_views)[t.view_index[index]] >= 10]
+    index = index[np.bincount(t.point_index[index], minlength=t.n_points)[t.point_index[index]] >= 2]
     total = len(index)
     if total > _MAX_OBSERVATIONS:
         # Every k-th track by length rather than the longest ones, which may lie in one corner of the scene.
@@ -177,19 +184,6 @@ def _projective_noise(reconstruction: Reconstruction, index: I64) -> float:
     noise = noise_from_distances(np.linalg.norm(x[:, :2] / x[:, 2:] - t.xy[index], axis=1))
     left = 2 * len(index) - 3 * len(np.unique(point)) - 11 * len(np.unique(view)) + 15
     return noise * float(np.sqrt(2.0 * len(index) / max(left, 1)))
-
-
-def _usable_observations(reconstruction: Reconstruction, R: F64, T: F64, X: F64, usable: B8) -> I64:
-    """Return inliers of finite points in front of their cameras, at least two per point and ten per view."""
-    t, views = reconstruction.tracks, np.flatnonzero(reconstruction.registered)
-    there = reconstruction.registered[t.view_index] & usable[t.point_index]
-    index = np.flatnonzero(reconstruction.inlier & there)
-    place = np.searchsorted(views, t.view_index[index])
-    depth = np.einsum("kj,kj->k", R[place, 2], X[t.point_index[index]]) + T[place, 2]
-    index = index[depth > 1e-6]
-    index = index[np.bincount(t.view_index[index], minlength=t.n_views)[t.view_index[index]] >= 10]
-    seen = np.bincount(t.point_index[index], minlength=t.n_points)
-    return np.asarray(index[seen[t.point_index[index]] >= 2], dtype=np.int64)
 
 
 Arguments = ParamSpec("Arguments")

@@ -11,6 +11,7 @@ infinity does not appear: more motions are critical than for the quadric, but no
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -90,22 +91,6 @@ def _kruppa_cost(pairs: _Pairs, K: F64, *, loss_scale: float) -> F64:
     return np.asarray(np.mean(soft_l1(squared, loss_scale)[0], axis=1))
 
 
-def _minimize_kruppa(
-    pairs: _Pairs, unknown: SolverUnknowns, start: F64, loss_scale: float
-) -> tuple[F64, F64]:
-    """Minimize the residuals over all unknown intrinsics from a start (D,); return K (R, 3, 3), its std."""
-
-    def residuals(batch: F64) -> F64:
-        r = _pair_residuals(pairs, unknown.calibrations(batch)).reshape(len(batch), 3 * len(pairs.i))
-        return np.concatenate([r, _NOISE * unknown.prior_residuals(batch)], axis=1)
-
-    found = minimize_residuals(
-        lambda x: residuals(x[None])[0], start,
-        loss=lambda s: soft_l1(s, loss_scale), max_iterations=80, tolerance=1e-14,
-    )  # fmt: skip
-    return unknown.calibrations(found.x[None])[0], unknown.calibration_std(found.x, found.covariance)
-
-
 @dataclass(frozen=True)
 class KruppaEquations:
     """Self-calibration by the Kruppa equations over all camera pairs.
@@ -144,6 +129,11 @@ class KruppaEquations:
 
     def _solutions(self, pairs: _Pairs, unknown: SolverUnknowns, n: int) -> list[tuple[F64, F64, float]]:
         """K (n, 3, 3), standard deviations and rms residual of minima whose focal is determined or given."""
+
+        def residuals(x: F64) -> F64:
+            r = _pair_residuals(pairs, unknown.calibrations(x[None])).ravel()
+            return np.concatenate([r, _NOISE * unknown.prior_residuals(x[None])[0]])
+
         found, weakest = [], np.inf
         given = float(unknown.std[unknown.focals].max(initial=0.0))
         # The best local minima of one common log focal length.
@@ -154,7 +144,9 @@ class KruppaEquations:
         minima = np.flatnonzero((cost <= padded[:-2]) & (cost <= padded[2:]))
         for log_f in grid[minima[np.argsort(cost[minima], kind="stable")][: self.starts]].tolist():
             start = unknown.from_log_focals(np.full((1, n), log_f))[0]
-            K, K_std = _minimize_kruppa(pairs, unknown, start, self.loss_scale)
+            loss = partial(soft_l1, delta=self.loss_scale)
+            fit = minimize_residuals(residuals, start, loss=loss, max_iterations=80, tolerance=1e-14)
+            K, K_std = unknown.calibrations(fit.x[None])[0], unknown.calibration_std(fit.x, fit.covariance)
             # The deviation of log f by the change of the residuals with all focal lengths.
             scaled = np.repeat(K[None], 3, axis=0)
             scaled[:, :, :2, :2] *= np.exp([-_STEP, 0.0, _STEP])[:, None, None, None]

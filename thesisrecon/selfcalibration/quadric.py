@@ -7,6 +7,7 @@ Each closed form fails on some image sets, so that the default method refines th
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -87,34 +88,26 @@ def minimize_quadric(
     # The residuals also vanish as all focal lengths go to 0: the weak prior makes this cost more than noise.
     free, unknown = 3 + int(np.isinf(unknown.std).sum()), unknown.with_focal_prior()
     theta, noise = np.concatenate([plane, unknown.from_log_focals(log_f[None])[0]]), 0.01
+    # Five independent entries per camera except the reference, whose residuals vanish.
+    views = len(frame.views)
+    dof = max(5 * (views - 1) - free, 1)
     for _ in range(_NOISE_PASSES):
-        supposed = noise
-        theta, noise, covariance, cost = _minimize(frame, unknown, free, theta, noise, loss_scale)
+
+        def residuals(x: F64, noise: float = noise) -> F64:
+            K = unknown.calibrations(x[None, 3:])
+            data = _refinement.dual_image_residuals(frame, K, x[None, :3]).ravel()
+            return np.concatenate([data, noise * unknown.prior_residuals(x[None, 3:])[0]])
+
+        supposed, loss = noise, partial(huber, delta=loss_scale)
+        fit = minimize_residuals(residuals, theta, loss=loss, max_iterations=100, tolerance=1e-14)
+        theta, squares = fit.x, float(np.sum(fit.residual[: 6 * views] ** 2))
+        noise = max(float(np.sqrt(squares / dof)), _MIN_NOISE)
         if noise > 0.7 * supposed:
             break
+    scale = noise**2 * max(len(fit.residual) - len(theta), 1) / max(2.0 * fit.cost, 1e-300)
     K = unknown.calibrations(theta[None, 3:])[0]
-    K_std = unknown.calibration_std(theta[3:], covariance[3:, 3:])
-    return Candidate(theta[:3], K, cost, method, K_std)
-
-
-def _minimize(
-    frame: ReferenceFrame, unknown: SolverUnknowns, free: int, theta: F64, noise: float, loss_scale: float
-) -> tuple[F64, float, F64, float]:
-    def residuals(batch: F64) -> F64:
-        K = unknown.calibrations(batch[:, 3:])
-        data = _refinement.dual_image_residuals(frame, K, batch[:, :3]).reshape(len(batch), -1)
-        return np.concatenate([data, noise * unknown.prior_residuals(batch[:, 3:])], axis=1)
-
-    found = minimize_residuals(
-        lambda x: residuals(x[None])[0], theta,
-        loss=lambda s: huber(s, loss_scale), max_iterations=100, tolerance=1e-14,
-    )  # fmt: skip
-    data = found.residual[: 6 * len(frame.views)]
-    # Five independent entries per camera except the reference, whose residuals vanish.
-    dof = max(5 * (len(frame.views) - 1) - free, 1)
-    noise = max(float(np.sqrt(np.sum(data**2) / dof)), _MIN_NOISE)
-    scale = noise**2 * max(len(found.residual) - len(theta), 1) / max(2.0 * found.cost, 1e-300)
-    return found.x, noise, found.covariance * scale, float(np.sum(data**2) / len(frame.views))
+    K_std = unknown.calibration_std(theta[3:], fit.covariance[3:, 3:] * scale)
+    return Candidate(theta[:3], K, squares / views, method, K_std)
 
 
 @dataclass(frozen=True)
