@@ -57,10 +57,11 @@ class MetricBundleResult:
     """Refined cameras and points with their uncertainty, in the inner gauge (no camera is exact).
 
     ``residual_px`` (K, 2) is projection minus observation in the caller's order, ``cost`` 1/2 sum rho in
-    units of the given sigma, priors included. ``intrinsics_covariance`` (G, C, C) is zero for entries that do
-    not move, ``pose_covariance`` (V, 6, 6) that of (w, d) of x -> exp(w) x + d in each camera frame,
-    ``point_covariance`` (N, 3, 3) infinite for points in fewer than two views. ``sigmas_to_minimum`` is the
-    largest undamped step of any function of the cameras in its standard deviations, (g' H^-1 g)^(1/2).
+    units of the given sigma, priors included, ``sigma_px`` NaN if not asked for. ``intrinsics_covariance``
+    (G, C, C) is zero for entries that do not move, ``pose_covariance`` (V, 6, 6) that of (w, d) of x ->
+    exp(w) x + d in each camera frame, ``point_covariance`` (N, 3, 3) infinite for points in fewer than two
+    views. ``sigmas_to_minimum`` is the largest undamped step of any function of the cameras in its standard
+    deviations, (g' H^-1 g)^(1/2).
     """
 
     cameras: projection.MetricCameras
