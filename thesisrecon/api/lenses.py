@@ -104,24 +104,12 @@ def undistort_image(
 
 @dataclass(frozen=True)
 class RectifiedCameras:
-    """Two cameras turned about their centres so that their rows correspond, without distortion.
+    """Two cameras turned about their centres so that their rows correspond, without distortion."""
 
-    Parameters
-    ----------
-    cameras : tuple of Camera
-        The rectified cameras: one K and one R, x along the baseline.
-    H : ndarray (2, 3, 3)
-        Homographies K R (K_i R_i)^-1 from undistorted pixels of the cameras to rectified ones.
-    Q : ndarray (4, 4)
-        (x, y, x1 - x2, 1) to homogeneous points in the frame of the first rectified camera.
-    given : tuple of Camera
-        The cameras of the images.
-    """
-
-    cameras: tuple[Camera, Camera]
-    H: F64
-    Q: F64
-    given: tuple[Camera, Camera]
+    cameras: tuple[Camera, Camera]  #: the rectified ones: one K and one R, x along the baseline
+    H: F64  #: (2, 3, 3) homographies K R (K_i R_i)^-1 from undistorted pixels to rectified ones
+    Q: F64  #: (4, 4), (x, y, x1 - x2, 1) to homogeneous points in the frame of the first rectified camera
+    given: tuple[Camera, Camera]  #: the cameras of the images
 
     @property
     def K(self) -> F64:

@@ -259,36 +259,22 @@ class ModelBuilder(Protocol):
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """How images are read.
+    """How images are read."""
 
-    Parameters
-    ----------
-    max_size_px : int
-        Larger images are reduced to this long side.
-    groups : bool
-        Reconstruct each group of 3 or more images with too little overlap with the others.
-    part_views : int
-        Maximum number of images (approximately) that are reconstructed together. Larger sets are divided
-        into overlapping parts if a division separates few of the common points; 0: never.
-    gps : bool
-        Move the model to the GPS positions of EXIF: in metres east, north and up of their median.
-    gps_std_m : float
-        Standard deviation of a coordinate of these positions, which are then observations of the adjustment,
-        too; 0: they determine the frame alone.
-    up : {"none", "auto"}
-        "auto": without GPS the model is turned until z is up, by vertical lines of the scene if most nearly
-        vertical ones agree, else by the level sides of the images.
-    static : {"mask", "keep"}
-        "mask": leave out pixels that look the same at the same place in most of at least four images while
-        others move: a text, a part of the vehicle, the room around a turntable.
-    """
-
-    max_size_px: int = 1600
-    groups: bool = True
+    max_size_px: int = 1600  #: larger images are reduced to this long side
+    groups: bool = True  #: reconstruct each group of 3 or more images with too little overlap with the others
+    #: maximum number of images (approximately) that are reconstructed together; larger sets are divided into
+    #: overlapping parts if a division separates few of the common points; 0: never
     part_views: int = 400
-    gps: bool = False
+    gps: bool = False  #: move the model to the GPS of EXIF: metres east, north and up of their median
+    #: standard deviation of a coordinate of these positions, which are then observations of the adjustment,
+    #: too; 0: they determine the frame alone
     gps_std_m: float = 0.0
+    #: "auto": without GPS the model is turned until z is up, by vertical lines of the scene if most nearly
+    #: vertical ones agree, else by the level sides of the images
     up: Literal["none", "auto"] = "none"
+    #: "mask": leave out pixels that look the same at the same place in most of at least four images while
+    #: others move: a text, a part of the vehicle, the room around a turntable
     static: Literal["mask", "keep"] = "mask"
 
     def __post_init__(self) -> None:

@@ -36,55 +36,35 @@ class IntrinsicsOptions:
     Each intrinsic has a mode (:data:`Mode`), a value and, unless it is known, the standard deviation of the
     value (None: the value is only a starting value). The defaults: unknown focal length, square pixels, no
     skew, a principal point within about 1 % of the long side of the image centre, moderate radial distortion.
-
-    Parameters
-    ----------
-    cameras : {"shared", "per-size", "per-image"}
-        "shared": images of the same size and folder come from one camera; "per-size": images of the same size
-        do, whatever their folder; "per-image": each image has its own camera.
-    common_prior : bool
-        Images of the same size come from cameras of the same kind: values that are not shared scatter about a
-        common mean (hierarchical prior; the scatter is estimated).
-    focal, focal_px, focal_std_rel, exif : Mode, float, float, bool
-        Focal length in pixels of the original images; its standard deviation is relative. ``exif``: read it
-        from EXIF (35 mm equivalent) if ``focal_px`` is not given; a known focal length that is missing there
-        is estimated as constant.
-    aspect, aspect_ratio, aspect_std : Mode, float, float
-        Pixel height over width, fy / fx.
-    skew, skew_px, skew_std_px : Mode, float, float
-        Skew in pixels of the original images.
-    principal_point, principal_point_px, principal_point_std_rel : Mode, (float, float), float
-        Principal point in pixels of the original images (None: image centre); std relative to the long side.
-    k1, k1_value, k1_std : Mode, float, float
-        First radial distortion coefficient.
-    lens : {"auto", "radial", "brown", "division", "fisheye"}
-        Model of the lens as of :class:`thesisrecon.Camera`. "auto": radial, and the model that explains the
-        observations best where pairs of images show that lines bend much.
-
-    Raises
-    ------
-    ValueError
-        If a value is not finite or out of range, or two settings contradict each other.
+    ``ValueError`` if a value is not finite or out of range, or two settings contradict each other.
     """
 
+    #: "shared": images of the same size and folder come from one camera; "per-size": images of the same size
+    #: do, whatever their folder; "per-image": each image has its own camera
     cameras: Literal["shared", "per-size", "per-image"] = "shared"
+    #: images of the same size come from cameras of the same kind: values that are not shared scatter about a
+    #: common mean (hierarchical prior; the scatter is estimated)
     common_prior: bool = True
-    focal: Mode = "constant"
-    focal_px: float | None = None
-    focal_std_rel: float | None = None
+    focal: Mode = "constant"  #: focal length
+    focal_px: float | None = None  #: in pixels of the original images
+    focal_std_rel: float | None = None  #: standard deviation, relative
+    #: read it from EXIF (35 mm equivalent) if ``focal_px`` is not given; a known focal length that is missing
+    #: there is estimated as constant
     exif: bool = False
-    aspect: Mode = "known"
-    aspect_ratio: float = 1.0
-    aspect_std: float | None = None
-    skew: Mode = "known"
-    skew_px: float = 0.0
-    skew_std_px: float | None = None
+    aspect: Mode = "known"  #: pixel height over width, fy / fx
+    aspect_ratio: float = 1.0  #: its value
+    aspect_std: float | None = None  #: standard deviation
+    skew: Mode = "known"  #: angle between the pixel axes
+    skew_px: float = 0.0  #: in pixels of the original images
+    skew_std_px: float | None = None  #: standard deviation
     principal_point: Mode = "constant"
-    principal_point_px: tuple[float, float] | None = None
-    principal_point_std_rel: float | None = 0.01
-    k1: Mode = "constant"
-    k1_value: float = 0.0
-    k1_std: float | None = 0.05
+    principal_point_px: tuple[float, float] | None = None  #: in pixels of the originals; None: image centre
+    principal_point_std_rel: float | None = 0.01  #: standard deviation over the long side
+    k1: Mode = "constant"  #: first radial distortion coefficient
+    k1_value: float = 0.0  #: its value
+    k1_std: float | None = 0.05  #: standard deviation
+    #: model of the lens as of :class:`thesisrecon.Camera`; "auto": radial, and the model that explains the
+    #: observations best where pairs of images show that lines bend much
     lens: LensModel = "auto"
 
     def __post_init__(self) -> None:
