@@ -131,8 +131,7 @@ def export(
     undistorted, pinholes = _undistorted(model, keep_lens=nerfstudio and formats.is_fisheye(model))
     divided = any(pinhole.turn is not None for each in pinholes for pinhole in each)
     if divided:
-        gave = f"the {len(model.views)} images gave {len(undistorted.views)} pinhole images"
-        notes.append(f"{gave}: those wider than {WIDE:.0f} degrees are divided into images of 90 degrees")
+        notes.append(Notice("divided-images", len(model.views), len(undistorted.views), WIDE))
     if images is None:
         raise UsageError(Notice("images-not-recorded"))
     paths = _images.find_images(images, model.names)
@@ -194,11 +193,8 @@ def _rounding_notes(model: SparseModel) -> list[str]:
     if len(model.X) < 2:
         return []
     rounding = float(np.spacing(np.float32(np.abs(model.X).max())))
-    if rounding <= 1e-4 * float(np.median(np.ptp(model.X, axis=0))):
-        return []
-    return [
-        f"points are stored in single precision, rounded to {rounding:.2g}; subtract an offset from positions"
-    ]
+    small = rounding <= 1e-4 * float(np.median(np.ptp(model.X, axis=0)))
+    return [] if small else [Notice("single-precision", rounding)]
 
 
 def recorded_masks(model: Model, to: str) -> tuple[Path | None, list[str]]:

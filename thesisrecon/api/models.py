@@ -555,17 +555,11 @@ def _similarity(centres: F64, centres_b: F64, notes: list[str]) -> Similarity | 
     try:
         similarity = estimate_similarity(centres, centres_b)
     except ValueError:
-        notes.append(
-            "the centres of the common cameras lie on one line or in one point and cannot be aligned; "
-            "rotations and intrinsics are compared"
-        )
+        notes.append(Notice("centres-on-a-line"))
         return None
     extents = (np.linalg.svd(C - C.mean(axis=0), compute_uv=False) for C in (centres, centres_b))
     if min(across / along for along, across, _ in extents) < 0.01:
-        notes.append(
-            "the centres of the common cameras lie almost on one line; the rotation about it is uncertain, "
-            "and with it the distances of points"
-        )
+        notes.append(Notice("centres-near-a-line"))
     return similarity
 
 
