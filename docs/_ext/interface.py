@@ -7,6 +7,7 @@ import dataclasses
 import inspect
 import re
 import typing
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -133,13 +134,16 @@ def class_lines(path: str, kind: type[Any], value: Any) -> list[str]:
 
 
 def field_notes(kind: type[Any]) -> dict[str, str]:
-    """Return what stands beside (#:) or below the fields of a class in its source."""
+    """Return what stands beside or above (#:) or below the fields of a class in its source."""
     source = inspect.getsource(kind)
-    body = ast.parse(source).body[0].body
+    body, lines = ast.parse(source).body[0].body, source.splitlines()
     notes = {}
     for node, below in zip(body, [*body[1:], None], strict=True):
         if isinstance(node, ast.AnnAssign):
-            beside = source.splitlines()[node.end_lineno - 1].partition("#: ")[2]
+            beside = lines[node.end_lineno - 1].partition("#: ")[2]
+            before = map(str.strip, lines[node.lineno - 2 :: -1])
+            above = [line[3:] for line in takewhile(lambda line: line.startswith("#: "), before)]
+            beside = beside or " ".join(above[::-1])
             if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
                 beside = beside or str(below.value.value)
             notes[node.target.id] = beside[:1].upper() + beside[1:]

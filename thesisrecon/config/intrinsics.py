@@ -47,22 +47,22 @@ class IntrinsicsOptions:
     common_prior: bool = True
     focal: Mode = "constant"  #: focal length
     focal_px: float | None = None  #: in pixels of the original images
-    focal_std_rel: float | None = None  #: standard deviation, relative
+    focal_std_rel: float | None = None  #: standard deviation of the focal length, relative
     #: read it from EXIF (35 mm equivalent) if ``focal_px`` is not given; a known focal length that is missing
     #: there is estimated as constant
     exif: bool = False
     aspect: Mode = "known"  #: pixel height over width, fy / fx
-    aspect_ratio: float = 1.0  #: its value
-    aspect_std: float | None = None  #: standard deviation
+    aspect_ratio: float = 1.0  #: value of the aspect
+    aspect_std: float | None = None  #: standard deviation of the aspect
     skew: Mode = "known"  #: angle between the pixel axes
     skew_px: float = 0.0  #: in pixels of the original images
-    skew_std_px: float | None = None  #: standard deviation
-    principal_point: Mode = "constant"
+    skew_std_px: float | None = None  #: standard deviation of the skew
+    principal_point: Mode = "constant"  #: image of the optical axis
     principal_point_px: tuple[float, float] | None = None  #: in pixels of the originals; None: image centre
-    principal_point_std_rel: float | None = 0.01  #: standard deviation over the long side
+    principal_point_std_rel: float | None = 0.01  #: its standard deviation over the long side
     k1: Mode = "constant"  #: first radial distortion coefficient
-    k1_value: float = 0.0  #: its value
-    k1_std: float | None = 0.05  #: standard deviation
+    k1_value: float = 0.0  #: value of k1
+    k1_std: float | None = 0.05  #: standard deviation of k1
     #: model of the lens as of :class:`thesisrecon.Camera`; "auto": radial, and the model that explains the
     #: observations best where pairs of images show that lines bend much
     lens: LensModel = "auto"
