@@ -202,7 +202,9 @@ def _projective(
             raise ValueError(str(error).replace("reconstruction_from_cameras", caller)) from None
     if given.stratum == "projective":
         return given
-    raise ValueError(Notice(f"no-projective-but-{given.stratum}", caller))
+    if given.stratum == "metric":
+        raise ValueError(Notice("no-projective-but-metric", caller))
+    raise ValueError(Notice("no-projective-but-affine", caller))
 
 
 def _method(
