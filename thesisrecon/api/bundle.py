@@ -314,19 +314,14 @@ def _start(views: Sequence[Camera], shared: bool | I64, free: B8) -> MetricCamer
             raise ValueError(f"shared must be True, False or a camera number per view ({n},); got {own}")
     lenses = lens_table("bundle_adjust", views, BASE + 1 if free[8:].any() else 3)
     table = np.column_stack([projection.pinhole_rows(np.array([view.K for view in views])), lenses])
-    _require_free(table, free)
-    R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
-    sharing = np.where(free[: table.shape[1]], own[:, None], np.arange(n)[:, None])
-    return MetricCameras(R, t, table, np.arange(n), sharing)
-
-
-def _require_free(table: F64, free: B8) -> None:
-    """Raise ``ValueError`` if a lens in the table lacks a coefficient that is free."""
-    bases = table[:, LENS] if table.shape[1] > LENS else np.zeros(len(table))
+    bases = table[:, LENS] if table.shape[1] > LENS else np.zeros(n)
     if free[6:].any() and (bases == DIVISION).any():
         raise ValueError("a division lens has k1 only: leave k2, k3, k4, p1 and p2 out of free")
     if free[8] and (bases != ANGLE).any():
         raise ValueError("k4 is a coefficient of fisheye lenses only: leave it out of free")
+    R, t = (np.array([getattr(view, name) for view in views]) for name in ("R", "t"))
+    sharing = np.where(free[: table.shape[1]], own[:, None], np.arange(n)[:, None])
+    return MetricCameras(R, t, table, np.arange(n), sharing)
 
 
 def _prior(table: F64, prior: Mapping[str, float | F64], free: B8, names: Sequence[str]) -> IntrinsicsPrior:

@@ -32,10 +32,10 @@ from thesisrecon.records import TexturedMesh
 from thesisrecon.results import RunResult, SparseModel, SparseView
 from thesisrecon.runtime._executors import available_threads
 
+# Separate from the budget for decoding, which each image needs while it occupies this one.
 _budget = MemoryBudget(_images.MAX_DECODED_BYTES)
 Images = str | Path | Mapping[str, str]
 """A folder of images, or their files by name."""
-"""Separate from the budget for decoding, which each image needs while it occupies this one."""
 
 
 @dataclass(frozen=True)

@@ -197,8 +197,14 @@ def depth_maps(
     """
     method = as_config(config)
     read, model = _scene("depth_maps", images, cameras, sizes, max_size or method.images.max_size_px)
-    limits = None if depth_range is None else _limits(depth_range, len(read))
-    dense = method.dense
+    limits, dense = None, method.dense
+    if depth_range is not None:
+        (given,) = numbers("depth_maps", depth_range=depth_range)
+        if given.shape not in ((2,), (len(read), 2)):
+            raise ValueError(Notice("shape-of-depth-range", len(read), given.shape))
+        limits = np.broadcast_to(given, (len(read), 2))
+        if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (np.diff(limits) > 0.0).all()):
+            raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
     scene = dense.prepare(read, model, depth_range=limits, threads=threads)
     if not any(scene.neighbours[view] for view in scene.views):
         raise StageFailure.of("no-depth-of-cameras")
@@ -382,16 +388,6 @@ def _model(views: Sequence[Camera]) -> records.Reconstruction:
         np.zeros(0, dtype=bool), records.Tracks(none, none, np.zeros((0, 2)), n, 0),
         np.array([view.size for view in views]).reshape(n, 2), 1.0, ("",) * n, K, lenses,
     )  # fmt: skip
-
-
-def _limits(depth_range: F64 | tuple[float, float], n: int) -> F64:
-    (limits,) = numbers("depth_maps", depth_range=depth_range)
-    if limits.shape not in ((2,), (n, 2)):
-        raise ValueError(Notice("shape-of-depth-range", n, limits.shape))
-    limits = np.broadcast_to(limits, (n, 2))
-    if not (np.isfinite(limits).all() and (limits[:, 0] > 0.0).all() and (limits[:, 1] > limits[:, 0]).all()):
-        raise ValueError(f"depth_range needs 0 < nearest < farthest, both finite; got {depth_range}")
-    return limits
 
 
 def _plain(number: int, depth: F32 | F64, camera: Camera) -> records.DepthMap:

@@ -171,7 +171,11 @@ def prepare_pair(
         one if isinstance(one, Image) else read_image(one, max_size_px=config.images.max_size_px).images[0]
         for one in eight_bit_images(image1, image2)
     )
-    _require_comparable_images(first, second)
+    if first.size != second.size:
+        sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
+        raise UsageError(f"interpolation needs images of the same size; {sizes} px")
+    if np.array_equal(first.rgb, second.rgb):
+        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
     pair = match_pair(first, second, config=config, seed=seed)
     _require_sideways_motion(pair, (first, second))
     try:
@@ -188,15 +192,6 @@ def prepare_pair(
     images = first.rgb, second.rgb
     places = dense.correspondences(0, first.size), dense.correspondences(1, second.size)
     return interpolation.prepare_interpolation(images, dense.frame.H, dense.left, places, gain=dense.gain)
-
-
-def _require_comparable_images(first: Image, second: Image) -> None:
-    """Raise ``UsageError`` unless the images have the same size and different content."""
-    if first.size != second.size:
-        sizes = " and ".join(f"{one.name} is {one.size[0]} x {one.size[1]}" for one in (first, second))
-        raise UsageError(f"interpolation needs images of the same size; {sizes} px")
-    if np.array_equal(first.rgb, second.rgb):
-        raise UsageError(f"{first.name} and {second.name} are the same image; give different ones")
 
 
 def _require_sideways_motion(pair: TwoView, images: tuple[Image, Image]) -> None:
