@@ -141,7 +141,11 @@ def prior_from_options(
     The ``names`` of the images tell their folders.
     """
     n = len(original_sizes)
-    _check_sizes(options, original_sizes)
+    for width, height in dict.fromkeys(original_sizes):
+        x, y = options.principal_point_px or (0.0, 0.0)
+        outside = max(-x, x - width, -y, y - height)
+        if outside > max(width, height):
+            raise UsageError(Notice("far-principal-point", x, y, outside, width, height))
     group, own = _cameras_of(options, original_sizes, names), np.arange(n)
     # A known value is known for every view: sharing it would add nothing.
     modes = [getattr(options, name) for name in _OF_COLUMN]
@@ -167,17 +171,6 @@ def prior_for(reconstruction: Reconstruction, options: IntrinsicsOptions | None 
     sizes = [(int(width), int(height)) for width, height in reconstruction.sizes]
     missing, same = np.full(len(sizes), np.nan), np.ones(len(sizes))
     return prior_from_options(options or IntrinsicsOptions(), sizes, missing, same)
-
-
-def _check_sizes(options: IntrinsicsOptions, original_sizes: Sequence[tuple[int, int]]) -> None:
-    """Raise ``UsageError`` for a principal point more than one long side outside an image."""
-    if options.principal_point_px is None:
-        return
-    x, y = options.principal_point_px
-    for width, height in dict.fromkeys(original_sizes):
-        outside = max(-x, x - width, -y, y - height)
-        if outside > max(width, height):
-            raise UsageError(Notice("far-principal-point", x, y, outside, width, height))
 
 
 def _values(options: IntrinsicsOptions, sizes: F64, exif_focal_px: F64) -> tuple[F64, F64]:

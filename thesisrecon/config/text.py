@@ -115,19 +115,14 @@ def config_from_toml(
         base = _preset(name)
     base = base or PipelineConfig()
     for change in changes:
-        tables = _merged_stages(tables, change, base)
+        for stage, table in change.items():
+            old = tables.get(stage)
+            if stage in KINDS and isinstance(old, Mapping) and isinstance(table, Mapping):
+                kind = old.get(_KIND, _kind_of(stage, getattr(base, stage)))
+                # The settings of another kind are dropped.
+                tables[stage] = {} if table.get(_KIND, kind) != kind else old
+        tables = _merged(tables, change)
     return config_from_tables(tables, base)
-
-
-def _merged_stages(under: Mapping[str, Any], over: Mapping[str, Any], base: PipelineConfig) -> dict[str, Any]:
-    """``over`` merged into ``under``; if the kind changes, the settings of the old kind are dropped."""
-    kept = dict(under)
-    for stage, table in over.items():
-        old = under.get(stage)
-        if stage in KINDS and isinstance(old, Mapping) and isinstance(table, Mapping):
-            kind = old.get(_KIND, _kind_of(stage, getattr(base, stage)))
-            kept[stage] = {} if table.get(_KIND, kind) != kind else old
-    return _merged(kept, over)
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
