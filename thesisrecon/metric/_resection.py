@@ -58,8 +58,21 @@ def register_missing_cameras(
     """Register missing and inconsistent cameras; return the model, and the reasons of those that failed."""
     model, rejected = _grow(model, adjustment, rng, np.ones(len(model.registered), dtype=bool))
     suspects = model.registered & (_model.inlier_ratios(model) < MIN_INLIER_RATIO)
-    if suspects.any() and (model.registered & ~suspects).sum() >= 3:
-        model, rejected = _register_again(model, adjustment, rng, suspects)
+    if not suspects.any() or (model.registered & ~suspects).sum() < 3:
+        return model, rejected
+    # The rest is adjusted without the suspects, which are then registered again if they fit.
+    none = np.zeros(len(suspects), dtype=bool)
+    inlier = model.inlier & ~suspects[model.tracks.view_index]
+    model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
+    model, _ = _grow(model, adjustment, rng, none)
+    model, rejected = _grow(model, adjustment, rng, ~none)
+    share = _model.inlier_ratios(model)
+    wrong = model.registered & (share < MIN_INLIER_RATIO)
+    if wrong.any():
+        for view in np.flatnonzero(wrong):
+            rejected[int(view)] = Notice("contradicted-by-others", share[view])
+        model = replace(model, registered=model.registered & ~wrong)
+        model = _model.retriangulate_tracks(model, sigmas=LATE_SIGMAS)
     return model, rejected
 
 
@@ -164,25 +177,6 @@ def _register(model: MetricEstimate, view: int, rows: I64, rng: np.random.Genera
         return ""
     registered = model.registered | (np.arange(len(Rs)) == view)
     return replace(model, cameras=replace(cameras, R=Rs, t=ts, intrinsics=intrinsics), registered=registered)
-
-
-def _register_again(
-    model: MetricEstimate, adjustment: MetricAdjustment, rng: np.random.Generator, suspects: B8
-) -> tuple[MetricEstimate, dict[int, str]]:
-    """Remove suspects, adjust the rest without them, then register them again if they fit."""
-    none = np.zeros(len(suspects), dtype=bool)
-    inlier = model.inlier & ~suspects[model.tracks.view_index]
-    model = replace(model, registered=model.registered & ~suspects, inlier=inlier)
-    model, _ = _grow(model, adjustment, rng, none)
-    model, rejected = _grow(model, adjustment, rng, ~none)
-    share = _model.inlier_ratios(model)
-    wrong = model.registered & (share < MIN_INLIER_RATIO)
-    if wrong.any():
-        for view in np.flatnonzero(wrong):
-            rejected[int(view)] = Notice("contradicted-by-others", share[view])
-        model = replace(model, registered=model.registered & ~wrong)
-        model = _model.retriangulate_tracks(model, sigmas=LATE_SIGMAS)
-    return model, rejected
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,15 @@ class MetricRefinement:
         model, rejected = register_missing_cameras(models[best], adjustment, rng)
         model, adjustment = _lens.with_best_lens(model, adjustment)
         reasons = tuple("" if there else rejected.get(v, "") for v, there in enumerate(model.registered))
-        model = _adjust_to_precise_points(model, reconstruction.tracks, adjustment)
+        # In large sets the points are selected again by the residuals of the model adjusted to the selection.
+        selected = model.tracks.n_points != reconstruction.tracks.n_points
+        before = np.empty(0, dtype=np.int64)
+        for _ in range(5 if selected else 0):
+            model, points = _model.with_precise_points(model, reconstruction.tracks)
+            model = adjustment.run(model)[0]
+            if len(np.intersect1d(points, before)) >= 0.98 * len(points):
+                break
+            before = points
         model, adjustment, finished = _finished_with_decentring(model, adjustment)
         assessed = _assess(settle_camera_model(finished), reconstruction.tracks, calibration, reasons)
         if assessed[0].trusted:
@@ -295,22 +303,6 @@ def _iterate_inliers(model: MetricEstimate, adjustment: MetricAdjustment) -> Met
         model = adjustment.run(_model.select_inliers(model, **gate))[0]
     model = _model.select_inliers(model, **gate)
     return adjustment.run(model, settled=_adjustment.SETTLED, keep_noise=True)[0]
-
-
-def _adjust_to_precise_points(
-    model: MetricEstimate, tracks: records.Tracks, adjustment: MetricAdjustment
-) -> MetricEstimate:
-    """In large sets, select the points again by the residuals of the model adjusted to the selection."""
-    if model.tracks.n_points == tracks.n_points:
-        return model
-    before = np.empty(0, dtype=np.int64)
-    for _ in range(5):
-        model, points = _model.with_precise_points(model, tracks)
-        model = adjustment.run(model)[0]
-        if len(np.intersect1d(points, before)) >= 0.98 * len(points):
-            break
-        before = points
-    return model
 
 
 def as_reconstruction(model: MetricEstimate, reasons: tuple[str, ...]) -> records.Reconstruction:

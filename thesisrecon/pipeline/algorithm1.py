@@ -270,7 +270,18 @@ def _with_further_models(job: Job, result: RunResult) -> RunResult:
     elsewhere += f", {none} in none" if none else ""
     models = Notice("several-models", len(run.groups) + 1)
     run.warnings.append(Notice("sizes-of-models", models, counted(registered, "image"), elsewhere))
-    return replace(_with_group_reasons(result, places), further_models=tuple(further))
+    reasons = {i: Notice("other-group", name) for i, name in places.items()}
+
+    def named(found: Reconstruction) -> Reconstruction:
+        return replace(found, reasons=tuple(reasons.get(i, why) for i, why in enumerate(found.reasons)))
+
+    projective, metric = result.projective, result.metric
+    return replace(
+        result,
+        projective=projective and named(projective),
+        metric=metric and replace(metric, reconstruction=named(metric.reconstruction)),
+        further_models=tuple(further),
+    )
 
 
 def _unregistered_groups(job: Job, result: RunResult) -> list[list[int]]:
@@ -314,21 +325,6 @@ def _run_group(whole: Job, result: RunResult, name: str, views: Sequence[int]) -
     missing = [image for image, registered in zip(part.names, there, strict=True) if not registered]
     whole.run.groups.append({"folder": name, "names": part.names, "missing": missing, **facts})
     return part, found
-
-
-def _with_group_reasons(result: RunResult, places: Mapping[int, str]) -> RunResult:
-    """The result in which the reason against each image that another model contains is that model."""
-
-    def named(found: Reconstruction) -> Reconstruction:
-        elsewhere = {i: Notice("other-group", name) for i, name in places.items()}
-        return replace(found, reasons=tuple(elsewhere.get(i, why) for i, why in enumerate(found.reasons)))
-
-    projective, metric = result.projective, result.metric
-    return replace(
-        result,
-        projective=projective and named(projective),
-        metric=metric and replace(metric, reconstruction=named(metric.reconstruction)),
-    )
 
 
 @contextmanager

@@ -184,10 +184,6 @@ class IntrinsicColumns:
     pinned: B8
     place: I64
 
-    def columns_of(self, number: I64) -> I64:
-        """Return the columns of unknowns, -1 for none."""
-        return np.append(self.place, NONE)[number]
-
 
 def assign_columns(values: IntrinsicUnknowns, group: I64, free: I64, observed: B8) -> IntrinsicColumns:
     """Distribute the unknowns over blocks and border; ``free`` are the intrinsics that move in some view."""

@@ -305,7 +305,7 @@ def _covariances(
     system = problem.linearize(state)
     reduced, sums, _ = system.reduce(1e-10)
     m, seen, layout = state.model, problem.moves, problem.layout
-    number = problem.columns.columns_of(problem.values.number)
+    number = np.append(problem.columns.place, -1)[problem.values.number]
     own = np.arange(int(seen.sum()))
     row, column = (layout.row, layout.column) if options.point_covariance else (own, own)
     if (solve := None if layout.coarse is None else system.iterative_solver(1e-10, reduced, sums)) is None:
