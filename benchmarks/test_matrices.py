@@ -22,12 +22,13 @@ from thesisrecon.api.cameras import triangulate
 from thesisrecon.camera import project_camera
 from thesisrecon.epipolar.ransac import estimate_eight_point, estimate_seven_point
 from thesisrecon.epipolar.verification import Configuration
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.strata import estimate_similarity
 from thesisrecon.geometry.triangulation import pose_from_three_points
 from thesisrecon.geometry.two_view import homography_linear
 from thesisrecon.lens import distort, undistort
 from validation.references.fundamental import colmap_points, opencv_eight_point
-from validation.scenes.rigs import beside, cameras_of
+from validation.scenes.rigs import beside
 from validation.scenes.two_views import make_two_views
 
 Call = Callable[..., Any]
@@ -54,7 +55,7 @@ def test_matrices_of_matches(bench: Bench, group: str, method: str, solve: Call,
 def test_triangulation_of_five_views(bench: Bench, method: str) -> None:
     solve: Call = partial(triangulate, method="linear") if method == "ours" else colmap_points
     rig = beside(np.random.default_rng(2), 5, 2000)
-    P, xy = cameras_of(rig), rig.pixels()
+    P, xy = camera_from_centre(rig.K, rig.R, rig.C), rig.pixels()
     xy = xy[:, np.isfinite(xy).all(axis=(0, 2))]
     bench("linear triangulation, five views", method, lambda: solve(P, xy))
 

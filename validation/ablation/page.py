@@ -29,7 +29,7 @@ from validation.ablation.analysis import (
 from validation.ablation.paper import SHADES, write_figures, write_latex
 from validation.ablation.study import Measure
 from validation.runs.page import plot_at, write_page
-from validation.runs.tables import Plot, commit, plot, scatter, slug, stamp, write_csv
+from validation.runs.tables import Plot, commit, finite, plot, scatter, slug, stamp, write_csv
 
 PAGE = "index.html"
 COLOURS = ("#1f6f8b", "#c8553d", "#5b8e7d", "#8a5a9e", "#d29b2e", "#4a6fa5", "#7a7a3a", "#b05c8a")
@@ -124,7 +124,7 @@ def _over_conditions(measure: Measure, curves: Curves) -> Plot:
     for k, (name, cells) in enumerate(curves.lines.items()):
         line = {"color": COLOURS[k % len(COLOURS)], "dash": ("solid", "dash", "dot")[k // len(COLOURS) % 3]}
         errors = _errors([(c.mean, c.low, c.high) for c in cells])
-        y = [_finite(c.mean) for c in cells]
+        y = [finite(c.mean) for c in cells]
         traces.append(scatter(name, curves.x, y, "lines+markers", line=line, error_y=errors))
     title = f"{measure.name} over {curves.title}"
     layout: dict[str, Any] = {"height": 420, "xaxis": LOGARITHMIC if curves.wide else {}}
@@ -137,8 +137,8 @@ def _errors(values: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
     return {
         "type": "data",
         "symmetric": False,
-        "array": [_finite(high - mean) for mean, _, high in values],
-        "arrayminus": [_finite(mean - low) for mean, low, _ in values],
+        "array": [finite(high - mean) for mean, _, high in values],
+        "arrayminus": [finite(mean - low) for mean, low, _ in values],
         "thickness": 1,
     }
 
@@ -154,7 +154,7 @@ def _forest(measure: Measure, comparisons: Sequence[Comparison], baseline: str) 
     marker = {"color": [SHADES.get(c.verdict, NONE) for c in shown], "size": 9}
     whole = [f"{c.variant} ({c.condition})" if c.condition else c.variant for c in shown]
     names = ["<br>".join(textwrap.wrap(name, 24)) for name in whole]
-    means = [_finite(mean) for mean, _, _ in values]
+    means = [finite(mean) for mean, _, _ in values]
     trace = scatter("", means, names, error_x=errors, marker=marker, showlegend=False)
     stroke = {"color": "#1b2733", "width": 1}
     line = {"type": "line", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "line": stroke}
@@ -187,10 +187,6 @@ def _cost(measure: Measure, cells: Sequence[Cell]) -> Plot | None:
     caption = "Filled: Pareto-optimal (no variant is both better and cheaper)."
     title, x = f"{measure.name} against cost", "processor time of a row (s)"
     return plot(title, traces, x, with_unit(measure.name, measure.unit), caption, **layout)
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 # ---------------------------------------------------------------- tables

@@ -65,15 +65,21 @@ def true_depth(scene: Scene, view: int) -> TrueDepth:
     seen = np.zeros(depth.shape, dtype=bool)
     for j in range(len(K)):
         if j != view:
-            q = (X - C[j]) @ (K[j] @ R[j]).T
+            z, other = depths_in_view(scene, j, X)
             with np.errstate(divide="ignore", invalid="ignore"):
-                at = q[..., :2] / q[..., 2:] / stride
-                inside = (q[..., 2] > 0.0) & np.all((at >= 0) & (at <= [columns - 1, rows - 1]), axis=-1)
-            place = np.rint(np.where(inside[..., None], at, 0.0)).astype(np.int64)
-            other = load_fixture_depth(j)[0][place[..., 1], place[..., 0]]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                seen |= inside & (np.abs(other / q[..., 2] - 1.0) < SAME)
+                seen |= np.abs(other / z - 1.0) < SAME
     return depth, stride, seen
+
+
+def depths_in_view(scene: Scene, view: int, X: F64) -> tuple[F64, F64]:
+    """Depths (...) of points X (..., 3) in a view of the courtyard, and its true ones there, NaN outside."""
+    (K, R, C), (depth, stride) = scene.cameras, load_fixture_depth(view)
+    q = (X - C[view]) @ (K[view] @ R[view]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = q[..., :2] / q[..., 2:] / stride
+        inside = (q[..., 2] > 0.0) & ((at >= 0.0) & (at <= np.array(depth.shape[::-1]) - 1)).all(axis=-1)
+    x, y = np.moveaxis(np.rint(np.where(inside[..., None], at, 0.0)).astype(np.int64), -1, 0)
+    return q[..., 2], np.where(inside, depth[y, x], np.nan)
 
 
 def true_from_maps(maps: Mapping[int, DepthMap], scene: Scene) -> Similarity:

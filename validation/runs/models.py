@@ -30,6 +30,7 @@ from validation.runs.tables import (
     Metric,
     Plot,
     commit,
+    finite,
     machine,
     number,
     plot,
@@ -156,7 +157,7 @@ def _of_cameras(compared: Sequence[Compared]) -> list[Metric]:
     def each(
         name: str, unit: str, values: Sequence[float | None], definition: str, *, more: bool = False
     ) -> Metric:
-        table = {c.name: _finite(v) for c, v in zip(compared, values, strict=True)}
+        table = {c.name: finite(v) for c, v in zip(compared, values, strict=True)}
         return row("models", name, unit, table, definition, more=more, judged=compared[0].name)
 
     total = len(compared[0].found.b.views)
@@ -190,7 +191,7 @@ def _of_models(compared: Sequence[Compared]) -> list[Metric]:
         "reprojection, median": ("px", "distance of observations from their projected points", False),
         "reprojection, RMS": ("px", "of the same distances", False),
     }.items():
-        table = {c.name: _finite(n.get(name)) for c, n in zip(compared, numbers, strict=True)}
+        table = {c.name: finite(n.get(name)) for c, n in zip(compared, numbers, strict=True)}
         rows.append(row("models", name, unit, table, about, more=more, ranked=False, judged=first))
     for name, attribute in (("to the reference", "a_to_b"), ("from the reference", "b_to_a")):
         apart = {
@@ -254,7 +255,7 @@ def _plots(compared: Sequence[Compared]) -> list[Plot]:
             if std := c.stated.get(attribute):
                 bars = [1.96 * factor * std.get(name, 0.0) for name in c.found.names]
                 more["error_y"] = {"type": "data", "array": bars, "color": colour, "thickness": 1}
-            traces.append(scatter(c.name, x, [_finite(e) for e in errors], marker=marker, **more))
+            traces.append(scatter(c.name, x, [finite(e) for e in errors], marker=marker, **more))
         caption = "Bars: stated 95 % intervals." if any("error_y" in trace for trace in traces) else ""
         if traces:
             found.append(plot(title, traces, "image", unit, caption, yaxis=zero, **size))
@@ -289,7 +290,3 @@ def _text(metrics: Mapping[str, Sequence[Metric]], names: Sequence[str]) -> str:
 def _median(errors: F64) -> float | None:
     known = errors[np.isfinite(errors)]
     return float(np.median(known)) if len(known) else None
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)

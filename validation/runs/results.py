@@ -12,12 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from thesisrecon.io._files import write_text
 from validation.references.libraries import PACKAGES
 from validation.runs.records import Judgement, Outcome, ReportOptions
-from validation.runs.tables import Metric, commit, key_of, machine, write_csv
+from validation.runs.tables import Metric, commit, finite, key_of, machine, write_csv
 
 ROUNDING = 1e-9  # Errors below it have no ratio
 MARGIN = 5.0
@@ -148,9 +146,9 @@ class Results:
 
 def row_of(stage: str, metric: Metric, gate: Gate | None) -> Row:
     """Return the row of a metric with the limit of its gate."""
-    others = {name: _finite(v) for name, v in metric.values.items() if name != metric.judged}
+    others = {name: finite(v) for name, v in metric.values.items() if name != metric.judged}
     at_most = metric.at_most if gate is None else gate.at_most
-    value = _finite(metric.values.get(metric.judged))
+    value = finite(metric.values.get(metric.judged))
     verdict = "reported" if gate is None else gate.verdict(value)
     direction, limit = "at most" if at_most else "at least", None if gate is None else gate.limit
     reason = "" if gate is None else gate.reason
@@ -210,7 +208,3 @@ def write_results(out: Path, results: Results) -> None:
             for row in rows
         ]
         write_csv(out / "tables" / f"{stage}.csv", records)
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)

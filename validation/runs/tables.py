@@ -142,6 +142,11 @@ def each(results: Mapping[str, T | None], read: Callable[[T], Any]) -> Values:
     return {name: None if value is None else float(value) for name, value in found.items()}
 
 
+def finite(value: float | None) -> float | None:
+    """Return a number, or None where there is none."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
 def ratio(a: float | None, b: float | None) -> float | None:
     """Return a / b if both are known."""
     return a / b if a is not None and b else None

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.camera import project_camera
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
 from thesisrecon.records import Reconstruction, Tracks
@@ -56,7 +57,7 @@ class Sequence:
     @property
     def P(self) -> F64:
         """(V, 3, 4) true cameras."""
-        return compose_camera(self.K, self.R, -np.einsum("vab,vb->va", self.R, self.C))
+        return camera_from_centre(self.K, self.R, self.C)
 
 
 class _Path(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from thesisrecon.arrays import B8, F64
-from thesisrecon.camera import compose_camera
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from validation.scenes.pose import look_at
 from validation.scenes.two_views import TwoViews
 
@@ -91,7 +91,7 @@ OFF_FACE = 20  # Minimum number of common points off the face that holds most of
 
 def cube_pairs(cube: CubeSequence) -> list[TwoViews]:
     """Return the pairs of cameras whose common points do not lie on one face, with these points."""
-    P = [compose_camera(cube.K, R, -R @ C) for R, C in zip(cube.R, cube.C, strict=True)]
+    P = camera_from_centre(np.tile(cube.K, (len(cube.R), 1, 1)), cube.R, cube.C)
     pairs = []
     for i, j in combinations(range(len(P)), 2):
         both = cube.visible[i] & cube.visible[j]

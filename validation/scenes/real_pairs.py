@@ -17,7 +17,7 @@ from PIL import Image
 
 from thesisrecon.api.cameras import triangulate
 from thesisrecon.arrays import F64
-from thesisrecon.camera import compose_camera
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.polynomial_triangulation import correct_matches
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
 from thesisrecon.io._files import write_atomically
@@ -88,7 +88,7 @@ def camera_pairs(scene: Scene | None, cache: Path, gaps: tuple[int, ...] = (1, 2
 
 def camera_pair(scene: Scene, i: int, j: int, cache: Path = CACHE) -> RealPair:
     """A pair of images whose cameras are known; ``truth`` is free of noise."""
-    P1, P2 = (compose_camera(K, R, -R @ C) for K, R, C in zip(*scene.cameras_of((i, j)), strict=True))
+    P1, P2 = camera_from_centre(*scene.cameras_of((i, j)))
     paths = scene.image_paths[i], scene.image_paths[j]
     xy1, xy2 = match_images(paths, cache, ratio=CAMERA_RATIO, mutual=True)
     truth = exact_correspondences(P1, P2, xy1, xy2)

@@ -11,7 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import B8, F64, I64
-from thesisrecon.camera import compose_camera, project_camera
+from thesisrecon.camera import project_camera
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.homogeneous import dehomogenize
 from thesisrecon.optimize.bundle.projection import Observations
 from thesisrecon.optimize.bundle.projective import refine_projective_bundle
@@ -97,7 +98,7 @@ def projective_from_truth(rig: Rig, tracks: Tracks, rng: np.random.Generator) ->
     """The minimum of the projective bundle adjustment nearest to the truth, in a random projective frame."""
     n = len(rig.K)
     registered = np.ones(n, dtype=bool) if rig.flat is None else ~rig.flat
-    P = compose_camera(rig.K, rig.R, -np.einsum("vab,vb->va", rig.R, rig.C))
+    P = camera_from_centre(rig.K, rig.R, rig.C)
     use = registered[tracks.view_index]
     use &= np.bincount(tracks.point_index[use], minlength=tracks.n_points)[tracks.point_index] >= 2
     X = np.column_stack([rig.X, np.ones(len(rig.X))])
@@ -173,11 +174,6 @@ def frame_of(group: Group, rng: np.random.Generator) -> F64:
     return G @ plane
 
 
-def cameras_of(rig: Rig) -> F64:
-    """Return P (V, 3, 4) of the rig."""
-    return compose_camera(rig.K, rig.R, -np.einsum("vab,vb->va", rig.R, rig.C))
-
-
 def squared_distances(P: F64, X: F64, xy: F64) -> F64:
     """Return the sum (N,) over views of squared projection distances, each capped at ``CAP_PX``."""
     xh = np.einsum("vab,nb->vna", P, X)
@@ -213,7 +209,7 @@ def draw_rig(scene: str, sigma_px: float, frame: Group, rng: np.random.Generator
     seen = np.isfinite(exact).all(axis=(0, 2))
     xy = exact[:, seen] + sigma_px * rng.normal(size=(views, int(seen.sum()), 2))
     G = frame_of(frame, rng)
-    return DrawnRig(G, cameras_of(rig) @ np.linalg.inv(G), xy, rig.X[seen], rig.C[0])
+    return DrawnRig(G, camera_from_centre(rig.K, rig.R, rig.C) @ np.linalg.inv(G), xy, rig.X[seen], rig.C[0])
 
 
 def random_transform(group: Group, rng: np.random.Generator) -> F64:

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thesisrecon.arrays import F64
-from thesisrecon.camera import compose_camera
 from thesisrecon.epipolar.verification import Configuration
-from thesisrecon.geometry.camera_matrix import project
+from thesisrecon.geometry.camera_matrix import camera_from_centre, project
 
 K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 480.0], [0.0, 0.0, 1.0]])
 
@@ -38,5 +37,5 @@ def make_two_views(kind: Configuration, n: int, rng: np.random.Generator) -> Two
         R, centre = np.eye(3), rng.normal(size=3)
         centre *= np.array([1.0, 1.0, 0.7]) / float(np.linalg.norm(centre))
     X[:, 2] += 5.0
-    P1, P2 = compose_camera(K, np.eye(3), np.zeros(3)), compose_camera(K, R, -R @ centre)
+    P1, P2 = K @ np.eye(3, 4), camera_from_centre(K, R, centre)
     return TwoViews(P1, P2, X, project(P1, X), project(P2, X))

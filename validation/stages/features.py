@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thesisrecon.arrays import F64
-from thesisrecon.camera import compose_camera
 from thesisrecon.config import preset
 from thesisrecon.features.harris import HarrisCorners
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.two_view import fundamental_from_cameras, symmetric_residuals
 from thesisrecon.io._images import read_images
@@ -129,7 +129,7 @@ def _matches(method: str, images: tuple[Image, ...], scene: Scene, options: Repo
 def _distance_from_truth(view: TwoView, images: tuple[Image, ...], scene: Scene) -> float:
     """RMS distance (working px) of the matches from their true epipolar lines, at most ``RIGHT_PX`` each."""
     K, R, C = scene.cameras_of((view.i, view.j))
-    F = fundamental_from_cameras(*compose_camera(K, R, -np.einsum("vab,vb->va", R, C)))
+    F = fundamental_from_cameras(*camera_from_centre(K, R, C))
     first, second = (images[k].original_from_working for k in (view.i, view.j))
     d = symmetric_residuals(second.T @ F @ first, view.xy1, view.xy2) / np.sqrt(2.0)
     return float(np.sqrt(np.mean(np.minimum(d, RIGHT_PX) ** 2)))
@@ -189,7 +189,7 @@ def _share_repeated(scene: Scene, corners: list[F64]) -> float:
 def _transfer(scene: Scene) -> Callable[[int, int, F64], F64]:
     """Transfer points (N, 2) of view i to view j by true depth; only mutually visible ones."""
     K, R, C = scene.cameras
-    P = compose_camera(K, R, -np.einsum("vab,vb->va", R, C))
+    P = camera_from_centre(K, R, C)
     depths = [load_fixture_depth(view, scene.name) for view in range(len(K))]
 
     def read(view: int, xy: F64) -> F64:

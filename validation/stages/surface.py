@@ -17,7 +17,7 @@ from thesisrecon.config import preset
 from thesisrecon.records import DepthMap, TexturedMesh
 from thesisrecon.surface._mesh import face_areas, surface_from_depth
 from thesisrecon.surface.model import SurfaceModel
-from validation.metrics.depth import coloured, true_depth, true_from_maps
+from validation.metrics.depth import coloured, depths_in_view, true_depth, true_from_maps
 from validation.references.open3d_geometry import Nearest, OpenTsdf, poisson_mesh
 from validation.runs.records import (
     Judgement,
@@ -30,7 +30,7 @@ from validation.runs.records import (
     read_arrays,
 )
 from validation.runs.tables import OURS, Metric, Values, each, ratio, row, slug
-from validation.scenes.real import Scene, load_fixture_depth, load_fixture_scene
+from validation.scenes.real import Scene, load_fixture_scene
 from validation.stages.depth import COURTYARD, PRESETS, THESIS, our_maps, views_of
 
 SAMPLES = 200_000  # Number of points sampled on a surface
@@ -82,19 +82,11 @@ def points_on(mesh: TexturedMesh, count: int = SAMPLES) -> F64:
 
 def asked_for(points: F64, scene: Scene) -> I64:
     """Return the number of images (N,) that truly show each point."""
-    K, R, C = scene.cameras
     count = np.zeros(len(points), dtype=np.int64)
-    for view in range(len(K)):
-        depth, stride = load_fixture_depth(view)
-        q = (points - C[view]) @ (K[view] @ R[view]).T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            at = q[:, :2] / q[:, 2:] / stride
-            limit = np.array(depth.shape[::-1]) - 1
-            inside = (q[:, 2] > 0.0) & ((at >= 0.0) & (at <= limit)).all(axis=1)
-        x, y = np.rint(np.where(inside[:, None], at, 0.0)).astype(np.int64).T
-        with np.errstate(invalid="ignore"):
-            # Relative depth tolerance of visibility.
-            count += inside & (q[:, 2] <= (1.0 + 0.05) * depth[y, x])
+    for view in range(len(scene.image_paths)):
+        z, depth = depths_in_view(scene, view, points)
+        # Relative depth tolerance of visibility.
+        count += z <= (1.0 + 0.05) * depth
     return count
 
 

@@ -11,9 +11,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from thesisrecon.arrays import F64, resizing_transform
-from thesisrecon.camera import compose_camera
 from thesisrecon.config import PipelineConfig
 from thesisrecon.errors import StageFailure, UsageError, unknown_word
+from thesisrecon.geometry.camera_matrix import camera_from_centre
 from thesisrecon.geometry.homogeneous import homogenize
 from thesisrecon.geometry.relative_pose import pose_in_front
 from thesisrecon.geometry.two_view import fundamental_from_cameras, sampson_residuals
@@ -117,7 +117,7 @@ def numbers_of_pair(
         raise StageFailure("the pair has no F", view.reason)
     if strict and error_px >= RIGHT_PX:
         raise StageFailure("F is wrong", f"its error is {error_px:.1f} px, with {view.inliers} inliers")
-    P1, P2 = compose_camera(pair.K, pair.R, -np.einsum("vab,vb->va", pair.R, pair.C))
+    P1, P2 = camera_from_centre(pair.K, pair.R, pair.C)
     distance = np.abs(sampson_residuals(fundamental_from_cameras(P1, P2), view.xy1, view.xy2))
     right = float(np.sum(distance < CONSISTENT_PX))
     fewest = min(len(prepared.features.xy) for prepared in views)

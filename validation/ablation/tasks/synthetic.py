@@ -15,7 +15,7 @@ from thesisrecon.config import PipelineConfig
 from thesisrecon.config.intrinsics import IntrinsicsOptions, prior_from_options
 from thesisrecon.errors import StageFailure, unknown_word
 from thesisrecon.geometry.polynomial_triangulation import triangulate_polynomial
-from thesisrecon.geometry.two_view import epipoles, symmetric_residuals
+from thesisrecon.geometry.two_view import epipoles, fundamental_from_cameras, symmetric_residuals
 from thesisrecon.records import IntrinsicsPrior, Reconstruction
 from validation.ablation.statistics import Sample
 from validation.ablation.study import Measure, Place, Task
@@ -131,8 +131,7 @@ def measure_pair(F: F64 | None, pair: TwoViews) -> tuple[float, float]:
 
 
 def _epipole_error_deg(F: F64, pair: TwoViews) -> float:
-    centres = [np.linalg.svd(P)[2][3] for P in (pair.P1, pair.P2)]
-    truths = (pair.P1 @ centres[1], pair.P2 @ centres[0])
+    truths = epipoles(fundamental_from_cameras(pair.P1, pair.P2))
     angles = []
     for found, true in zip(epipoles(F), truths, strict=True):
         a, b = (np.linalg.solve(K, e) for e in (found, true))
