@@ -46,6 +46,7 @@ def test_exact_points_have_an_exact_fundamental_matrix():
         task = FundamentalOfCube(method=method, noise_px=0.0, pairs=3)
         found = task.run(CONFIG, "cube", 0, NOWHERE)
         assert found["distance_px"] < 1e-6
+        assert found["epipole_deg"] < 1e-4
         assert found["within_pct"] == 100.0
         assert "over_bound" not in found, "without noise there is no bound"
 
