@@ -419,7 +419,7 @@ class _Walk:
         self.follow(kind.__bases__)
         for name, member in list(vars(kind).items()):
             # Python and its libraries note other things there, some of them when an instance is pickled.
-            noted = name.startswith("__") and not hasattr(member, "__get__")
+            noted = name.startswith("__annot") or (name.startswith("__") and not hasattr(member, "__get__"))
             if not noted and name not in ("_abc_impl", "_is_protocol", "_is_runtime_protocol"):
                 self.found.append(name)
                 self.follow(member)
