@@ -14,7 +14,7 @@ from thesisrecon.geometry.homogeneous import dehomogenize, homogenize, unit_norm
 from thesisrecon.geometry.three_view import tensor_from_cameras
 from thesisrecon.geometry.two_view import fundamental_from_cameras
 from thesisrecon.views import tensor
-from thesisrecon.views.tensor import CalibratedPair, VirtualCamera, camera_at, prepare_synthesis
+from thesisrecon.views.tensor import CalibratedPair, VirtualCamera, camera_at, prepare_synthesis, seed_of_two
 
 exact = settings(derandomize=True, deadline=None, max_examples=60)
 
@@ -306,6 +306,15 @@ def test_cameras_shapes_and_places_that_do_not_fit_are_refused(synthesis):
     places[0] += 50.0
     words = "no pixel of image 1 has a known correspondence"
     refuses(StageFailure, words, prepare_synthesis, PAIR, BLACK, places)
+
+
+def test_the_tensor_of_a_moved_camera_contains_it():
+    third = np.column_stack([Rotation.from_rotvec([0.05, 0.1, 0.0]).as_matrix(), [0.3, 0.2, -0.5]])
+    moved = seed_of_two(PAIR).moved(third[:, :3] @ PAIR.R.T, third[:, 3] - third[:, :3] @ PAIR.R.T @ PAIR.t)
+    # Points of the tensor's frame are (K X_1, 1).
+    change = np.eye(4)
+    change[:3, :3] = np.linalg.inv(K)
+    np.testing.assert_allclose(moved.P3, K @ third @ change, atol=1e-9)
 
 
 @pytest.mark.parametrize("reported", ["nothing", "the foreground"])
