@@ -29,7 +29,7 @@ from thesisrecon.stereo.depth import (
     _sparse_points,
     _without_small_regions,
 )
-from thesisrecon.stereo.rectification import minimum_distortion, polar
+from thesisrecon.stereo.rectification import common_orientation, polar
 from thesisrecon.stereo.semi_global import SemiGlobalMatching
 from validation.scenes.real import load_fixture_depth, load_fixture_scene
 
@@ -285,7 +285,7 @@ def wall_points(P, xy):
     return (homogenize(xy) * 6.0 - P[:, 3]) @ np.linalg.inv(P[:, :3]).T
 
 
-@pytest.mark.parametrize("method", [minimum_distortion, polar])
+@pytest.mark.parametrize("method", [common_orientation, polar])
 def test_exact_disparities_give_exact_depth(method):
     P = on_arc((-6.0, 6.0))
     rho, std = inverse_depths(P[0], P[1], true_correspondence(P, (0, 1), method))
@@ -299,7 +299,7 @@ def test_exact_disparities_give_exact_depth(method):
 
 def test_working_pixels_map_back_to_pixels_of_the_file():
     P = on_arc((-6.0, 6.0))
-    own, reported = (true_correspondence(P, (0, 1), minimum_distortion, larger=k) for k in (1, 2))
+    own, reported = (true_correspondence(P, (0, 1), common_orientation, larger=k) for k in (1, 2))
     assert reported.sigma.shape == (2 * SIZE[1], 2 * SIZE[0])
     # The middle of four pixels is the pixel of the smaller photograph.
     four = np.mean([reported.xy[a::2, b::2] for a in (0, 1) for b in (0, 1)], axis=0)
@@ -331,7 +331,7 @@ def test_brightness_is_made_alike(walled):
 
 def test_links_of_a_chain_lead_from_view_to_view():
     P = on_arc((-8.0, 0.0, 8.0))
-    steps = [true_correspondence(P, pair, minimum_distortion) for pair in ((0, 1), (1, 2))]
+    steps = [true_correspondence(P, pair, common_orientation) for pair in ((0, 1), (1, 2))]
     linked = _concatenated(*steps)
     known = np.isfinite(linked.sigma)
     assert known.mean() > 0.3

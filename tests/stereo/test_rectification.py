@@ -83,6 +83,7 @@ PLANAR_METHODS = (
     rectification.hartley,
     rectification.loop_zhang,
     rectification.minimum_distortion,
+    rectification.common_orientation,
 )
 CASES = [(method, motion) for method in PLANAR_METHODS for motion in PLANAR]
 CASES += [(polar, motion) for motion in MOTIONS]
@@ -109,7 +110,7 @@ def matched(rectified, pair):
 @pytest.mark.parametrize(("method", "motion"), CASES, ids=named)
 def test_exact_matches_share_their_row_and_nearer_ones_are_farther_left_on_the_right(method, motion):
     scene = make_pair(motion, np.random.default_rng(0))
-    for pair in both_pairs(scene):
+    for pair in both_pairs(scene)[method is rectification.common_orientation :]:
         rectified = method(pair)
         left = rectified.rectified_from_original(0, scene.xy1)
         right = rectified.rectified_from_original(1, scene.xy2)
@@ -175,13 +176,30 @@ def test_the_lookup_is_the_map_at_whole_pixels(method, motion):
 
 def test_a_parallel_pair_stays_as_it_is():
     scene = make_pair("parallel", np.random.default_rng(3))
-    for method in (rectification.loop_zhang, rectification.minimum_distortion):
+    for method in (
+        rectification.loop_zhang,
+        rectification.minimum_distortion,
+        rectification.common_orientation,
+    ):
         for H in method(both_pairs(scene)[1]).H:
             expected = np.eye(3)
             expected[:2, 2] = (H / H[2, 2])[:2, 2]
             # The disparities of any scene slope a little; a shear takes part of that.
             atol = 0.1 if method is rectification.minimum_distortion else 1e-6
             np.testing.assert_allclose(H / H[2, 2], expected, atol=atol)
+
+
+def test_disparities_of_a_common_orientation_are_inverse_depths():
+    scene = make_pair("toed in", np.random.default_rng(4))
+    pair = both_pairs(scene)[1]
+    rectified = rectification.common_orientation(pair)
+    d = matched(rectified, pair)[:, 0]
+    # The third coordinate of the new orientation is that of H1 M1 over its scale.
+    M = rectified.H[0] @ scene.P[0, :, :3]
+    inverse = np.linalg.norm(M[2]) / (scene.X @ M[2])
+    slope, offset = np.polyfit(inverse, d, 1)
+    assert slope > 0.0
+    np.testing.assert_allclose(d, slope * inverse + offset, atol=1e-8)
 
 
 def test_each_planar_method_is_best_at_what_it_minimises():
@@ -231,7 +249,7 @@ def test_the_best_is_planar_for_neighbours_and_polar_where_planar_frames_stretch
 
 def test_matches_bound_the_disparities_and_a_few_wrong_ones_do_not():
     scene = make_pair("beside", np.random.default_rng(10))
-    rectified = rectification.minimum_distortion(pair_of_cameras(*scene.P, *scene.sizes))
+    rectified = rectification.common_orientation(pair_of_cameras(*scene.P, *scene.sizes))
     low, high = disparity_range(rectified, scene.xy1, scene.xy2)
     left = rectified.rectified_from_original(0, scene.xy1)
     d = left[:, 0] - rectified.rectified_from_original(1, scene.xy2)[:, 0]

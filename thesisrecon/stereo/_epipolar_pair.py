@@ -170,6 +170,7 @@ class EpipolarPair:
     matches: tuple[F64, F64]  #: (N, 2) pixels, possibly none
     arc: tuple[float, float]  #: interval of phi that both images see
     regions: tuple[F64, F64]  #: (M, 2) pixels of each image inside the arc, first the corners of that polygon
+    cameras: F64 | None = None  #: (2, 3, 4) metric, if known
 
 
 def pair_of_fundamental(F: F64, xy1: F64, xy2: F64, size1: Size, size2: Size) -> EpipolarPair:
@@ -234,7 +235,7 @@ def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -
     P_z = _quasi_euclidean(pencil, *matches) if P_z is None else P_z
     pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, *seen))
     arc = _common_arc(pencil, matches[0])
-    return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)))
+    return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)), P)
 
 
 def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:

@@ -99,6 +99,17 @@ class PlanarRectification(Rectification):
         return np.stack([u * w, v * w], axis=-1)
 
 
+def common_orientation(pair: EpipolarPair) -> PlanarRectification:
+    """Rotate metric cameras to a common orientation: H = K R (K_i R_i)^-1, x axis of R along the baseline.
+
+    Fusiello, Trucco and Verri (MVA 2000) use the viewing direction of the first camera; here it is the mean.
+    """
+    if pair.cameras is None:
+        raise StageFailure.of("orientation-without-cameras")
+    orientation = rotation_along_baseline(pair.cameras)
+    return _crop_and_scale(pair, np.asarray(orientation @ np.linalg.inv(pair.cameras[:, :, :3])))
+
+
 def rotation_along_baseline(P: F64) -> F64:
     """Rotation (3, 3) with the x axis along the baseline of two cameras (2, 3, 4) and z near both views."""
     baseline = np.diff(dehomogenize(camera_centre(P)), axis=0)[0]
@@ -425,7 +436,8 @@ BENDING = 0.03  #: penalty of polar frames, which bend straight lines
 
 Method = Callable[[EpipolarPair], Rectification]
 PLANAR: tuple[Method, ...] = (hartley, loop_zhang, minimum_distortion)  #: methods from F with homographies
-METHODS: tuple[Method, ...] = (*PLANAR, polar, partial(polar, aligned=False))
+METHODS: tuple[Method, ...] = (*PLANAR, polar, common_orientation, partial(polar, aligned=False))
+"""All methods; the common orientation needs cameras."""
 
 
 @dataclass(frozen=True, eq=False)
