@@ -231,22 +231,18 @@ def _pencil_of_fundamental(F: F64, sizes: tuple[Size, Size]) -> tuple[EpipolarPe
 def _complete(pencil: EpipolarPencil, matches: tuple[F64, F64], P: F64 | None) -> EpipolarPair:
     """Determine orientation, direction of disparities, and common field of view."""
     seen, P_z = (matches, None) if P is None else _virtual_matches(pencil, P)
-    pencil = _orient(pencil, *seen)
+    # The sign of the second view is that which most matches support: at least this share of them lies on
+    # corresponding half-lines; half of the wrong matches are there by chance.
+    min_same_half = 0.8
+    share = float(np.mean(np.sum(pencil.planes(0, seen[0]) * pencil.planes(1, seen[1]), axis=1) > 0.0))
+    if max(share, 1.0 - share) < min_same_half:
+        raise StageFailure.of("opposite-half-lines", 100.0 * max(share, 1.0 - share), len(seen[0]))
+    if share < 0.5:
+        pencil = replace(pencil, lines=pencil.lines * [[[1.0]], [[-1.0]]])
     P_z = _quasi_euclidean(pencil, *matches) if P_z is None else P_z
     pencil = replace(pencil, flipped=not _depth_increases_along_half_lines(pencil, P_z, *seen))
     arc = _common_arc(pencil, matches[0])
     return EpipolarPair(pencil, matches, arc, (_region(pencil, 0, arc), _region(pencil, 1, arc)), P)
-
-
-def _orient(pencil: EpipolarPencil, xy1: F64, xy2: F64) -> EpipolarPencil:
-    """Pencil with the sign of the second view that most matches support."""
-    # Minimum fraction of matches on corresponding half-lines; half of the wrong matches are there by chance.
-    min_same_half = 0.8
-    p1, p2 = pencil.planes(0, xy1), pencil.planes(1, xy2)
-    share = float(np.mean(np.sum(p1 * p2, axis=1) > 0.0))
-    if max(share, 1.0 - share) < min_same_half:
-        raise StageFailure.of("opposite-half-lines", 100.0 * max(share, 1.0 - share), len(xy1))
-    return pencil if share >= 0.5 else replace(pencil, lines=pencil.lines * [[[1.0]], [[-1.0]]])
 
 
 def _virtual_matches(pencil: EpipolarPencil, P: F64) -> tuple[tuple[F64, F64], F64]:
@@ -289,10 +285,16 @@ def _depth_increases_along_half_lines(pencil: EpipolarPencil, P: F64, xy1: F64, 
 
 
 def _common_arc(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
-    """Interval of phi that both images see."""
+    """Interval of phi that both images see; a full circle starts in the widest gap between matches."""
     arcs = [arc for arc in (_arc(pencil, side) for side in (0, 1)) if arc is not None]
-    if len(arcs) < 2:
-        return arcs[0] if arcs else _full_circle(pencil, xy1)
+    if len(arcs) == 1:
+        return arcs[0]
+    if not arcs:
+        phi = np.sort(pencil.angles(0, xy1)) if len(xy1) else np.array([-2.0 * np.pi])
+        gaps = np.diff(phi, append=phi[0] + 2.0 * np.pi)
+        k = int(np.argmax(gaps))
+        start = float(phi[k] + 0.5 * gaps[k])
+        return start, start + 2.0 * np.pi
     (a, b), (c, d) = arcs
     turn = 2.0 * np.pi * np.round((0.5 * (a + b) - 0.5 * (c + d)) / (2.0 * np.pi))
     low, high = max(a, c + turn), min(b, d + turn)
@@ -313,17 +315,6 @@ def _arc(pencil: EpipolarPencil, side: int) -> tuple[float, float] | None:
     about = float(pencil.angles(side, pencil.centres[side][None])[0])
     phi = pencil.angles(side, corners, about=about)
     return float(phi.min()), float(phi.max())
-
-
-def _full_circle(pencil: EpipolarPencil, xy1: F64) -> tuple[float, float]:
-    """Full circle, starting in the widest gap between matches."""
-    phi = np.sort(pencil.angles(0, xy1))
-    if len(phi) == 0:
-        return -np.pi, np.pi
-    gaps = np.diff(phi, append=phi[0] + 2.0 * np.pi)
-    k = int(np.argmax(gaps))
-    start = float(phi[k] + 0.5 * gaps[k])
-    return start, start + 2.0 * np.pi
 
 
 def _region(pencil: EpipolarPencil, side: int, arc: tuple[float, float]) -> F64:

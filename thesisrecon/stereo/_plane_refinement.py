@@ -186,11 +186,6 @@ def _view_cost(
     return _cost_at_border(squares, start, (width, height), warp, offsets, samples)
 
 
-@kernel
-def _work_space(n_views: int) -> tuple[F64, F64, I64]:
-    return empty(8), empty(n_views), np.arange(n_views)
-
-
 @kernel(inline="always")
 def _mean_cost(first: float, second: float) -> float:
     """Mean of two costs, the larger at most ``MAX_EXCESS_COST`` above the smaller."""
@@ -272,7 +267,7 @@ def sweep_planes(
     gray, H, e, offsets = search.gray, search.H, search.e, search.offsets
     height, width = gray.shape
     samples, plane, trial = empty((2, offsets.shape[1]), np.float32), empty(3), empty(3)
-    work = _work_space(len(H))
+    work = empty(8), empty(len(H)), np.arange(len(H))
     reach = -float(offsets[0, 0])
     back = -1 if backward else 1
     for row in range(height):
@@ -354,7 +349,8 @@ def begin_planes(search: PatchSearch, planes: F32) -> F32:
     gray = search.gray
     height, width = gray.shape
     samples, plane = empty((2, search.offsets.shape[1]), np.float32), empty(3)
-    work, cost = _work_space(len(search.H)), full((height, width), UNKNOWN, np.float32)
+    n, cost = len(search.H), full((height, width), UNKNOWN, np.float32)
+    work = empty(8), empty(n), np.arange(n)
     for v in range(height):
         for u in range(width):
             if np.isfinite(gray[v, u]) and planes[v, u, 0] > 0.0:
@@ -379,7 +375,12 @@ def refine_depths(reference: PinholeView, others: Sequence[PinholeView], found: 
     rho = planes[..., 0]
     least, support, std = rate_planes(search, planes, MAX_COST)
     seen = _is_supported(least, support)
-    joining, joining_std = _continuing_surfaces(search, planes, seen, least)
+    # Planes of higher cost stay if they continue the surface of accepted ones.
+    unknown, doubtful = np.float32(np.nan), ~seen & (least <= MAX_CONTINUATION_COST)
+    unsure = np.where(doubtful[..., None], planes, unknown)
+    joining_std = rate_planes(search, unsure, MAX_CONTINUATION_COST)[2]
+    known = np.where(seen | doubtful, rho, unknown)
+    joining = surface_continuation(known, joining_std, seen, RADIUS + 1, GATE)
     std = np.where(joining, joining_std, std)
     seen |= joining
     # Without texture the fused correspondences are kept.
@@ -413,15 +414,6 @@ def search_planes(
 def _is_supported(least: F32, support: U8) -> B8:
     """(H, W) planes that two neighbours support, or one clearly."""
     return np.asarray((support >= 2) | ((support == 1) & (least <= 0.5 * MAX_COST)))
-
-
-def _continuing_surfaces(search: PatchSearch, planes: F32, seen: B8, least: F32) -> tuple[B8, F32]:
-    """(H, W) planes of higher cost that continue the surface of accepted ones, and standard deviations."""
-    doubtful = ~seen & (least <= MAX_CONTINUATION_COST)
-    unsure = np.where(doubtful[..., None], planes, np.float32(np.nan))
-    std = rate_planes(search, unsure, MAX_CONTINUATION_COST)[2]
-    rho = np.where(seen | doubtful, planes[..., 0], np.float32(np.nan))
-    return surface_continuation(rho, std, seen, RADIUS + 1, GATE), std
 
 
 def _search_arguments(reference: PinholeView, others: Sequence[PinholeView]) -> PatchSearch:

@@ -133,7 +133,15 @@ def _sample_disparity(found: DisparityMap, places: F64) -> tuple[F64, F64]:
 
 def brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
     """Gain (3,) that makes ``other`` as bright as ``reference``: median ratio of patch means at matches."""
-    levels = [_patch_means(rgb, xy) for rgb, xy in ((reference, xy1), (other, xy2))]
+    reach = 2  # Radius of the patches whose brightness is compared
+    dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    levels = list[F64]()
+    for rgb, xy in ((reference, xy1), (other, xy2)):
+        at = np.rint(xy).astype(np.int64)
+        inside = np.all((at >= reach) & (at < np.array(rgb.shape[1::-1]) - reach), axis=1)
+        at = np.where(inside[:, None], at, reach)
+        patches = rgb[at[:, 1, None, None] + dy, at[:, 0, None, None] + dx]
+        levels.append(np.where(inside[:, None], patches.mean(axis=(1, 2)), np.nan))
     good = np.isfinite(levels[0]).all(axis=1) & np.isfinite(levels[1]).all(axis=1)
     good &= np.minimum(levels[0], levels[1]).min(axis=1) > 8.0
     good &= np.maximum(levels[0], levels[1]).max(axis=1) < 247.0
@@ -141,19 +149,6 @@ def brightness_gain(reference: U8, other: U8, xy1: F64, xy2: F64) -> F32:
         return np.ones(3, dtype=np.float32)
     ratio = np.median(np.log(levels[0][good] / levels[1][good]), axis=0)
     return np.asarray(np.exp(np.clip(ratio, -1.0, 1.0)), dtype=np.float32)
-
-
-def _patch_means(rgb: U8, xy: F64) -> F64:
-    """Mean colours (N, 3) around pixels (N, 2), NaN where the patch leaves the image."""
-    gain_patch = 2  # Radius of the patches whose brightness is compared
-    height, width = rgb.shape[:2]
-    at = np.rint(xy).astype(np.int64)
-    reach = gain_patch
-    inside = np.all((at >= reach) & (at < np.array([width, height]) - reach), axis=1)
-    at = np.where(inside[:, None], at, reach)
-    dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    patches = rgb[at[:, 1, None, None] + dy, at[:, 0, None, None] + dx]
-    return np.where(inside[:, None], patches.mean(axis=(1, 2)), np.nan)
 
 
 def _levels(view: PinholeView) -> F32:

@@ -184,6 +184,7 @@ def frustum_samples(
     min_angle_deg, max_angle_deg = 0.5, 40.0
     # Depths between given limits, evenly in inverse depth; ratio of successive depths without limits.
     depths, ratio = 12, 1.25
+    grid = (8, 6)  # Samples along the width and the height of an image
     centres = {i: dehomogenize(camera_centre(view.P)) for i, view in views.items()}
     points, shown = [np.zeros((0, 3))], [np.zeros((n_views, 0), dtype=bool)]
     for i, view in views.items():
@@ -199,7 +200,12 @@ def frustum_samples(
             depth = np.geomspace(nearest, farthest, 2 + int(np.log(farthest / nearest) / np.log(ratio)))
         else:
             continue
-        X = _on_rays(view, centres[i], depth)
+        sides = zip(grid, view.seen.shape[::-1], strict=True)
+        x, y = (np.linspace(0.02, 0.98, n) * (side - 1.0) for n, side in sides)
+        xh = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.ones(grid[0] * grid[1])])
+        # The third row of P has unit norm: the rays have depth 1.
+        rays = np.linalg.solve(view.P[:, :3], xh).T
+        X = (centres[i] + depth[:, None, None] * rays).reshape(-1, 3)
         seen = np.zeros((n_views, len(X)), dtype=bool)
         for j in views:
             if j != i:
@@ -212,17 +218,6 @@ def frustum_samples(
         points.append(X[kept])
         shown.append(seen[:, kept])
     return np.concatenate(points), np.concatenate(shown, axis=1)
-
-
-def _on_rays(view: PinholeView, centre: F64, depth: F64) -> F64:
-    """Points (N, 3) on the rays of a grid of pixels, at each depth."""
-    grid = (8, 6)  # Samples along the width and the height of an image
-    size = np.array(view.seen.shape[::-1])
-    x, y = (np.linspace(0.02, 0.98, n) * (side - 1.0) for n, side in zip(grid, size, strict=True))
-    xh = np.stack([*(a.ravel() for a in np.meshgrid(x, y)), np.ones(grid[0] * grid[1])])
-    # The third row of P has unit norm: the rays have depth 1.
-    rays = np.linalg.solve(view.P[:, :3], xh).T
-    return np.asarray((centre + depth[:, None, None] * rays).reshape(-1, 3))
 
 
 def project_inside(view: PinholeView, X: F64) -> tuple[F64, B8]:
@@ -299,12 +294,9 @@ class MultiViewStereo:
 
     def prepare(
         self,
-        images: Sequence[Image],
-        reconstruction: Reconstruction,
-        *,
-        depth_range: F64 | None = None,
+        images: Sequence[Image], reconstruction: Reconstruction, *, depth_range: F64 | None = None,
         threads: int = 1,  # noqa: ARG002
-    ) -> MultiViewScene:
+    ) -> MultiViewScene:  # fmt: skip
         """See `thesisrecon.config.DepthEstimator.prepare`."""
         if len(images) != len(reconstruction.P):
             raise ValueError(f"{len(reconstruction.P)} cameras need as many images; got {len(images)}")
@@ -323,9 +315,8 @@ class MultiViewStereo:
         if depth_range is None and len(reconstruction.tracks.xy):
             points = _sparse_points(reconstruction, frames)
         else:
-            points = SparsePoints(
-                *frustum_samples(frames, max(numbers, default=0) + 1, depth_range), sampled=True
-            )
+            samples = frustum_samples(frames, max(numbers, default=0) + 1, depth_range)
+            points = SparsePoints(*samples, sampled=True)
         chosen = {i: _select_neighbours(points, frames, i, self.max_neighbours) for i in frames}
         return MultiViewScene(views, points, chosen, matched)
 
