@@ -14,11 +14,11 @@ import numpy as np
 from thesisrecon._numba import ThreadPool, empty, kernel, zeros
 from thesisrecon.arrays import F32, F64, I32, I64, U8
 from thesisrecon.records import TexturedMesh
-from thesisrecon.surface._mesh import components, face_areas, remove_unused_vertices
+from thesisrecon.surface._mesh import connected_parts, face_areas, remove_unused_vertices, select_faces
 
 BLOCK_FACES = 150_000
 """Faces that are simplified as one block; vertices between blocks stay for the next round."""
-SHARES, LONGEST = (0.08, 0.32), 8.0
+SHARES, LONGEST = (0.08, 0.32, 1.28, 5.12), 8.0
 """Limits tried for a number of faces, and longest new side; unit: side of a square of a face's mean area."""
 MAX_FAN = 24  #: largest number of faces around a vertex
 
@@ -394,7 +394,7 @@ def _sort_into_blocks(state: MeshState, axis: int) -> I64:
 
 
 def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> TexturedMesh:
-    """Simplify a mesh to a number of faces, first by collapsing edges, then by clustering vertices."""
+    """Simplify a mesh to a number of faces; if so many cannot be joined, the largest parts stay."""
     if len(mesh.faces) <= max_faces:
         return mesh
     mesh = replace(mesh, colors=None, uv=None, texture=None, untextured=None)
@@ -403,28 +403,8 @@ def reduce_faces(mesh: TexturedMesh, max_faces: int, *, threads: int = 1) -> Tex
         limit = np.full(len(mesh.vertices), share * cell)
         mesh = simplify_surface(mesh, limit, longest=LONGEST * cell, threads=threads)
         if len(mesh.faces) <= max_faces:
-            break
-    return mesh if len(mesh.faces) <= max_faces else _merge_in_cells(mesh, max_faces)
-
-
-def _merge_in_cells(mesh: TexturedMesh, max_faces: int) -> TexturedMesh:
-    """Merge vertices that edges connect within a cell of a grid, enlarged as needed (Rossignac 1993)."""
-    extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    cell = max(float(np.sqrt(face_areas(mesh.vertices, mesh.faces).sum() / max_faces)), 1e-9 * extent)
-    start, stop = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-    while True:
-        place = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
-        within = (place[start] == place[stop]).all(axis=1)
-        cluster = components(start[within], stop[within], len(place))
-        faces = cluster[mesh.faces]
-        a, b, c = faces.T
-        faces = faces[(a != b) & (b != c) & (c != a)]
-        first = np.argmin(faces, axis=1)
-        turned = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-        faces = faces[np.sort(np.unique(turned, axis=0, return_index=True)[1])]
-        if len(faces) <= max_faces:
-            break
-        cell *= max(1.02, float(np.sqrt(len(faces) / max_faces)))
-    size = np.bincount(cluster)
-    mean = np.stack([np.bincount(cluster, mesh.vertices[:, d]) / size for d in range(3)], axis=1)
-    return remove_unused_vertices(replace(mesh, vertices=mean, faces=faces))
+            return mesh
+    part = connected_parts(mesh.faces, len(mesh.vertices))
+    area, keep = np.bincount(part, face_areas(mesh.vertices, mesh.faces)), np.zeros(len(part), dtype=bool)
+    keep[np.argsort(-area[part], kind="stable")[:max_faces]] = True
+    return select_faces(mesh, keep)
