@@ -226,14 +226,10 @@ def warp_image(image: F32, lookup: Callable[[range], F64], size: tuple[int, int]
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     width, height = size
     out = np.empty((height, width, pixels.shape[2]), np.float32)
-    for first in range(0, height, STRIP_ROWS):
-        last = min(first + STRIP_ROWS, height)
-        # One row more, if available: neighbour distances determine the filter width.
-        start = first - 1 if last == height and last - first == 1 and first > 0 else first
-        places = lookup(range(start, min(last + 1, height)))
-        strip = out[start:last] if start == first else np.empty((last - start, *out.shape[1:]), np.float32)
-        sample_cubic(pixels, places, True, strip)
-        out[first:last] = strip[first - start :]
+    for rows in np.array_split(np.arange(height), -(-height // STRIP_ROWS)):
+        first, last = int(rows[0]), int(rows[-1]) + 1
+        # One row more, if there is one: neighbour distances determine the filter width.
+        sample_cubic(pixels, lookup(range(first, min(last + 1, height))), True, out[first:last])
     return out[:, :, 0] if image.ndim == 2 else out
 
 

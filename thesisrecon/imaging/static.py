@@ -57,7 +57,7 @@ def _of_equal_size(images: Sequence[Image], group: Sequence[int], map_all: Any) 
     if sum(same.mean() >= LEAST for same, _ in parts) < FEWEST - 1:
         return {}
     if len(some) < len(group):
-        parts = list(map_all(partial(_agreement_of_image, template), [images[n] for n in group]))
+        parts = list(map_all(lambda n: _agreement(template, _reduced(images[n])), list(group)))
     # The median shows a static part that most images show.
     often = np.sum([same for same, _ in parts], axis=0) >= max(FEWEST - 1, len(group) / 2.0)
     window = np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=bool)
@@ -80,10 +80,6 @@ def _reduced(image: Image) -> F32:
     width, height = image.size
     factor = min(LONG_SIDE / max(width, height), 1.0)
     return resample(image.gray, max(round(width * factor), 1), max(round(height * factor), 1))
-
-
-def _agreement_of_image(template: F32, image: Image) -> tuple[B8, B8]:
-    return _agreement(template, _reduced(image))
 
 
 def _agreement(template: F32, reduced: F32) -> tuple[B8, B8]:

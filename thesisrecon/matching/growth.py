@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thesisrecon._numba import empty, full, kernel, zeros
-from thesisrecon.arrays import B8, F32, F64, I64
+from thesisrecon.arrays import F32, F64, I64
 from thesisrecon.errors import StageFailure, UsageError, require_range
 from thesisrecon.geometry.two_view import epipolar_distance_std
 from thesisrecon.matching import _seeds
@@ -124,6 +124,7 @@ def match_guided(
     # position (N, 2), radius (N,) px; `corners2`: xy, scale, patches (C, 225); `grid2`: cell size, shape
     # (2,), start, order; `gate`: F, half widths (N,) of the bands px, minimum correlation. Returns the corner
     # (-1: none), its correlation and the second best elsewhere (-1: none).
+    pixels, levels, base = view1
     xy1, scale1 = corners1
     affine, position, radius = predicted
     xy2, scale2, patches2 = corners2
@@ -134,8 +135,7 @@ def match_guided(
     second_best = full(count, -1.0, np.float32)
     near, seen = empty(len(xy2), np.int64), empty(len(xy2), np.float32)
     window, raster = empty((2, SAMPLES), np.float32), window_raster(SIDE)
-    ready = zeros(2, np.bool_)
-    sizes = full(2, np.inf)
+    ready, sizes, inverse = zeros(2, np.bool_), full(2, np.inf), empty((2, 2))
     for c in range(len(scale2)):
         sizes[0] = min(sizes[0], scale2[c])
     sizes[1] = 2.0 * sizes[0]
@@ -146,7 +146,17 @@ def match_guided(
         found = _corners_in_band(xy1[n], (position[n], radius[n]), (F, band[n]), xy2, grid2, near)
         if found == 0:
             continue
-        _warp_windows(view1, (xy1[n], scale1[n]), (affine[n], determinant), sizes, (window, ready, raster))
+        # The window of the corner as seen in image 2, for each corner size; ready if usable.
+        a, m = affine[n], np.sqrt(determinant)
+        inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
+        inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
+        for t in range(2):
+            ready[t] = False
+            if 0.6 < scale1[n] * m / sizes[t] < 1.7:
+                k = pyramid_level(sizes[t] / m, base, len(levels))
+                to_level, step = 1.0 / (base * 2.0**k), inverse * sizes[t]
+                if sample_window(pixels, levels[k], to_level, xy1[n], step, raster, window[t]):
+                    ready[t] = normalize_window(window[t]) > 0.0
         best, top = -1, least
         for t in range(found):
             c = near[t]
@@ -201,30 +211,6 @@ def _corners_in_band(
             near[found] = c
             found += 1
     return found
-
-
-@kernel(forceinline=True)
-def _warp_windows(
-    view1: tuple[F32, I64, float], corner: tuple[F64, float], local: tuple[F64, float], sizes: F64,
-    out: tuple[F32, B8, F32],
-) -> None:  # fmt: skip
-    """Sample the window of a corner of image 1 as seen in image 2, for each corner size; ready if usable."""
-    pixels, levels, base = view1
-    xy, scale = corner
-    a, determinant = local
-    window, ready, raster = out
-    m = np.sqrt(determinant)
-    inverse = empty((2, 2))
-    inverse[0, 0], inverse[0, 1] = a[1, 1] / determinant, -a[0, 1] / determinant
-    inverse[1, 0], inverse[1, 1] = -a[1, 0] / determinant, a[0, 0] / determinant
-    for t in range(len(sizes)):
-        ready[t] = False
-        ratio = scale * m / sizes[t]
-        if ratio > 0.6 and ratio < 1.7:
-            k = pyramid_level(sizes[t] / m, base, len(levels))
-            step = inverse * sizes[t]
-            if sample_window(pixels, levels[k], 1.0 / (base * 2.0**k), xy, step, raster, window[t]):
-                ready[t] = normalize_window(window[t]) > 0.0
 
 
 @dataclass(frozen=True)

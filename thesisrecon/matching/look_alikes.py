@@ -129,7 +129,11 @@ def _different(
         similar.append(index >= 0)
     inside = ((xy > 0.06 * size) & (xy < 0.94 * size)).all(axis=1)
     inside &= ((place > 0.06 * np.array(two.size)) & (place < 0.94 * np.array(two.size))).all(axis=1)
-    use = inside & (_contrast(image, xy) > MIN_CONTRAST)
+    # Standard deviation of the grey levels around the corners.
+    gray = image.gray.astype(np.float64)
+    mean, square = (scipy.ndimage.uniform_filter(g, 9) for g in (gray, gray**2))
+    x, y = np.clip(np.rint(xy).astype(np.int64), 0, np.array(gray.shape[::-1]) - 1).T
+    use = inside & (np.sqrt(np.maximum(square - mean**2, 0.0))[y, x] > MIN_CONTRAST)
 
     def in_parts(xy: F64) -> I64:
         """Number of places in each part of the image."""
@@ -148,11 +152,3 @@ def _different(
     ratio = (here * hit + (count - here) * missed)[dense]
     different, same = np.count_nonzero(ratio < -EVIDENCE), np.count_nonzero(ratio > EVIDENCE)
     return different / (different + same) if different >= MIN_DIFFERENT else 0.0
-
-
-def _contrast(image: Image, xy: F64) -> F64:
-    """Standard deviation (N,) of the grey levels around corners."""
-    gray = image.gray.astype(np.float64)
-    mean, square = (scipy.ndimage.uniform_filter(g, 9) for g in (gray, gray**2))
-    x, y = (np.clip(np.rint(xy[:, k]).astype(np.int64), 0, gray.shape[1 - k] - 1) for k in (0, 1))
-    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0))[y, x])

@@ -1,9 +1,8 @@
 """Tracks: chains of verified matches over many views, optionally aligned with their middle view."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -189,16 +188,23 @@ class AlignedTracks:
         start, affine, middle = _affines_from_middle_view(chains, accepted)
         xy, kept = start.copy(), np.ones(len(start), np.bool_)
 
-        def align(groups: Sequence[tuple[int, int, I64]]) -> None:
-            for i, j, group in groups:
+        def align(some: I64) -> None:
+            for k in some.tolist():
+                i, j, group = int(first[k]), int(second[k]), groups[k]
                 corner = select_found(prepared[i].features, chains.corner[middle[group]])
                 matches = corner.xy, corner.scale, start[group], affine[group]
                 found, _, score = align_corners(prepared[i], prepared[j], matches, affine_std=AFFINE_STD)
                 xy[group], kept[group] = found, score >= MIN_CORRELATION
 
-        groups = _groups(chains.view[middle], chains.view, len(prepared))
-        # Consecutive groups share views: a thread aligns 256 at a time.
-        map_all(align, iter(lambda: list(islice(groups, 256)), []))
+        # Observations of each two different views, in an order that reuses prepared images.
+        pair = chains.view[middle] * len(prepared) + chains.view
+        rows = np.flatnonzero(chains.view[middle] != chains.view)
+        rows = rows[np.argsort(pair[rows], kind="stable")]
+        numbers, starts = np.unique(pair[rows], return_index=True)
+        groups, (first, second) = np.split(rows, starts[1:]), np.divmod(numbers, len(prepared))
+        # A thread aligns 256 groups at a time, which share views.
+        order = cached_pair_order(first, second)
+        map_all(align, np.split(order, np.arange(256, len(order), 256)))
         return _tracks(chains, xy, kept, len(prepared))
 
 
@@ -277,18 +283,6 @@ def _merge_positions(xy: F64, merge_px: float) -> tuple[F64, I64]:
 def _best_first(pairs: Sequence[TwoView]) -> list[TwoView]:
     """Accepted pairs, those with more verified matches first."""
     return sorted((p for p in pairs if p.accepted), key=lambda p: (-p.inliers, p.i, p.j))
-
-
-def _groups(first: I64, second: I64, views: int) -> Iterator[tuple[int, int, I64]]:
-    """Observations of each two different views (i, j), in an order that reuses prepared images."""
-    pair = first * views + second
-    order = np.flatnonzero(first != second)
-    order = order[np.argsort(pair[order], kind="stable")]
-    numbers, starts = np.unique(pair[order], return_index=True)
-    groups = np.split(order, starts[1:]) if len(numbers) else []
-    i, j = np.divmod(numbers, views)
-    for k in cached_pair_order(i, j):
-        yield int(i[k]), int(j[k]), groups[k]
 
 
 def _tracks(chains: _Chains, xy: F64, kept: B8, n_views: int) -> Tracks:

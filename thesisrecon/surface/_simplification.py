@@ -193,7 +193,10 @@ def _is_simple(mesh: MeshState, v: int, w: int, ring: I64) -> bool:
         if mesh.faces[m, 0] < 0:
             continue
         for turn in range(1, 3):
-            size = _noted(ring, size, mesh.faces[m, (k + turn) % 3])
+            other, n = mesh.faces[m, (k + turn) % 3], 0
+            while n < size and ring[n] != other:
+                n += 1
+            ring[n], size = other, max(size, n + 1)
             if size == len(ring):
                 return False
     around, shared, common, corner = size, 0, 0, mesh.first[w]
@@ -213,16 +216,6 @@ def _is_simple(mesh: MeshState, v: int, w: int, ring: I64) -> bool:
     # An inner edge between two borders does not collapse: it would join the borders.
     apart = shared == 2 and mesh.border[v] and mesh.border[w]
     return 1 <= shared <= 2 and common == shared and around <= MAX_FAN and not apart
-
-
-@kernel
-def _noted(ring: I64, size: int, vertex: int) -> int:
-    """Append a vertex to a list that does not hold it; returns the new length."""
-    for n in range(size):
-        if ring[n] == vertex:
-            return size
-    ring[size] = vertex
-    return size + 1
 
 
 @kernel

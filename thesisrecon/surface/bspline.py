@@ -236,7 +236,7 @@ class BSplineSurface:
         unit = float(np.median(std[reliable]))
         value, std = value / unit, std / unit
         weight, stiffness = reliable.astype(np.float64), np.full(len(spline.cell), min_stiffness)
-        noise = np.zeros(0)
+        noise, cell, shape = np.zeros(0), spline.cell[spline.piece], spline.shape
         # The n residuals of a window have n - p degrees of freedom with standard deviation sqrt(2 p) of the
         # fitted part: larger mean squares are incompatible with the softest spline.
         n, p = (self.knot_px * WINDOW) ** 2, WINDOW**2
@@ -245,23 +245,20 @@ class BSplineSurface:
             c = spline.fit(value, weight / std**2, stiffness)
             residual = (spline.values(c) - value) / std
             weight = np.where(reliable, _weights(residual, reliable, redescending=k >= huber_rounds), 0.0)
-            found = _mean_square(spline, residual, weight)
+            # Weighted means of squared residuals in the window around each cell.
+            above, below = (
+                scipy.ndimage.uniform_filter(
+                    np.bincount(cell, part, shape[0] * shape[1]).reshape(shape), WINDOW, mode="constant"
+                )
+                for part in (weight * residual**2, weight)
+            )
+            found = (above / np.maximum(below, 1e-12)).ravel()
             if k < initial_rounds:
                 noise = allowed * found
             else:
                 step = first_step ** (step_decay ** (k - initial_rounds))
                 stiffness *= np.where(found <= noise, step, 1.0 / step)[spline.cell]
         return c * unit
-
-
-def _mean_square(spline: _Spline, residual: F64, weight: F64) -> F64:
-    """(cells,) weighted means of squared residuals of pixels (N,) in the window around each cell."""
-    cell, shape = spline.cell[spline.piece], spline.shape
-    totals = (
-        np.bincount(cell, part, shape[0] * shape[1]).reshape(shape) for part in (weight * residual**2, weight)
-    )
-    above, below = (scipy.ndimage.uniform_filter(total, WINDOW, mode="constant") for total in totals)
-    return np.asarray(above / np.maximum(below, 1e-12)).ravel()
 
 
 def _weights(residual: F64, reliable: B8, *, redescending: bool) -> F64:
