@@ -152,7 +152,16 @@ def assess_degeneracy(
     least = max(0.05 * agreeing, expected + 2.0 * np.sqrt(expected) + 1.0)
     different = [m for m in models if m.gained >= least and m.differs(relevant_px * frame.scale)]
     other = min(different, key=lambda m: m.margin, default=None)
-    reasons = _reasons(agreeing, tried, contradicted, false_alarms, other)
+    off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
+    reasons = list[str]()
+    if false_alarms > -2.0:
+        reasons.append(f"{off}, no more than expected by chance")
+    if contradicted > 0.2 * agreeing:
+        among = f"{contradicted:.0f} of them lie among matches of the plane"
+        reasons.append(f"{off}, but {among}, as matches between repeated structures do")
+    if other is not None and other.margin < MIN_MARGIN:
+        more = f"another F explains {other.gained:.0f} matches that this F does not explain"
+        reasons.append(f"{more}, and misses {other.lost:.0f} of its inliers")
     # Few matches estimate their own noise: Student's quantile instead of the normal one.
     allowed_px = error_px * student_factor(max(int(fit.inliers.sum()) - 7, 1))
     if not allowed_px <= relevant_px:
@@ -163,27 +172,6 @@ def assess_degeneracy(
         competing_margin=other.margin if other is not None else float("inf"),
         competing_model=frame.matrix_in_pixels(other.f) if other is not None else None,
     )  # fmt: skip
-
-
-def _reasons(
-    agreeing: float, tried: float, contradicted: float, false_alarms: float, other: _CompetingModel | None
-) -> list[str]:
-    """A sentence each if the matches off the plane, or another F, leave F undetermined."""
-    off = f"{agreeing:.0f} of {tried:.0f} matches off the dominant plane agree with F"
-    found = []
-    if false_alarms > -2.0:
-        found.append(f"{off}, no more than expected by chance")
-    if contradicted > 0.2 * agreeing:
-        found.append(
-            f"{off}, but {contradicted:.0f} of them lie among matches of the plane, as matches "
-            "between repeated structures do"
-        )
-    if other is not None and other.margin < MIN_MARGIN:
-        found.append(
-            f"another F explains {other.gained:.0f} matches that this F does not explain, and "
-            f"misses {other.lost:.0f} of its inliers"
-        )
-    return found
 
 
 def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:

@@ -86,13 +86,15 @@ class LocallyOptimisedRansac:
 
     def _repeat_search(self, points: F64, gate: float, rng: Generator) -> tuple[list[tuple[float, F64]], int]:
         """Score and F (9,) of the searches, among near matches once they differ; number of samples."""
-        found: list[tuple[float, F64]] = []
-        samples = 0
+        found, samples = list[tuple[float, F64]](), 0
+        # Six searches share the minimum; one of them draws a sample without outliers.
+        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / 6.0)
+        limits = self.min_samples // 6, self.max_samples // self.max_starts, confidence
         for k in range(self.max_starts):
             shuffled = points[rng.permutation(len(points))]
             columns = np.ascontiguousarray(shuffled.T)
-            f, drawn = self._search(shuffled, columns, gate, rng)
-            samples += drawn
+            f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
+            samples += _score_samples(shuffled, shuffled, columns, gate, limits, state, f, rng)
             if f.any():
                 if k >= self.starts:
                     _search_among_inliers(f, shuffled, columns, gate, rng)
@@ -128,13 +130,6 @@ class LocallyOptimisedRansac:
         score, inliers, _ = truncated_score(f, columns, gate, 1.0, (0.0, 0.0))
         watched(0, score, inliers / len(points), f)
         return score * len(points), f
-
-    def _search(self, points: F64, columns: F64, gate: float, rng: Generator) -> tuple[F64, int]:
-        f, state = np.zeros(9), np.array([1.0, 0.0, *PRIOR])
-        # Six searches share the minimum; one of them draws a sample without outliers.
-        confidence = 1.0 - (1.0 - self.confidence) ** (1.0 / 6.0)
-        limits = self.min_samples // 6, self.max_samples // self.max_starts, confidence
-        return f, _score_samples(points, points, columns, gate, limits, state, f, rng)
 
     def _finish(self, frame: PairFrame, found: _Candidate, points: F64) -> FundamentalFit:
         r, noise = found.residuals, found.noise

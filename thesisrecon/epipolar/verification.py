@@ -59,7 +59,12 @@ def _rotation_test(H: F64, xy1: F64, xy2: F64) -> float:
         return homography_sampson_residuals(_rotation_homography(parameters), xy1, xy2).ravel()
 
     # Focal lengths in units of the point spread: fields of view of 150 to 10 degrees.
-    starts = [_start(H, f) for f in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)]
+    starts = list[F64]()
+    for f in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
+        # The rotation nearest to K^-1 H K for a focal length and a central principal point.
+        A = H * np.array([[1.0, 1.0, 1.0 / f], [1.0, 1.0, 1.0 / f], [f, f, 1.0]])
+        R = scipy.spatial.transform.Rotation.from_matrix(nearest_rotation(A * np.sign(np.linalg.det(A))))
+        starts.append(np.array([np.log(f), 0.0, 0.0, *R.as_rotvec()]))
     costs = [float(np.sum(residuals(start) ** 2)) for start in starts]
     rss = float(np.sum(homography_sampson_residuals(H, xy1, xy2) ** 2))
     constraints, degrees = 2, 2 * len(xy1) - 8
@@ -73,13 +78,6 @@ def _rotation_test(H: F64, xy1: F64, xy2: F64) -> float:
         if ratio <= 1.0:
             break
     return ratio
-
-
-def _start(H: F64, f: float) -> F64:
-    """Parameters of the rotation nearest to K^-1 H K for a focal length and a central principal point."""
-    A = H * np.array([[1.0, 1.0, 1.0 / f], [1.0, 1.0, 1.0 / f], [f, f, 1.0]])
-    R = nearest_rotation(A * np.sign(np.linalg.det(A)))
-    return np.array([np.log(f), 0.0, 0.0, *scipy.spatial.transform.Rotation.from_matrix(R).as_rotvec()])
 
 
 class Configuration(Enum):

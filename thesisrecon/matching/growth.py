@@ -69,7 +69,28 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
         scale2 = np.inf
         # The first round is unweighted.
         for _ in range(3):
-            _solve_correction(offset, rest, (distance2, mean2), (residual2, scale2), z)
+            # Correction of the prior map, transposed, above the translation, by weighted least squares.
+            xx = sxy = yy = x = y = total = 0.0
+            xu = yu = u = xv = yv = v = 0.0
+            for m in range(k):
+                w = 1.0 / ((distance2[m] + mean2) * (1.0 + residual2[m] / (scale2 + 1e-9)))
+                dx, dy = offset[m, 0], offset[m, 1]
+                wx, wy, e, f = w * dx, w * dy, rest[m, 0], rest[m, 1]
+                total, x, y = total + w, x + wx, y + wy
+                xx, sxy, yy = xx + wx * dx, sxy + wx * dy, yy + wy * dy
+                xu, yu, u = xu + wx * e, yu + wy * e, u + w * e
+                xv, yv, v = xv + wx * f, yv + wy * f, v + w * f
+            # Without the means, the translation leaves a symmetric system of two unknowns, positive by the
+            # ridge. The prior weighs 5 % of the neighbours along one direction.
+            ridge = 0.05 * total * mean2
+            x, y = x / total, y / total
+            xx, sxy, yy = xx - total * x * x + ridge, sxy - total * x * y, yy - total * y * y + ridge
+            determinant = xx * yy - sxy * sxy
+            xu, yu, xv, yv = xu - x * u, yu - y * u, xv - x * v, yv - y * v
+            z[0, 0], z[1, 0] = (yy * xu - sxy * yu) / determinant, (xx * yu - sxy * xu) / determinant
+            z[0, 1], z[1, 1] = (yy * xv - sxy * yv) / determinant, (xx * yv - sxy * xv) / determinant
+            z[2, 0] = u / total - z[0, 0] * x - z[1, 0] * y
+            z[2, 1] = v / total - z[0, 1] * x - z[1, 1] * y
             for m in range(k):
                 dx, dy = offset[m, 0], offset[m, 1]
                 ex = rest[m, 0] - (z[0, 0] * dx + z[1, 0] * dy + z[2, 0])
@@ -82,36 +103,6 @@ def _fit_local_affines(xy: F64, neighbours: I64, xy1: F64, xy2: F64, prior: F64)
         position[n, 0], position[n, 1] = z[2, 0], z[2, 1]
         spread[n] = np.sqrt(scale2)
     return affine, position, spread
-
-
-@kernel(forceinline=True)
-def _solve_correction(
-    offset: F64, rest: F64, near: tuple[F64, float], misfit: tuple[F64, float], correction: F64
-) -> None:
-    """Correction (3, 2) of the prior map, transposed, above the translation, by weighted least squares."""
-    distance2, mean2 = near
-    residual2, scale2 = misfit
-    xx = xy = yy = x = y = total = 0.0
-    xu = yu = u = xv = yv = v = 0.0
-    for m in range(len(offset)):
-        w = 1.0 / ((distance2[m] + mean2) * (1.0 + residual2[m] / (scale2 + 1e-9)))
-        dx, dy = offset[m, 0], offset[m, 1]
-        wx, wy, e, f = w * dx, w * dy, rest[m, 0], rest[m, 1]
-        total, x, y = total + w, x + wx, y + wy
-        xx, xy, yy = xx + wx * dx, xy + wx * dy, yy + wy * dy
-        xu, yu, u = xu + wx * e, yu + wy * e, u + w * e
-        xv, yv, v = xv + wx * f, yv + wy * f, v + w * f
-    # Without the means, the translation leaves a symmetric system of two unknowns, positive by the ridge.
-    # The prior weighs 5 % of the neighbours along one direction.
-    ridge = 0.05 * total * mean2
-    x, y = x / total, y / total
-    xx, xy, yy = xx - total * x * x + ridge, xy - total * x * y, yy - total * y * y + ridge
-    determinant = xx * yy - xy * xy
-    xu, yu, xv, yv = xu - x * u, yu - y * u, xv - x * v, yv - y * v
-    correction[0, 0], correction[1, 0] = (yy * xu - xy * yu) / determinant, (xx * yu - xy * xu) / determinant
-    correction[0, 1], correction[1, 1] = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
-    correction[2, 0] = u / total - correction[0, 0] * x - correction[1, 0] * y
-    correction[2, 1] = v / total - correction[0, 1] * x - correction[1, 1] * y
 
 
 @kernel

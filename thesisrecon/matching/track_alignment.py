@@ -54,6 +54,7 @@ def _align_windows(
     wide, raster = (empty(WIDE * WIDE, np.float32), window_raster(WIDE)), window_raster(SIDE)
     template, window = empty(SAMPLES, np.float32), empty(SAMPLES, np.float32)
     gradient = empty((6 if affine_std > 0.0 else 2, SAMPLES), np.float32)
+    normal = zeros((len(gradient), len(gradient)))
     for n in range(len(xy1)):
         determinant = affine_determinant(affine[n])
         if determinant == 0.0:
@@ -65,7 +66,10 @@ def _align_windows(
         to1, to2 = 1.0 / (base1 * 2.0**k1), 1.0 / (base2 * 2.0**k2)
         if not _read_template(pixels1, levels1[k1], to1, (xy1[n], size), wide, raster, (template, gradient)):
             continue
-        normal = _normal_matrix(gradient)
+        # Inner products of the derivatives.
+        for g in range(len(gradient)):
+            for h in range(g, len(gradient)):
+                normal[g, h] = normal[h, g] = dot(gradient[g], gradient[h])
         d = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
         # Structure in one direction gives no position.
         if d <= 1e-4 * normal[0, 0] * normal[1, 1]:
@@ -85,7 +89,7 @@ def _align_windows(
     return xy2, affine, score
 
 
-# Inlined, as the next two kernels: they are called for every window or step.
+# Inlined, as the next kernels: they are called for every window.
 @kernel(forceinline=True)
 def _read_template(
     pixels: F32, level: I64, to_level: float, place: tuple[F64, float], wide: tuple[F32, F32], inner: F32,
@@ -142,17 +146,6 @@ def _project_out_gain_and_bias(gradient: F32, template: F32, norm: float) -> Non
 
 
 @kernel(forceinline=True)
-def _normal_matrix(gradient: F32) -> F64:
-    """Inner products of the derivatives."""
-    unknowns = len(gradient)
-    normal = zeros((unknowns, unknowns))
-    for g in range(unknowns):
-        for h in range(g, unknowns):
-            normal[g, h] = normal[h, g] = dot(gradient[g], gradient[h])
-    return normal
-
-
-@kernel(forceinline=True)
 def _iterate(
     level2: tuple[F32, I64, float], template: tuple[F32, F32, F64, F32, F32], found: tuple[F64, F64],
     limits: tuple[int, float, float, float],
@@ -165,8 +158,9 @@ def _iterate(
     xy, a = found
     iterations, affine_std, reach, size = limits
     x, y = xy[0], xy[1]
-    moved = zeros(len(gradient))
-    value = 0.0
+    unknowns, value = len(gradient), 0.0
+    # The change of the map so far, and the step of all unknowns.
+    moved, right, delta = zeros(unknowns), empty(unknowns), zeros(unknowns)
     for turn in range(iterations + 1):
         if not sample_window(pixels, level, to_level, xy, a * size, raster, window):
             return 0.0
@@ -178,51 +172,34 @@ def _iterate(
             return 0.0
         if turn == iterations:
             break
-        delta = _solve_step(gradient, normal, window, value, (moved, affine_std))
-        _compose(xy, a, delta, size)
+        damped = normal.copy()
+        # Residual variance of a normalised sample against the prior of the affine coefficients.
+        ridge = max(1.0 - value * value, 1e-4) / SAMPLES / max(HALF * HALF * affine_std * affine_std, 1e-12)
+        for g in range(unknowns):
+            right[g] = dot(gradient[g], window) / value
+            if g >= 2:
+                damped[g, g] += ridge
+                right[g] -= ridge * moved[g]
+        solved = solve_damped(damped, right, 0.0, delta)
+        for g in range(unknowns):
+            delta[g] = -delta[g] if solved else 0.0
+            moved[g] += delta[g]
+        # The map x2(x) = xy + a x is composed with the inverse of the step of the template.
+        if unknowns == 6:
+            p, q, r, s = 1.0 + delta[2] / HALF, delta[3] / HALF, delta[4] / HALF, 1.0 + delta[5] / HALF
+            determinant = p * s - q * r
+            for i in range(2):
+                u, v = a[i, 0], a[i, 1]
+                a[i, 0], a[i, 1] = (u * s - v * r) / determinant, (v * p - u * q) / determinant
+        dx, dy = size * delta[0], size * delta[1]
+        xy[0] -= a[0, 0] * dx + a[0, 1] * dy
+        xy[1] -= a[1, 0] * dx + a[1, 1] * dy
         if (xy[0] - x) ** 2 + (xy[1] - y) ** 2 > reach**2:
             return 0.0
         if turn < iterations - 1 and delta[0] ** 2 + delta[1] ** 2 < 1e-4:
             # Another correlation would cost a window and not change the result.
             break
     return value
-
-
-@kernel(forceinline=True)
-def _solve_step(gradient: F32, normal: F64, window: F32, value: float, prior: tuple[F64, float]) -> F64:
-    """Step of all unknowns; ``prior`` = change of the map so far (updated) and its standard deviation."""
-    moved, affine_std = prior
-    unknowns = len(gradient)
-    damped = normal.copy()
-    right = empty(unknowns)
-    # Residual variance of a normalised sample against the prior of the affine coefficients.
-    ridge = max(1.0 - value * value, 1e-4) / SAMPLES / max(HALF * HALF * affine_std * affine_std, 1e-12)
-    for g in range(unknowns):
-        right[g] = dot(gradient[g], window) / value
-        if g >= 2:
-            damped[g, g] += ridge
-            right[g] -= ridge * moved[g]
-    delta = zeros(unknowns)
-    if solve_damped(damped, right, 0.0, delta):
-        for g in range(unknowns):
-            delta[g] = -delta[g]
-    for g in range(2, unknowns):
-        moved[g] += delta[g]
-    return delta
-
-
-@kernel(forceinline=True)
-def _compose(xy: F64, a: F64, delta: F64, size: float) -> None:
-    """Compose the map x2(x) = xy + a x with the inverse of the step of the template, in place."""
-    if len(delta) == 6:
-        p, q, r, s = 1.0 + delta[2] / HALF, delta[3] / HALF, delta[4] / HALF, 1.0 + delta[5] / HALF
-        determinant = p * s - q * r
-        for i in range(2):
-            u, v = a[i, 0], a[i, 1]
-            a[i, 0], a[i, 1] = (u * s - v * r) / determinant, (v * p - u * q) / determinant
-    dx, dy = size * delta[0], size * delta[1]
-    xy[0] -= a[0, 0] * dx + a[0, 1] * dy
-    xy[1] -= a[1, 0] * dx + a[1, 1] * dy
 
 
 def align_corners(

@@ -130,16 +130,13 @@ def _depth_at(depth: F32, std: F32, slope: float, u: float, v: float) -> tuple[f
         upper = (1.0 - s) / a + s / b
         lower = (1.0 - s) / c + s / d
         return 1.0 / ((1.0 - t) * upper + t * lower), (row, column), 1.0
-    if depth[row, column] == depth[row, column]:
-        return depth[row, column], (row, column), 1.0
-    other_row, other_column = y + y1 - row, x + x1 - column
-    if depth[row, other_column] == depth[row, other_column]:
-        column = other_column
-    elif depth[other_row, column] == depth[other_row, column]:
-        row = other_row
-    else:
-        row, column = other_row, other_column
-    return depth[row, column], (row, column), weight_beyond
+    other_row, other_column, trust = y + y1 - row, x + x1 - column, 1.0
+    j, i = row, column
+    for k in range(1, 4):
+        if depth[j, i] == depth[j, i]:
+            break
+        j, i, trust = other_row if k > 1 else row, other_column if k != 2 else column, weight_beyond
+    return depth[j, i], (j, i), trust
 
 
 @kernel
@@ -355,10 +352,15 @@ def _measured(depth_map: DepthMap) -> FusionMap:
     fused_grazing_deg = 5.0  # Surfaces break where they are seen at a smaller angle
     K, R, t = decompose_camera(depth_map.P)
     slope = _mesh.max_depth_slope(depth_map.P, fused_grazing_deg)
-    depth, focal = _without_grazing(depth_map, slope), float(np.sqrt(K[0, 0] * K[1, 1]))
-    return FusionMap(
-        compose_camera(K, R, t), focal, depth, depth_map.std, _incidence_cosines(depth, K), slope
-    )
+    # Pixels at grazing incidence blend into the background; borders stay.
+    depth, steepest = depth_map.depth, np.zeros_like(depth_map.depth)
+    for axis in (0, 1):
+        steepest = np.hypot(steepest, np.nan_to_num(_smaller_difference(depth, axis)))
+    with np.errstate(invalid="ignore"):
+        flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
+    depth, focal = np.where(flat, np.float32(np.nan), depth), float(np.sqrt(K[0, 0] * K[1, 1]))
+    cosines = _incidence_cosines(depth, K)
+    return FusionMap(compose_camera(K, R, t), focal, depth, depth_map.std, cosines, slope)
 
 
 def _incidence_cosines(depth: F32, K: F64) -> F32:
@@ -389,17 +391,6 @@ def _smaller_difference(values: F32, axis: int) -> F32:
     after = np.insert(step, step.shape[axis], np.nan, axis=axis)
     with np.errstate(invalid="ignore"):
         return np.where((np.abs(after) < np.abs(before)) | np.isnan(before), after, before)
-
-
-def _without_grazing(depth_map: DepthMap, slope: float) -> F32:
-    """Depths without pixels at grazing incidence, which blend into the background; borders stay."""
-    depth = depth_map.depth
-    steepest = np.zeros_like(depth)
-    for axis in (0, 1):
-        steepest = np.hypot(steepest, np.nan_to_num(_smaller_difference(depth, axis)))
-    with np.errstate(invalid="ignore"):
-        flat = steepest > np.maximum(slope * depth, 3.0 * depth_map.std)
-    return np.where(flat, np.float32(np.nan), depth)
 
 
 def _empty_grid(maps: Sequence[FusionMap], voxel: float, pool: ThreadPool) -> VoxelGrid | None:
