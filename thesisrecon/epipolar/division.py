@@ -57,11 +57,6 @@ class DivisionEstimate:
         deviation = float(np.sqrt(self.covariance.sum()))
         return bool(abs(self.k[0] + self.k[1]) > LEAST + 2.0 * deviation)
 
-    @property
-    def is_small(self) -> bool:
-        """Whether k1, refined from zero, is surely near it."""
-        return bool(abs(self.k[0]) < LEAST / 2.0 and self.covariance[0, 0] < LEAST**2 / 4.0)
-
 
 def straighten(xy: F64, sizes: I64 | F64, k: F64) -> tuple[F64, F64]:
     """Straight positions (N, 2) of pixels, and their magnification (N,), negative beyond the horizon.
@@ -135,7 +130,8 @@ def _small_lens(pairs: Sequence[_Pair], rng: Generator) -> DivisionEstimate | No
     if start is None or start[1] != 0.0:
         return None
     found = DivisionEstimate(*_adjusted(start[0], np.array([0.0, 0.0, DIVISION]), 1)[1:])
-    return found if found.is_small else None
+    small = abs(found.k[0]) < LEAST / 2.0 and found.covariance[0, 0] < LEAST**2 / 4.0
+    return found if small else None
 
 
 def _chosen_pairs(matches: Sequence[Matches], wanted: int) -> list[Matches]:

@@ -4,7 +4,7 @@ A camera with a lens has the faces at the nearest pixels of pinhole views, and t
 them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -156,6 +156,15 @@ class Raster:
     face: I64
     weights: F32
 
+    @classmethod
+    def empty(cls, height: int, width: int) -> "Raster":
+        """Return a raster without faces."""
+        depth, weights = (
+            np.full((height, width), np.inf, np.float32),
+            np.zeros((height, width, 2), np.float32),
+        )
+        return cls(depth, np.full((height, width), -1, dtype=np.int64), weights)
+
     def interpolate(self, values: F64 | F32, faces: I64 | None = None) -> F32:
         """Values (H, W, C) of mesh vertices (N, C), or of face corners (M, 3, C), at each pixel; else 0."""
         if faces is None:
@@ -189,10 +198,8 @@ def image_corners(vertices: F64, faces: I64, camera: Camera) -> tuple[F64, float
 
 def rasterize_rows(corners: F64, near: float, rows: tuple[int, int], width: int) -> Raster:
     """Find the face at the pixels of rows (first, last + 1) from the image points (M, 3, 3) of corners."""
-    shape = (rows[1] - rows[0], width)
-    depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
-    raster = Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
-    _rasterize_rows(np.ascontiguousarray(corners), near, rows, depth, face, raster.weights)
+    raster = Raster.empty(rows[1] - rows[0], width)
+    _rasterize_rows(np.ascontiguousarray(corners), near, rows, raster.depth, raster.face, raster.weights)
     return raster
 
 
@@ -215,15 +222,30 @@ def raster_of_camera(
         points = vertices @ camera.R.T + camera.t
 
     def find(rows: tuple[int, int]) -> Raster:
-        shape = (rows[1] - rows[0], width)
-        depth, face = np.full(shape, np.inf, dtype=np.float32), np.full(shape, -1, dtype=np.int64)
-        raster = Raster(depth, face, np.zeros((*shape, 2), dtype=np.float32))
-        step = max(CHUNK // width, 1)
-        for first in range(0, shape[0], step):
+        raster, step = Raster.empty(rows[1] - rows[0], width), max(CHUNK // width, 1)
+        for first in range(0, rows[1] - rows[0], step):
             part = raster[first : first + step]
             across = np.arange(rows[0] + first, rows[0] + first + len(part.face))
             xy = np.stack(np.meshgrid(np.arange(width), across), axis=-1).reshape(-1, 2).astype(np.float64)
-            _fill(part, viewing_rays(K, xy, lens), views, points, faces)
+            rays = viewing_rays(K, xy, lens)
+            found = np.full(len(rays), -1)
+            for view in views:
+                if view is not None:
+                    mine = np.flatnonzero(_looks_into(rays, view[1]) & (found < 0))
+                    xh = rays[mine] @ view[0].T
+                    x, y = np.rint(xh[:, :2] / xh[:, 2:]).astype(np.int64).T
+                    here = np.clip(y, 0, len(view[2]) - 1), np.clip(x, 0, view[2].shape[1] - 1)
+                    found[mine] = view[2][here]
+            hit = np.flatnonzero(found >= 0)
+            corners, rays = points[faces[found[hit]]], rays[hit]
+            # The ray is a sum of the corners with these weights: their signs are equal inside the face.
+            weights = np.einsum("nkc,nc->nk", np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]), rays)
+            side = np.einsum("nc,nc->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+            weights = np.maximum(weights * np.sign(side)[:, None], 0.0)
+            weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
+            part.face.reshape(-1)[hit] = found[hit]
+            part.depth.reshape(-1)[hit] = np.einsum("nk,nk->n", weights, corners[:, :, 2])
+            part.weights.reshape(-1, 2)[hit] = weights[:, 1:]
         return raster
 
     return find
@@ -257,27 +279,6 @@ def _looks_into(rays: F64, turn: F64) -> B8:
     """Whether rays (N,) lie in a pinhole view of 90 x 90 degrees; NaN: in none."""
     across = rays @ turn.T
     return np.asarray(across[:, 2] >= (1.0 - 1e-12) * np.abs(across[:, :2]).max(axis=1))
-
-
-def _fill(raster: Raster, rays: F64, views: Sequence[_View], points: F64, faces: I64) -> None:
-    """Fill a raster by the faces of views at the pixels nearest to the rays, and their places on these."""
-    found = np.full(len(rays), -1)
-    for view in views:
-        if view is not None:
-            mine = np.flatnonzero(_looks_into(rays, view[1]) & (found < 0))
-            xh = rays[mine] @ view[0].T
-            x, y = np.rint(xh[:, :2] / xh[:, 2:]).astype(np.int64).T
-            found[mine] = view[2][np.clip(y, 0, len(view[2]) - 1), np.clip(x, 0, view[2].shape[1] - 1)]
-    hit = np.flatnonzero(found >= 0)
-    corners = points[faces[found[hit]]]
-    # The ray is a sum of the corners with these weights: their signs are equal inside the face.
-    weights = np.einsum("nkc,nc->nk", np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]), rays[hit])
-    weights *= np.sign(np.einsum("nc,nc->n", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))[:, None]
-    weights = np.maximum(weights, 0.0)
-    weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-300)
-    raster.face.reshape(-1)[hit] = found[hit]
-    raster.depth.reshape(-1)[hit] = np.einsum("nk,nk->n", weights, corners[:, :, 2])
-    raster.weights.reshape(-1, 2)[hit] = weights[:, 1:]
 
 
 def vertex_normals(mesh: TexturedMesh) -> F64:

@@ -20,8 +20,6 @@ SIGMA_PX = 0.4  #: standard deviation of a position in the neighbours
 MIN_GAIN = 0.006  #: fall of the cost in one pass below which a plane has converged
 SUMS = {"reassoc", "contract", "arcp", "nsz"}
 """Floating-point rules for sums over a window that allow vectorisation; NaN is preserved."""
-
-
 RADIUS, SPACING = 4, 2  #: radius of the window, and distance of its samples, in pixels
 MAX_COST, MAX_CONTINUATION_COST = 0.4, 0.6
 """Largest accepted cost, and that of pixels that are accepted if they continue a surface."""
@@ -244,16 +242,6 @@ def _step(H: F64, e: F64, at: tuple[int, int], rho: float, px: float) -> float:
     return px / most
 
 
-@kernel(fastmath=SUMS, forceinline=True)
-def _continued(planes: F32, a: int, b: int, u: int, v: int, trial: F64) -> bool:
-    """Fill ``trial`` with the plane of pixel (a, b) evaluated at (u, v); False if there is none."""
-    if not (0 <= a < planes.shape[1] and 0 <= b < planes.shape[0]) or not np.isfinite(planes[b, a, 0]):
-        return False
-    trial[0] = planes[b, a, 0] + (u - a) * planes[b, a, 1] + (v - b) * planes[b, a, 2]
-    trial[1], trial[2] = planes[b, a, 1], planes[b, a, 2]
-    return True
-
-
 @kernel(fastmath=SUMS)
 def sweep_planes(
     search: PatchSearch, step_px: float, converged_cost: float, backward: bool, planes: F32, cost: F32,
@@ -287,8 +275,12 @@ def sweep_planes(
             shifted = False
             for k in range(8):
                 if k < 2:
-                    if not _continued(planes, u - back * (1 - k), v - back * k, u, v, trial):
+                    # The plane of a neighbour, evaluated here.
+                    p, q = u - back * (1 - k), v - back * k
+                    if not (0 <= p < width and 0 <= q < height) or not np.isfinite(planes[q, p, 0]):
                         continue
+                    trial[0] = planes[q, p, 0] + (u - p) * planes[q, p, 1] + (v - q) * planes[q, p, 2]
+                    trial[1], trial[2] = planes[q, p, 1], planes[q, p, 2]
                     tilt = abs(trial[1] - plane[1]) + abs(trial[2] - plane[2])
                     if abs(trial[0] - plane[0]) + reach * tilt <= SAME_PLANE * move:
                         continue

@@ -36,23 +36,6 @@ def _keep_second_best(total: U16, q: np.int16, index: I16, second: U16) -> None:
 
 
 @kernel
-def _best_of_row(total: U16, first: int, left: tuple[U16, I16, U16], right: tuple[U16, I16]) -> None:
-    """Least totals and their disparities for both images, and the second best totals of the left one."""
-    n, width = total.shape
-    best, index, second = left
-    best[:], index[:], second[:] = UNREACHED, 0, UNREACHED
-    right[0][:], right[1][:] = UNREACHED, -1
-    for q in range(n):
-        d = first + q
-        _keep_best(total[q], np.int16(q), best, index)
-        lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
-        if hi > lo:
-            _keep_best(total[q, lo:hi], np.int16(q), right[0][lo - d : hi - d], right[1][lo - d : hi - d])
-    for q in range(n):
-        _keep_second_best(total[q], np.int16(q), index, second)
-
-
-@kernel
 def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32], half: float) -> None:
     """Select the best disparity of every pixel from path sums (P, N, D, W), rows from ``start`` on."""
     # `out` (3 of (H, W)): left disparities at the vertex of two lines of opposite slope through three totals,
@@ -70,7 +53,15 @@ def best_disparities(sums: U8, start: int, first: int, out: tuple[F32, F32, F32]
                 values, of_pairs = sums[k, start + y, q], total[q]
                 for x in range(width):
                     of_pairs[x] = np.uint16(of_pairs[x] + np.uint16(values[x]))
-        _best_of_row(total, first, (best, index, second), (best_r, index_r))
+        best[:], index[:], second[:], best_r[:], index_r[:] = UNREACHED, 0, UNREACHED, UNREACHED, -1
+        for q in range(n):
+            d = first + q
+            _keep_best(total[q], np.int16(q), best, index)
+            lo, hi = min(max(d, 0), width), max(min(width, width + d), 0)
+            if hi > lo:
+                _keep_best(total[q, lo:hi], np.int16(q), best_r[lo - d : hi - d], index_r[lo - d : hi - d])
+        for q in range(n):
+            _keep_second_best(total[q], np.int16(q), index, second)
         for x in range(width):
             q = int(index[x])
             value = np.float32(first + q)

@@ -219,7 +219,14 @@ def paint_texture(
         pixels = sum(camera.size[0] * camera.size[1] for camera in cameras)
         texels = PART_TEXELS if prepared_bytes * pixels <= SURFACE_BYTES else LARGE_PART_TEXELS
         for at, face, weights in _surface_parts(mesh, uv, texture.shape[:2], texels, pool):
-            points, towards = _points_on_faces(mesh, normals, face, weights)
+            points, towards = np.empty((2, len(face), 3))
+            for first in range(0, len(face), CHUNK_POINTS):
+                some = slice(first, first + CHUNK_POINTS)
+                share = weights[some].astype(np.float64)
+                share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
+                vertex = mesh.faces[face[some]]
+                points[some] = (share * mesh.vertices[vertex]).sum(axis=1)
+                towards[some] = (share * normals[vertex]).sum(axis=1)
             box = points.min(axis=0), points.max(axis=0)
             near = [v for v, camera in enumerate(cameras) if _may_contain(camera, *box)]
             views = OnDemand(len(near), lambda n: prepared[near[n]])  # noqa: B023
@@ -292,19 +299,6 @@ def _no_observations(views: int, points: F64) -> tuple[F32, F32]:
     return np.zeros((views, len(points)), np.float32), np.zeros((views, len(points), 3), np.float32)
 
 
-def _points_on_faces(mesh: TexturedMesh, normals: F64, face: I32, weights: F32) -> tuple[F64, F64]:
-    """Points and normals (N, 3) on faces (N,) with ``weights`` (N, 2) of corners 1 and 2."""
-    points, towards = np.empty((2, len(face), 3))
-    for first in range(0, len(face), CHUNK_POINTS):
-        some = slice(first, first + CHUNK_POINTS)
-        share = weights[some].astype(np.float64)
-        share = np.column_stack([1.0 - share.sum(axis=1), share])[:, :, None]
-        vertex = mesh.faces[face[some]]
-        points[some] = (share * mesh.vertices[vertex]).sum(axis=1)
-        towards[some] = (share * normals[vertex]).sum(axis=1)
-    return points, towards
-
-
 def _may_contain(camera: Camera, low: F64, high: F64) -> bool:
     """Whether an image may contain points of a box: it is not completely outside one of its sides."""
     box = np.array([[(low, high)[k >> d & 1][d] for d in range(3)] for k in range(8)])
@@ -319,13 +313,22 @@ def _surface_parts(
 ) -> Iterator[tuple[I32, I32, F32]]:
     """Numbers (N,), faces and weights (N, 2) of corners 1 and 2 of at most ``largest`` texels at a time."""
     strip_rows = 64  # Rows of the texture processed at a time
+    beyond_face = 4.0  # Limit of the extrapolation to the rim in sides of a face
     top, bottom = uv[..., 1].min(axis=1) - RIM_TEXELS, uv[..., 1].max(axis=1) + RIM_TEXELS
 
     def texels(first: int) -> tuple[I32, I32, F32]:
         rows = slice(first, min(first + strip_rows, shape[0]))
         # Comparisons with NaN are false: such faces are not seen.
         some = np.flatnonzero((bottom >= rows.start) & (top <= rows.stop))
-        return _texels_of_rows((some, uv[some]), rows, shape[1])
+        corners = np.concatenate([uv[some], np.ones((len(some), 3, 1))], axis=2)
+        corners[..., 1] -= rows.start - RIM_TEXELS
+        raster = rasterize_rows(corners, 1e-3, (0, rows.stop - rows.start + 2 * RIM_TEXELS), shape[1])
+        for _ in range(RIM_TEXELS):
+            continue_faces(corners, beyond_face, raster.face, raster.weights)
+        inner = raster[RIM_TEXELS:-RIM_TEXELS]
+        y, x = np.nonzero(inner.face >= 0)
+        at = ((y + rows.start) * shape[1] + x).astype(np.int32)
+        return at, some[inner.face[y, x]].astype(np.int32), inner.weights[y, x]
 
     strips = list(pool.map(texels, range(0, shape[0], strip_rows)))
     at, face, weights = (np.concatenate(kind) for kind in zip(*strips, strict=True))
@@ -339,23 +342,6 @@ def _surface_parts(
         some = order[first:last]
         if len(some):
             yield at[some], face[some], weights[some]
-
-
-def _texels_of_rows(faces: tuple[I64, F64], rows: slice, width: int) -> tuple[I32, I32, F32]:
-    """Numbers (N,), faces (N,) and weights (N, 2) of the texels of some rows, and of the ``faces`` there."""
-    beyond_face = 4.0  # Limit of that extrapolation in sides of a face
-    some, uv = faces
-    corners = np.concatenate([uv, np.ones((len(some), 3, 1))], axis=2)
-    corners[..., 1] -= rows.start - RIM_TEXELS
-    shape = (rows.stop - rows.start + 2 * RIM_TEXELS, width)
-    raster = rasterize_rows(corners, 1e-3, (0, shape[0]), shape[1])
-    face, weights = raster.face, raster.weights
-    for _ in range(RIM_TEXELS):
-        continue_faces(corners, beyond_face, face, weights)
-    face, weights = face[RIM_TEXELS:-RIM_TEXELS], weights[RIM_TEXELS:-RIM_TEXELS]
-    y, x = np.nonzero(face >= 0)
-    at = ((y + rows.start) * width + x).astype(np.int32)
-    return at, some[face[y, x]].astype(np.int32), weights[y, x]
 
 
 def _prepared(view: PinholeView, depth: F32) -> ViewSurface:

@@ -3,7 +3,7 @@
 A chart consists of connected faces assigned to one image, at its resolution; colours are blended from all.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -54,9 +54,13 @@ def texture_mesh(
         whole = views
         views = OnDemand(len(whole), lambda v: _reduced(whole[v], scale), REDUCED_BYTES)
         buffers = _texture_blending.depth_buffers(mesh, views)
-    cut_out = _fill(
-        lambda v: views[v].rgb, label[np.unique(chart, return_index=True)[1]], rectangles, offsets, size
-    )
+    # The rectangle of each chart is copied from its view, view by view, so that each is made once.
+    cut_out, view_of = np.full((*size[::-1], 3), 128, np.uint8), label[np.unique(chart, return_index=True)[1]]
+    for c in np.argsort(view_of, kind="stable"):
+        (left, top, right, bottom), (x, y) = rectangles[c], offsets[c]
+        if view_of[c] >= 0:
+            rgb = views[int(view_of[c])].rgb
+            cut_out[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
     seen_uv = np.where((label >= 0)[:, None, None], uv, np.nan)
     prepared = _texture_blending.prepare_views(mesh, views, buffers, threads=threads)
     texture = _texture_blending.paint_texture(mesh, prepared, cameras, seen_uv, cut_out, threads=threads)
@@ -228,20 +232,6 @@ def _pack_rectangles(sizes: I64) -> tuple[I64, tuple[int, int]]:
         places[c] = x, y
         x, shelf, widest = x + w, max(shelf, h), max(widest, x + w)
     return places, (int(widest), int(max(y + shelf, 1)))
-
-
-def _fill(
-    image_of: Callable[[int], U8], label: I64, rectangles: I64, offsets: I64, size: tuple[int, int]
-) -> U8:
-    """Texture (H, W, 3): the rectangle of each chart, copied from view ``label`` to its place."""
-    texture = np.full((size[1], size[0], 3), 128, dtype=np.uint8)
-    # View by view, so that each is made once.
-    for c in np.argsort(label, kind="stable"):
-        (left, top, right, bottom), (x, y) = rectangles[c], offsets[c]
-        if label[c] >= 0:
-            rgb = image_of(int(label[c]))
-            texture[y : y + bottom - top, x : x + right - left] = rgb[top:bottom, left:right]
-    return texture
 
 
 def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U8]:
