@@ -55,12 +55,8 @@ def _basis_equation(u: Three, v: Three) -> tuple[float, float, float, float, flo
 @kernel(inline="always")
 def _determinant(a: Three, b: Three, c: Three) -> float:
     """Determinant of the matrix with columns a, b, c."""
-    value: float = (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
-    return value
+    value: float = a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2])
+    return value + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
 @kernel(fastmath={"contract"}, forceinline=True)
@@ -321,9 +317,8 @@ def search_fundamental(
     solutions, work = empty((3, 9)), empty(9)
     before = state[0]
     for start in range(0, len(uniforms), LANES):
-        if state[0] < before or (
-            done >= least and done >= required_samples(state[1], 7, confidence, LARGEST)
-        ):
+        enough = done >= least and done >= required_samples(state[1], 7, confidence, LARGEST)
+        if state[0] < before or enough:
             break
         batch = uniforms[start : start + LANES]
         done += len(batch)

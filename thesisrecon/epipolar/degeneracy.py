@@ -35,17 +35,13 @@ SAMPLED = 60  # inliers of which the covariance and the contradictions are teste
 
 @dataclass(frozen=True)
 class _CompetingModel:
-    """Another F ``f`` (9,), and the weights of matches that only the estimate or only this F explains.
-
-    ``error`` is the RMS distance of its inliers to the estimate, ``apart`` the smaller of that and the
-    reverse, in frame units.
-    """
+    """Another F ``f`` (9,), and the weights of matches that only the estimate or only this F explains."""
 
     f: F64
     lost: float
     gained: float
-    error: float
-    apart: float
+    error: float  #: RMS distance of its inliers to the estimate in frame units
+    apart: float  #: the smaller of that and the reverse
 
     @property
     def margin(self) -> float:

@@ -209,14 +209,10 @@ def _require_determined(fit: TrifocalFit, xy: F64) -> None:
 
 @dataclass(frozen=True)
 class _TensorEquations:
-    """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates.
+    """Linear equations A t = 0 of the tensor entries t, in conditioned image coordinates."""
 
-    ``A`` (27, 27): triangular factor of all equations; ``transforms`` (3, 3, 3): from pixels to conditioned
-    coordinates.
-    """
-
-    A: F64
-    transforms: F64
+    A: F64  #: (27, 27) triangular factor of all equations
+    transforms: F64  #: (3, 3, 3) from pixels to conditioned coordinates
 
     def solve(self) -> F64:
         """The unit tensor (3, 3, 3) of least |A t| (HZ algorithm 16.1), in general not one of cameras."""

@@ -29,12 +29,7 @@ def static_pixels(
 
     A window is static if it correlates with the median of the images and is not shifted against it. So are
     distant points if the camera does not turn at all; images that are static everywhere, or have a mask, are
-    left alone.
-
-    Returns
-    -------
-    dict of int to ndarray
-        By number of the image; images without static pixels are not in it.
+    left alone, and not among the numbers of the result.
     """
     groups = defaultdict(list)
     for n, image in enumerate(images):

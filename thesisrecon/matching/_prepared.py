@@ -129,19 +129,14 @@ def affine_determinant(a: F64) -> float:
 
 @dataclass(frozen=True)
 class PreparedImage:
-    """An image prepared for matching.
+    """An image prepared for matching."""
 
-    ``size`` = (width, height); ``pyramid`` = pixels, levels, base and ``cells`` = side px, shape, start and
-    order of the corner cells are arguments of the kernels; ``window`` is the side of the corner windows, cut
-    from the pixels of ``channels``.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  #: (width, height)
     features: Features
-    pyramid: tuple[F32, I64, float]
-    cells: tuple[float, I64, I64, I64]
-    window: int
-    channels: tuple[F32, ...]
+    pyramid: tuple[F32, I64, float]  #: pixels, levels and base: arguments of the kernels
+    cells: tuple[float, I64, I64, I64]  #: side px, shape, start and order of the corner cells
+    window: int  #: side of the corner windows
+    channels: tuple[F32, ...]  #: pixels of which they are cut
 
     @property
     def long_side(self) -> int:

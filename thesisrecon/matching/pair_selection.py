@@ -190,9 +190,8 @@ class PairsOfAdded:
             rank = np.where(new >= self.count, _ranks(new, evidence, n).T, n)
             best = (rank < usual.most).any(axis=1) & (evidence >= usual.min_evidence)
             new = new[best | (rank < usual.nearest).any(axis=1)]
-        return PairChoice(
-            _pair_array([*self.before, *new]), "the pairs of the run, and the best of each new image"
-        )
+        how = "the pairs of the run, and the best of each new image"
+        return PairChoice(_pair_array([*self.before, *new]), how)
 
 
 def _most_similar(words: scipy.sparse.csr_array, count: int) -> I64:
@@ -257,10 +256,8 @@ def _count_agreeing(xy1: F64, xy2: F64, scale: F64, angle: F64, limits: F64) -> 
 
 
 class _Subset(NamedTuple):
-    """Seeds of one image, and the extent px of all its seeds."""
-
     seeds: Seeds
-    extent: F64
+    extent: F64  #: (2,) px of all seeds of the image
 
 
 def _subset_seeds(seeds: Seeds, *, rotated: bool) -> _Subset:
@@ -387,11 +384,10 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
         "its {} matches are few compared with those of each image's best pair, and "
         f"at least {MAX_STEPS + 1} strong pairs separate the images: probably repeated structure"
     )
+    rejected = (pair.accepted and (pair.i, pair.j) in apart for pair in pairs)
     return [
-        replace(pair, accepted=False, reason=reason.format(pair.inliers))
-        if pair.accepted and (pair.i, pair.j) in apart
-        else pair
-        for pair in pairs
+        replace(pair, accepted=False, reason=reason.format(pair.inliers)) if bad else pair
+        for pair, bad in zip(pairs, rejected, strict=True)
     ]
 
 

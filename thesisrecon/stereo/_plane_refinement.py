@@ -29,19 +29,16 @@ GATE = 3.0  #: standard deviations within which plane and fused correspondences 
 class PatchSearch(NamedTuple):
     """A reference view, its K neighbours, the transfer of pixels to them, and the matching window.
 
-    A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k. ``gray``
-    (H, W): NaN without a pixel; ``squares`` (S,): of all neighbours, see :func:`pack_squares`; ``layout`` (K,
-    3): offset, width and height of each; ``offsets`` (2, S) of the samples: whole pixels, opposite corners
-    first and last; ``weights`` (256,) belong to absolute grey level differences to the centre.
+    A pixel (x, y, 1) of inverse depth rho is at ``H[k]`` (x, y, 1) + rho ``e[k]`` in neighbour k.
     """
 
-    gray: F32
-    squares: U32
-    layout: I64
+    gray: F32  #: (H, W) NaN without a pixel
+    squares: U32  #: (S,) of all neighbours, see :func:`pack_squares`
+    layout: I64  #: (K, 3) offset, width and height of each
     H: F64
     e: F64
-    offsets: F32
-    weights: F32
+    offsets: F32  #: (2, S) of the samples: whole pixels, opposite corners first and last
+    weights: F32  #: (256,) by the absolute grey level difference to the centre
 
 
 def pack_squares(gray: F32) -> U32:

@@ -24,23 +24,19 @@ MAX_FAN = 24  #: largest number of faces around a vertex
 
 
 class MeshState(NamedTuple):
-    """A mesh during its simplification.
+    """A mesh during its simplification."""
 
-    ``points`` (N, 3); ``planes`` (N, 11): weighted sums of n n' (upper triangle), n d and d^2 of the planes n
-    x = d, and of areas; ``limit`` (N,) squared; ``border`` (N,); ``faces`` (M, 3), -1 if removed; ``first``
-    (N,) corner 3 m + k of each vertex and ``following`` (3M,) or -1; ``block`` (N,) of all faces of a vertex,
-    else -1; ``into`` (N,) the vertex that replaced one, or itself.
-    """
-
-    points: F64
-    planes: F64
-    limit: F64
-    border: U8
-    faces: I32
-    first: I32
-    following: I32
-    block: I32
-    into: I32
+    points: F64  #: (N, 3)
+    planes: (
+        F64  #: (N, 11) weighted sums of n n' (upper triangle), n d, d^2 of the planes n x = d, and of areas
+    )
+    limit: F64  #: (N,) squared
+    border: U8  #: (N,)
+    faces: I32  #: (M, 3), -1 if removed
+    first: I32  #: (N,) corner 3 m + k of each vertex
+    following: I32  #: (3 M,) corner after each one of its vertex, or -1
+    block: I32  #: (N,) block of all faces of a vertex, else -1
+    into: I32  #: (N,) the vertex that replaced one, or itself
 
 
 @kernel

@@ -47,21 +47,16 @@ SCATTER = 20.0  #: distance from the median colour in grey levels at which the w
 
 
 class ViewSurface(NamedTuple):
-    """A surface seen by one view; with (u, v, 1) z = M X + p, ``scale`` = det M.
-
-    Pixels per area: ``scale`` times the distance of ``centre`` to the tangent plane over z^3. ``depth`` (H,
-    W): inf without a surface; ``trust`` (H, W): weight in 0 .. 1; ``tolerance``: relative depth by which
-    visible points may lie behind ``depth``; ``gain`` (3,): of the brightness.
-    """
+    """A surface seen by one view, with (u, v, 1) z = M X + p."""
 
     P: F64
     centre: F64
-    scale: float
-    depth: F32
-    trust: F32
-    tolerance: float
+    scale: float  #: det M; pixels per area: it times the distance of ``centre`` to the tangent plane over z^3
+    depth: F32  #: (H, W) inf without a surface
+    trust: F32  #: (H, W) weight in 0 .. 1
+    tolerance: float  #: relative depth by which visible points may lie behind ``depth``
     rgb: U8
-    gain: F32
+    gain: F32  #: (3,) of the brightness
 
 
 @kernel

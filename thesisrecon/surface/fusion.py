@@ -37,35 +37,27 @@ SIDE = 8  #: voxels per side of a block
 
 
 class FusionMap(NamedTuple):
-    """A depth map prepared for fusion; depth, std and ``cosine`` (H, W), NaN = unknown.
+    """A depth map prepared for fusion."""
 
-    ``P`` = K [R t] (3, 4), ``focal`` in pixels, ``cosine``: distance across the surface per unit of depth,
-    ``slope``: largest relative depth step between neighbours on one surface.
-    """
-
-    P: F64
-    focal: float
-    depth: F32
-    std: F32
-    cosine: F32
-    slope: float
+    P: F64  #: (3, 4) K [R t]
+    focal: float  #: px
+    depth: F32  #: (H, W) NaN = unknown
+    std: F32  #: (H, W)
+    cosine: F32  #: (H, W) distance across the surface per unit of depth
+    slope: float  #: largest relative depth step between neighbours on one surface
 
 
 class VoxelGrid(NamedTuple):
-    """Sparse voxel grid, and the values of its blocks from number ``first`` on.
-
-    ``blocks`` (B, 3): grid positions of all blocks; ``place`` (X, Y, Z): block number at each position or -1.
-    ``value``, ``weight``, ``vertex`` (W, 8, 8, 8): signed distance, its weight, and vertex number or -1.
-    """
+    """Sparse voxel grid, and the values of its blocks from number ``first`` on."""
 
     origin: F64
     voxel: float
-    blocks: I64
-    place: I32
+    blocks: I64  #: (B, 3) grid positions of all blocks
+    place: I32  #: (X, Y, Z) block number at each position or -1
     first: int
-    value: F32
-    weight: F32
-    vertex: I32
+    value: F32  #: (W, 8, 8, 8) signed distance
+    weight: F32  #: (W, 8, 8, 8) its weight
+    vertex: I32  #: (W, 8, 8, 8) vertex number or -1
 
 
 @kernel
