@@ -219,16 +219,10 @@ def squared_distances(F: F64, columns: F64) -> F64:
 @kernel(fastmath={"reassoc", "contract"}, forceinline=True)
 def _block_score(f: F64, columns: F64, start: int, end: int, gate: float) -> tuple[float, float]:
     """Sum of min(r^2 / gate^2, 1) over columns ``start`` to ``end`` of (4, N), and the inliers."""
-    total, inside, wide = 0.0, 0.0, gate * gate
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    total, inside, per_gate = 0.0, 0.0, 1.0 / (gate * gate)
+    F = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for k in range(start, end):
-        x1, y1, x2, y2 = columns[0, k], columns[1, k], columns[2, k], columns[3, k]
-        a0 = f0 * x1 + f1 * y1 + f2
-        a1 = f3 * x1 + f4 * y1 + f5
-        b0 = f0 * x2 + f3 * y2 + f6
-        b1 = f1 * x2 + f4 * y2 + f7
-        e = a0 * x2 + a1 * y2 + f6 * x1 + f7 * y1 + f8
-        r2 = e * e / (wide * (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) + 1e-300)
+        r2 = per_gate * _squared_sampson(F, columns[0, k], columns[1, k], columns[2, k], columns[3, k])
         total += r2 if r2 < 1.0 else 1.0
         inside += 1.0 if r2 < 1.0 else 0.0
     return total, inside

@@ -113,21 +113,6 @@ def _rasterize_rows(
 
 
 @kernel
-def _interpolate(face: I64, weights: F32, faces: I64, values: F32, out: F32) -> None:
-    """Fill out (H, W, C) where there is a face with the values (N, C) of the vertices of ``faces``."""
-    for y in range(face.shape[0]):
-        for x in range(face.shape[1]):
-            m = face[y, x]
-            if m < 0:
-                continue
-            i, j, l = faces[m, 0], faces[m, 1], faces[m, 2]
-            b, c = weights[y, x, 0], weights[y, x, 1]
-            a = np.float32(1.0) - b - c
-            for k in range(values.shape[1]):
-                out[y, x, k] = a * values[i, k] + b * values[j, k] + c * values[l, k]
-
-
-@kernel
 def sample_texture(texture: F32 | U8, uv: F32, drawn: I64, out: F32) -> None:
     """Sample a texture bilinearly, clamped to its border, at ``uv`` (H, W, 2) where ``drawn`` >= 0."""
     height, width = texture.shape[:2]
@@ -169,8 +154,10 @@ class Raster:
         """Values (H, W, C) of mesh vertices (N, C), or of face corners (M, 3, C), at each pixel; else 0."""
         if faces is None:
             faces, values = np.arange(3 * len(values)).reshape(-1, 3), values.reshape(-1, values.shape[2])
-        out = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32)
-        _interpolate(self.face, self.weights, faces, np.ascontiguousarray(values, dtype=np.float32), out)
+        out, hit = np.zeros((*self.face.shape, values.shape[1]), dtype=np.float32), self.face >= 0
+        b, c = self.weights[hit].T[:, :, None]
+        i, j, k = values.astype(np.float32)[faces[self.face[hit]].T]
+        out[hit] = (np.float32(1.0) - b - c) * i + b * j + c * k
         return out
 
     def __getitem__(self, rows: slice) -> "Raster":

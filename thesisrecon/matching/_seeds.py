@@ -33,10 +33,24 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
     index = zeros(rows, np.int64)
     value = full(rows, -1.0, np.float32)
     second_best = full(rows, -1.0, np.float32)
-    largest = empty(LANES, np.float32)
+    largest, whole = empty(LANES, np.float32), columns // (4 * LANES) * (4 * LANES)
     for b in range(rows):
         row = correlation[b]
-        _largest_by_lane(row, largest)
+        # The largest of the values whose number is l modulo ``LANES``, four at once.
+        largest[:] = np.float32(-2.0)
+        for first in range(0, whole, 4 * LANES):
+            one, two = row[first : first + LANES], row[first + LANES : first + 2 * LANES]
+            three, four = (
+                row[first + 2 * LANES : first + 3 * LANES],
+                row[first + 3 * LANES : first + 4 * LANES],
+            )
+            for lane in range(LANES):
+                p = one[lane] if one[lane] > two[lane] else two[lane]
+                q = three[lane] if three[lane] > four[lane] else four[lane]
+                p = p if p > q else q
+                largest[lane] = p if p > largest[lane] else largest[lane]
+        for n in range(whole, columns):
+            largest[n % LANES] = max(largest[n % LANES], row[n])
         top = largest.max()
         best = columns
         for lane in range(LANES):
@@ -57,24 +71,6 @@ def _scan_correlations(correlation: F32, xy2: F32, apart2: F32) -> tuple[I64, F3
                         second = row[n]
         index[b], value[b], second_best[b] = best, top, second
     return index, value, second_best
-
-
-@kernel(fastmath={"nnan", "nsz"}, forceinline=True)
-def _largest_by_lane(row: F32, largest: F32) -> None:
-    """Write the largest of the values whose number is l modulo ``LANES`` to ``largest[l]``, four at once."""
-    whole = len(row) // (4 * LANES) * (4 * LANES)
-    for lane in range(LANES):
-        largest[lane] = np.float32(-2.0)
-    for first in range(0, whole, 4 * LANES):
-        one, two = row[first : first + LANES], row[first + LANES : first + 2 * LANES]
-        three, four = (row[first + 2 * LANES : first + 3 * LANES], row[first + 3 * LANES : first + 4 * LANES])
-        for lane in range(LANES):
-            a = one[lane] if one[lane] > two[lane] else two[lane]
-            b = three[lane] if three[lane] > four[lane] else four[lane]
-            a = a if a > b else b
-            largest[lane] = a if a > largest[lane] else largest[lane]
-    for n in range(whole, len(row)):
-        largest[n % LANES] = max(largest[n % LANES], row[n])
 
 
 def mutual_best(blocks: Iterable[F32], xy2: F32, apart2: F32) -> tuple[I64, F32, F32]:

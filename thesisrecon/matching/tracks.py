@@ -237,21 +237,17 @@ def corners_from_matches(
     for rows in rows_of_views(view, n_views):
         found, number[rows] = _merge_positions(xy[rows], merge_px)
         corners.append(found)
-    index = np.split(number, np.cumsum(lengths))
-    each = zip(pairs, index[::2], index[1::2], strict=False)
-    return corners, [_numbered_pair(pair, corners, one, two) for pair, one, two in each]
-
-
-def _numbered_pair(pair: Pair, corners: Sequence[F64], index1: I64, index2: I64) -> Pair:
-    """The pair with the corners of its matches; among matches of one corner the nearest one stays."""
-    off1, off2 = pair.xy1 - corners[pair.i][index1], pair.xy2 - corners[pair.j][index2]
-    rows = np.argsort((off1**2 + off2**2).sum(axis=1), kind="stable")
-    for index in (index1, index2):
-        rows = rows[np.sort(np.unique(index[rows], return_index=True)[1])]
-    rows = np.sort(rows)
-    names = ["xy1", "xy2", "affine"] + ["score"] * isinstance(pair, Matches)
-    kept = {name: getattr(pair, name)[rows] for name in names}
-    return replace(pair, index1=index1[rows], index2=index2[rows], **kept)
+    index, numbered = np.split(number, np.cumsum(lengths)), []
+    for pair, index1, index2 in zip(pairs, index[::2], index[1::2], strict=False):
+        off1, off2 = pair.xy1 - corners[pair.i][index1], pair.xy2 - corners[pair.j][index2]
+        rows = np.argsort((off1**2 + off2**2).sum(axis=1), kind="stable")
+        for ends_of in (index1, index2):
+            rows = rows[np.sort(np.unique(ends_of[rows], return_index=True)[1])]
+        rows = np.sort(rows)
+        names = ["xy1", "xy2", "affine"] + ["score"] * isinstance(pair, Matches)
+        kept = {name: getattr(pair, name)[rows] for name in names}
+        numbered.append(replace(pair, index1=index1[rows], index2=index2[rows], **kept))
+    return corners, numbered
 
 
 def _merge_positions(xy: F64, merge_px: float) -> tuple[F64, I64]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import TypeVar
 
@@ -211,17 +210,7 @@ class InverseDepth:
     conflicts: U8  #: (H, W) number of other views that disagree
 
 
-def fuse_neighbours(
-    view: int, views: Mapping[int, PinholeView], neighbours: Sequence[int], correspond: Correspond,
-    pool: Executor | None = None,
-) -> InverseDepth:  # fmt: skip
-    """Robust weighted mean of the inverse depths measured with all neighbours (2.5)."""
-    pairs = zip(neighbours, _with_idle_threads(pool, partial(correspond, view), neighbours), strict=True)
-    found = [inverse_depths(views[view].P, views[j].P, pair) for j, pair in pairs if pair is not None]
-    return fuse_inverse_depths(found, views[view].seen.shape)
-
-
-def _with_idle_threads(pool: Executor | None, function: Callable[[A], B], items: Sequence[A]) -> list[B]:
+def with_idle_threads(pool: Executor | None, function: Callable[[A], B], items: Sequence[A]) -> list[B]:
     """Map a function in this thread; threads of ``pool`` without other work take items that are not begun."""
     if pool is None:
         return [function(item) for item in items]

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -336,7 +337,12 @@ class MultiViewStereo:
         if self.sequence_links:
             found = _depth_fusion.link_sequence(view, scene.views, self.sequence_links, correspond)
         else:
-            found = _depth_fusion.fuse_neighbours(view, scene.views, scene.neighbours[view], correspond, pool)
+            # Robust weighted mean of the inverse depths measured with all neighbours (2.5).
+            near, P = scene.neighbours[view], scene.views[view].P
+            pairs = _depth_fusion.with_idle_threads(pool, partial(correspond, view), near)
+            each = [(scene.views[j].P, pair) for j, pair in zip(near, pairs, strict=True) if pair is not None]
+            measured = [_depth_fusion.inverse_depths(P, *one) for one in each]
+            found = _depth_fusion.fuse_inverse_depths(measured, scene.views[view].seen.shape)
         keep = scene.views[view].seen
         if self.refinement:
             found = refine_depths(scene.views[view], [scene.views[j] for j in scene.neighbours[view]], found)

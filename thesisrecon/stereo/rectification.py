@@ -373,7 +373,12 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
     be reduced by more than ``MAX_SHRINK`` (1: no pixel is lost, as in the paper).
     """
     pencil, sign = pair.pencil, -1 if pair.pencil.flipped else 1
-    phi = _half_planes(pair)
+    # Half-planes over the arc, including those of the image corners, where the row spacing is extreme.
+    samples, (start, end) = 4096, pair.arc
+    corners, about = [image_corners(size) for size in pencil.sizes], 0.5 * (start + end)
+    peaks = np.concatenate([pencil.angles(side, xy, about=about) for side, xy in enumerate(corners)])
+    peaks = peaks[(peaks > start) & (peaks < end)]
+    phi = np.unique(np.concatenate([np.linspace(start, end, samples), peaks]))
     both = [pencil.chords(side, phi) for side in (0, 1)]
     # Images of unequal resolution meet halfway, as in planar frames.
     unit = max(float(np.sqrt(pencil.units.prod())), float(pencil.units.max()) / MAX_SHRINK)
@@ -403,15 +408,6 @@ def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRe
     shear = np.clip(-0.5 * slope[1], -max_shear, max_shear)
     scales = frame.scales * [max(scale, 1.0), max(1.0 / scale, 1.0)]
     return replace(frame, scales=scales, shears=np.array([shear, -shear]))
-
-
-def _half_planes(pair: EpipolarPair) -> F64:
-    """Angles over the arc, including those of the image corners, where the row spacing is extreme."""
-    angles = 4096  # Number of half-planes at which the row spacing is computed
-    low, high = pair.arc
-    corners, about = [image_corners(size) for size in pair.pencil.sizes], 0.5 * (low + high)
-    peaks = np.concatenate([pair.pencil.angles(side, xy, about=about) for side, xy in enumerate(corners)])
-    return np.unique(np.concatenate([np.linspace(low, high, angles), peaks[(peaks > low) & (peaks < high)]]))
 
 
 def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]], scales: F64) -> F64:
