@@ -171,10 +171,8 @@ def assess_degeneracy(
 
 
 def _contradicted_fraction(points: F64, weights: F64, H: F64, off: B8, near: float) -> float:
-    """Fraction of a sample of the inliers ``off`` the plane that 30 % of their neighbours on it contradict.
-
-    A larger difference of parallax than of position would change the order of two points of a surface.
-    """
+    """Fraction of the inliers ``off`` the plane that 30 % of their neighbours on it contradict."""
+    # A larger difference of parallax than of position would change the order of two points of a surface.
     chosen = np.flatnonzero(off)
     chosen = chosen[:: max(1, len(chosen) // SAMPLED)]
     parallax = points[:, 2:] - dehomogenize(homogenize(points[:, :2]) @ H.T)

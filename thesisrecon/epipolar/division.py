@@ -59,10 +59,8 @@ class DivisionEstimate:
 
 
 def straighten(xy: F64, sizes: I64 | F64, k: F64) -> tuple[F64, F64]:
-    """Straight positions (N, 2) of pixels, and their magnification (N,), negative beyond the horizon.
-
-    ``sizes`` (2,) or (N, 2) and ``k``, (3,) or (N, 3), are those of the image of each pixel.
-    """
+    """Straight positions (N, 2) of pixels, and their magnification (N,), negative beyond the horizon."""
+    # `sizes` (2,) or (N, 2) and `k`, (3,) or (N, 3), are those of the image of each pixel.
     middle, half = (np.asarray(sizes) - 1.0) / 2.0, _half_diagonal(sizes)
     places, magnification = straight_places(np.asarray((xy - middle) / half), k)
     return np.asarray(middle + half * places), magnification
@@ -107,10 +105,8 @@ class _Pair(NamedTuple):
 
 
 def estimate_division(matches: Sequence[Matches], sizes: I64, rng: Generator) -> DivisionEstimate | None:
-    """Estimate the lens of pairs of images of one camera; None without enough matches.
-
-    Most lenses bend little: other values are tried only where a refined one differs from zero.
-    """
+    """Estimate the lens of pairs of images of one camera; None without enough matches."""
+    # Most lenses bend little: other values are tried only where a refined one differs from zero.
     pairs = [_sampled(m, sizes, rng) for m in _chosen_pairs(matches, MAX_PAIRS)]
     return _small_lens(pairs[:FEW_PAIRS], rng) or _best_of(pairs, VALUES, rng)
 
@@ -122,10 +118,8 @@ def is_nearly_straight(matches: Sequence[Matches], sizes: I64, rng: Generator) -
 
 
 def _small_lens(pairs: Sequence[_Pair], rng: Generator) -> DivisionEstimate | None:
-    """The lens refined from zero; None if it may be larger than k1 near zero.
-
-    F of a bent lens agrees with the matches of a part of the images, for which zero is a minimum too.
-    """
+    """The lens refined from zero; None if it may be larger than k1 near zero."""
+    # F of a bent lens agrees with the matches of a part of the images, for which zero is a minimum too.
     start = _best_value(pairs, (0.0, BENT), rng)
     if start is None or start[1] != 0.0:
         return None

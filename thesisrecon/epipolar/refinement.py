@@ -240,10 +240,8 @@ def _project(B: F64, G: F64, h: F64, H: F64, g: F64) -> None:
 def refine(
     f: F64, points: F64, criterion: int, gate: float, delta: float, iterations: int, frame: F64 | None
 ) -> tuple[float, int]:
-    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves.
-
-    With a ``frame`` (9, 9), f is an essential matrix and stays one; the fundamental matrix is ``frame`` f.
-    """
+    """Minimise a criterion in place by Levenberg-Marquardt; returns the cost and number of solves."""
+    # With a `frame` (9, 9), f is an essential matrix and stays one; the fundamental matrix is `frame` f.
     U, V, Un, Vn = empty((3, 3)), empty((3, 3)), empty((3, 3)), empty((3, 3))
     G, h, Gn, hn = empty((9, 9)), empty(9), empty((9, 9)), empty(9)
     B, step, trial, F, of_E = empty((9, 7)), empty(7), empty(9), empty(9), empty((9, 7))
@@ -294,10 +292,8 @@ def refine(
 
 
 def fundamental_covariance(frame: PairFrame, f: F64, points: F64, sigma: float) -> F64:
-    """Covariance (9, 9) of vec(F), px, unit norm: sigma^2 B (J'J)^-1 B' to first order (HZ 5.2).
-
-    J: derivatives of the Sampson distances by seven parameters, B: of vec(F); f, sigma in the frame.
-    """
+    """Covariance (9, 9) of vec(F), px, unit norm: sigma^2 B (J'J)^-1 B' to first order (HZ 5.2)."""
+    # J: derivatives of the Sampson distances by seven parameters, B: of vec(F); f, sigma in the frame.
     U, V, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((9, 7))
     G, h = np.empty((9, 9)), np.empty(9)
     phi = orthonormal_from_fundamental(f, U, V)

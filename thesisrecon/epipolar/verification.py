@@ -326,10 +326,8 @@ def _assess_pair(
 def homography_inlier_ratio(
     F: F64, xy1: F64, xy2: F64, *, tolerance_px: float, rng: np.random.Generator
 ) -> float:
-    """The largest fraction of the matches (N, 2) of F that one homography maps to within ``tolerance_px``.
-
-    The best of 200 planes through three matches, fitted again to its inliers; 1 for fewer than 5 matches.
-    """
+    """The largest fraction of the matches (N, 2) of F that one homography maps to within ``tolerance_px``."""
+    # The best of 200 planes through three matches, fitted again to its inliers; 1 for fewer than 5 matches.
     n = len(xy1)
     if n < 5:
         return 1.0

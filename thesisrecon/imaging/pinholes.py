@@ -45,10 +45,8 @@ def is_divided(K: F64, size: tuple[int, int], lens: F64) -> bool:
 
 
 def seen_faces(K: F64, size: tuple[int, int], lens: F64) -> tuple[F64, int, dict[str, F64]]:
-    """K and the side px of the square pinhole views of a wide image, and by name the boxes that it shows.
-
-    A box (2, 2) is the first and the last pixel along x and y; views of which little is shown have none.
-    """
+    """K and the side px of the square pinhole views of a wide image, and by name the boxes that it shows."""
+    # A box (2, 2) is the first and the last pixel along x and y; views of which little is shown have none.
     side = 2 * max(int(K[0, 0]), 8)
     middle = (side - 1.0) / 2.0
     own = np.array([[side / 2.0, 0.0, middle], [0.0, side / 2.0, middle], [0.0, 0.0, 1.0]])
@@ -86,10 +84,8 @@ def pinhole_frame(
 def pinhole_view(
     image: Image, reconstruction: Reconstruction, view: int, *, max_side: int = 1536
 ) -> PinholeView:
-    """The pinhole view of a number of an image of a metric reconstruction; P[2] X is the depth.
-
-    Images longer than ``max_side`` are reduced.
-    """
+    """The pinhole view of a number of an image of a metric reconstruction; P[2] X is the depth."""
+    # Images longer than `max_side` are reduced.
     P, K, size, turn = _pinhole_camera(image, reconstruction, view, max_side)
     own, _, lens = camera_of_image(reconstruction, view % len(reconstruction.P))
     if not lens.any() and size == image.size and image.mask is None:

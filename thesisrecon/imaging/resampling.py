@@ -237,10 +237,8 @@ def undistort_image(
     rgb: U8, K: F64, distortion: F64, pinhole_K: F64, size: tuple[int, int], *, mask: B8 | None = None,
     turn: F64 | None = None,
 ) -> tuple[U8, B8]:  # fmt: skip
-    """Resample an image with distortion into a pinhole camera; return it and which pixels are inside.
-
-    The pinhole camera is rotated by ``turn`` (3, 3), from the axes of the image to its own.
-    """
+    """Resample an image with distortion into a pinhole camera; return it and which pixels are inside."""
+    # The pinhole camera is rotated by `turn` (3, 3), from the axes of the image to its own.
     inverse = np.linalg.inv(pinhole_K)
     most = np.inf if turn is None else widest_angle(K, rgb.shape[1::-1], distortion)
 

@@ -103,10 +103,8 @@ def _count_ones(word: np.int32) -> np.uint32:
 
 
 def census(grey: I16) -> I32:
-    """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre.
-
-    Windows of 5 x 5 pixels, 24 comparisons; the border is repeated.
-    """
+    """Census transform (Zabih and Woodfill 1994): one bit per window pixel, 1 if darker than the centre."""
+    # Windows of 5 x 5 pixels, 24 comparisons; the border is repeated.
     (height, width), padded = grey.shape, np.pad(grey, 2, mode="edge")
     bits = np.zeros(grey.shape, np.int32)
     for k in range(25):
@@ -179,10 +177,8 @@ def _row_costs(
 
 
 def support_masks(channels: I16, valid: U8, tolerance: np.int16) -> U8:
-    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009).
-
-    255 where the pixel s + 1 to the left, right, top or bottom is within ``tolerance`` in each channel.
-    """
+    """Cross-shaped support arms (4, ARM, H, W) of all pixels (Zhang, Lu and Lafruit 2009)."""
+    # 255 where the pixel s + 1 to the left, right, top or bottom is within `tolerance` in each channel.
     height, width = valid.shape
     levels, known = np.pad(channels, [(0, 0), (ARM, ARM), (ARM, ARM)]), np.pad(valid, ARM)
     masks = np.zeros((4, ARM, height, width), np.uint8)

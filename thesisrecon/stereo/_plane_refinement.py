@@ -74,10 +74,8 @@ def _window_samples(search: PatchSearch, u: int, v: int, samples: F32) -> float:
 
 @kernel(fastmath=SUMS, forceinline=True)
 def _plane_homography(H: F64, e: F64, k: int, at: tuple[int, int], plane: F64, warp: F64) -> bool:
-    """Fill ``warp`` (8,) with the plane's map of offsets from pixel ``at`` to view k; False if it is behind.
-
-    (warp[0] + dx warp[1] + dy warp[2], warp[3] + dx warp[4] + dy warp[5]) / (1 + dx warp[6] + dy warp[7]).
-    """
+    """Fill ``warp`` (8,) with the plane's map of offsets from ``at`` to view k; False if it is behind."""
+    # (warp[0] + dx warp[1] + dy warp[2], warp[3] + dx warp[4] + dy warp[5]) / (1 + dx warp[6] + dy warp[7]).
     u, v = at
     z = H[k, 2, 0] * u + H[k, 2, 1] * v + H[k, 2, 2] + plane[0] * e[k, 2]
     if not z > 0.0:

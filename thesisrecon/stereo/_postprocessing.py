@@ -98,10 +98,8 @@ def final_confidence(confidence: F32, confirmed: F32, disparity: F32, texture: F
 
 @kernel
 def remove_speckles(disparity: F32, textured: B8, step: np.float32, smallest: int) -> None:
-    """Set regions to NaN with fewer than ``smallest`` pixels, or with too few ``textured`` ones in or beside.
-
-    Neighbours are connected if their disparities differ by at most ``step``.
-    """
+    """Set regions of fewer than ``smallest`` pixels, or too few ``textured`` in or beside them, to NaN."""
+    # Neighbours are connected if their disparities differ by at most `step`.
     min_textured = 20  # A region needs one textured pixel per this number of pixels
     height, width = disparity.shape
     # Padding with unknown pixels gives every pixel four neighbours; one column serves both sides.

@@ -121,10 +121,8 @@ def scratch_size(height: int, disparities: int, width: int) -> int:
 
 @kernel
 def sum_paths(costs: U8, P2: U8, P1: np.uint8, total: U8, scratch: U8) -> None:
-    """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time.
-
-    ``P2`` (2, H, W) of :func:`adaptive_P2`; ``total`` (2, H, D, W): along rows, along columns.
-    """
+    """Sum the minimal costs of all paths that end in a pixel of costs (H, D, W), two at a time."""
+    # `P2` (2, H, W) of `adaptive_P2`; `total` (2, H, D, W): along rows, along columns.
     height, n, width = costs.shape
     # Horizontal paths are sequential in x: transposed rows are vectorised over y.
     for start in range(0, height, BLOCK):
