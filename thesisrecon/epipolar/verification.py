@@ -287,7 +287,12 @@ class PairVerification:
         # 99 % of a plane's matches: sqrt(chi-square(2)) = 3.03, times sqrt(2) for noise in both images.
         tolerance = max(self.homography_px, 4.3 * fit.sigma_px)
         ratio = homography_inlier_ratio(fit.F, xy1, xy2, tolerance_px=tolerance, rng=rng)
-        reason = self._objection(len(xy1), len(inliers))
+        reason, of_all = "", counted(len(inliers), "match")
+        if len(xy1) < self.min_inliers:
+            reason = Notice("few-inliers", len(xy1), of_all, self.min_inliers)
+        elif len(xy1) < self.min_inlier_ratio * len(inliers):
+            found, least = 100.0 * len(xy1) / len(inliers), 100.0 * self.min_inlier_ratio
+            reason = Notice("low-inlier-ratio", found, of_all, least)
         configuration, degeneracy = _assess_pair(matches, fit, rng)
         return TwoView(
             i=matches.i, j=matches.j, F=fit.F, sigma_px=fit.sigma_px, index1=matches.index1[inliers],
@@ -295,15 +300,6 @@ class PairVerification:
             candidates=len(inliers), homography_inlier_ratio=ratio, accepted=not reason, reason=reason,
             configuration=configuration, degeneracy=degeneracy,
         )  # fmt: skip
-
-    def _objection(self, verified: int, candidates: int) -> str:
-        """Reason to reject the pair, empty if there is none."""
-        if verified < self.min_inliers:
-            return Notice("few-inliers", verified, counted(candidates, "match"), self.min_inliers)
-        if verified < self.min_inlier_ratio * candidates:
-            found, least = 100.0 * verified / candidates, 100.0 * self.min_inlier_ratio
-            return Notice("low-inlier-ratio", found, counted(candidates, "match"), least)
-        return ""
 
 
 def _assess_pair(

@@ -378,7 +378,13 @@ def reject_repeated_structure(pairs: Sequence[TwoView], n_views: int) -> list[Tw
     graph = scipy.sparse.coo_array((np.ones(strong.sum()), ends), (n_views, n_views)).tocsr()
     group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     weak = np.flatnonzero(~strong & (group[i] == group[j]))
-    near = _within_steps(graph + graph.T, i[weak], j[weak], MAX_STEPS)
+    step, near = graph + graph.T + scipy.sparse.eye_array(n_views), np.zeros(len(weak), dtype=bool)
+    # At most so many edges connect the views of a pair: steps from both ends meet.
+    for rows in np.array_split(np.arange(len(weak)), len(weak) // ROWS_AT_ONCE + 1):
+        reached = [scipy.sparse.eye_array(n_views, format="csr")[ends[weak[rows]]] for ends in (i, j)]
+        for k in range(MAX_STEPS):
+            reached[k % 2] = (reached[k % 2] @ step).sign()
+        near[rows] = reached[0].multiply(reached[1]).sum(axis=1) > 0
     apart = {*map(tuple, np.column_stack([i, j])[weak[~near]].tolist())}
     reason = (
         "its {} matches are few compared with those of each image's best pair, and "
@@ -396,18 +402,6 @@ def strong_pairs(i: I64, j: I64, count: I64 | F64, n_views: int) -> B8:
     most = np.zeros(n_views, count.dtype)
     np.maximum.at(most, np.concatenate([i, j]), np.tile(count, 2))
     return np.asarray(count >= STRONG * np.minimum(most[i], most[j]))
-
-
-def _within_steps(graph: scipy.sparse.csr_array, i: I64, j: I64, steps: int) -> B8:
-    """Whether at most ``steps`` edges connect the views i and j (M,): steps from both ends meet."""
-    step = scipy.sparse.csr_array(graph + scipy.sparse.eye_array(graph.shape[0]))
-    near = np.zeros(len(i), dtype=bool)
-    for rows in np.array_split(np.arange(len(i)), len(i) // ROWS_AT_ONCE + 1):
-        reached = [scipy.sparse.eye_array(graph.shape[0], format="csr")[ends[rows]] for ends in (i, j)]
-        for k in range(steps):
-            reached[k % 2] = (reached[k % 2] @ step).sign()
-        near[rows] = reached[0].multiply(reached[1]).sum(axis=1) > 0
-    return near
 
 
 def connected_groups(views: int, pairs: Sequence[tuple[int, int]]) -> I64:

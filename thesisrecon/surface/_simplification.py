@@ -90,7 +90,12 @@ def sum_planes(mesh: MeshState) -> None:
             v, w = faces[m, k], faces[m, (k + 1) % 3]
             _add_plane(mesh, v, normal, _offset(normal, points, v), area)
             mesh.planes[v, 10] += area
-            if _shared(mesh, v, w) > 1:
+            shared, corner = 0, mesh.first[v]
+            while corner >= 0:
+                n, c = corner // 3, corner % 3
+                shared += faces[n, (c + 1) % 3] == w or faces[n, (c + 2) % 3] == w
+                corner = mesh.following[corner]
+            if shared > 1:
                 continue
             for d in range(3):
                 side[d] = points[w, d] - points[v, d]
@@ -103,17 +108,6 @@ def sum_planes(mesh: MeshState) -> None:
 @kernel
 def _offset(normal: F64, points: F64, v: int) -> float:
     return float(normal[0] * points[v, 0] + normal[1] * points[v, 1] + normal[2] * points[v, 2])
-
-
-@kernel
-def _shared(mesh: MeshState, v: int, w: int) -> int:
-    """Number of faces at the edge between two vertices."""
-    count, corner = 0, mesh.first[v]
-    while corner >= 0:
-        m, k = corner // 3, corner % 3
-        count += mesh.faces[m, (k + 1) % 3] == w or mesh.faces[m, (k + 2) % 3] == w
-        corner = mesh.following[corner]
-    return count
 
 
 @kernel
