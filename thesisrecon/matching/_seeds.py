@@ -158,21 +158,6 @@ def _similarity(scale: F64, angle: F64) -> F64:
     return maps
 
 
-def _common_similarity(matches: Matches) -> F64:
-    """Scaled rotation (2, 2) of most matches: medians of log scale and of the angle around its mode."""
-    a = matches.affine
-    scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
-    angle = np.arctan2(a[:, 1, 0], a[:, 0, 0])
-    # The mode of the angles, by a histogram of 10 degrees, and the median around it.
-    counts, edges = np.histogram(angle, bins=36, range=(-np.pi, np.pi))
-    counts = counts + np.roll(counts, 1) + np.roll(counts, -1)
-    mode = edges[np.argmax(counts)] + np.pi / 36
-    around = np.angle(np.exp(1j * (angle - mode)))
-    near = np.abs(around) < np.pi / 6
-    common: F64 = _similarity(np.array([scale]), np.array([mode + np.median(around[near])]))[0]
-    return common
-
-
 def neighbour_support(matches: Matches) -> F64:
     """Strength (M,) of each match: neighbours with similar displacements ((4.1) with c = 1), in both images.
 
@@ -181,7 +166,16 @@ def neighbour_support(matches: Matches) -> F64:
     """
     if len(matches.xy1) < 2:
         return np.zeros(len(matches.xy1))
-    u, v = matches.xy1 @ _common_similarity(matches).T, matches.xy2
+    # The common similarity: medians of the log scale and of the angle around its mode, of 10 degrees.
+    a = matches.affine
+    scale = np.exp(np.median(np.log(np.hypot(a[:, 0, 0], a[:, 1, 0]))))
+    angle = np.arctan2(a[:, 1, 0], a[:, 0, 0])
+    counts, edges = np.histogram(angle, bins=36, range=(-np.pi, np.pi))
+    counts = counts + np.roll(counts, 1) + np.roll(counts, -1)
+    mode = edges[np.argmax(counts)] + np.pi / 36
+    around = np.angle(np.exp(1j * (angle - mode)))
+    turn = mode + np.median(around[np.abs(around) < np.pi / 6])
+    u, v = matches.xy1 @ _similarity(np.array([scale]), np.array([turn]))[0].T, matches.xy2
     same = np.eye(2)[None]
     return 0.5 * (_agreement(u, v, same, 10) + _agreement(v, u, same, 10))
 

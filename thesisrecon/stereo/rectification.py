@@ -135,7 +135,12 @@ def hartley(pair: EpipolarPair) -> PlanarRectification:
     low, high = _admissible_lines(pair)
     middle = pair.pencil.centres[1][None]
     phi = float(pair.pencil.angles(1, middle, about=0.5 * (low + high))[0])
-    rows = _pencil_rows(pair, phi, _perpendicular(pair, phi))
+    # The line through the epipole perpendicular to that through the centre, which is the origin; for an
+    # epipole at infinity it is the line at infinity.
+    x, y, z = pair.pencil.epipole(1)
+    line = np.array([0.0, 0.0, 1.0] if abs(z) < 1e-12 * np.hypot(x, y) else [x, y, -(x**2 + y**2) / z])
+    p = np.linalg.lstsq(pair.pencil.lines[1], line, rcond=None)[0]
+    rows = _pencil_rows(pair, phi, phi + float(np.mod(np.arctan2(p[1], p[0]) - phi, np.pi)))
     _require_in_front(pair, rows)
     v, w = rows[1]
     # A similarity about the image centre, the origin of normalised coordinates.
@@ -144,16 +149,6 @@ def hartley(pair: EpipolarPair) -> PlanarRectification:
     design = z1 / (z1 @ rows[0, 1])[:, None]
     first = np.linalg.lstsq(design, z2 @ second / (z2 @ w), rcond=None)[0]
     return _crop_and_scale(pair, _homographies_of_rows(pair, np.stack([first, second]), rows))
-
-
-def _perpendicular(pair: EpipolarPair, phi: float) -> float:
-    """Plane of the line through the epipole of view 2 perpendicular to that through its centre."""
-    # The centre is the origin. For an epipole at infinity it is the line at infinity.
-    x, y, w = pair.pencil.epipole(1)
-    at_infinity = abs(w) < 1e-12 * np.hypot(x, y)
-    line = np.array([0.0, 0.0, 1.0] if at_infinity else [x, y, -(x**2 + y**2) / w])
-    p = np.linalg.lstsq(pair.pencil.lines[1], line, rcond=None)[0]
-    return phi + float(np.mod(np.arctan2(p[1], p[0]) - phi, np.pi))
 
 
 def loop_zhang(pair: EpipolarPair) -> PlanarRectification:
@@ -385,7 +380,15 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
     scales = unit / pencil.units
     angles = _rows_of(pencil, phi, both, scales)[::sign]
     frame = PolarRectification(pencil, angles, scales, np.zeros(2), np.zeros(2), (1, len(angles)))
-    frame = _align_disparities(frame, pair) if aligned else frame
+    left, right = matches_in_frame(frame, pair.matches, within=False)
+    if aligned and len(left) >= MIN_MATCHES:
+        max_log_scale, max_shear = 0.1, 0.06  # Limits of the alignment of the disparities along the rows
+        # The disparity slope is the difference of the scales along x and of the shears along y.
+        slope = disparity_gradients(left, right).mean(axis=0)
+        scale = np.exp(np.clip(-slope[0], -max_log_scale, max_log_scale))
+        shear = np.clip(-0.5 * slope[1], -max_shear, max_shear)
+        scales = frame.scales * [max(scale, 1.0), max(1.0 / scale, 1.0)]
+        frame = replace(frame, scales=scales, shears=np.array([shear, -shear]))
     ends = []
     for side, (lines, enter, leave) in enumerate(both):
         met = leave >= enter
@@ -395,19 +398,6 @@ def polar(pair: EpipolarPair, *, aligned: bool = True) -> PolarRectification:
     low, high = common_crop(ends, matches_in_frame(frame, pair.matches, within=False))
     extent = np.array([(high - low)[:, 0].max() + 1.0, len(angles)])
     return replace(frame, origins=low[:, 0].copy(), size=frame_size(extent, pair))
-
-
-def _align_disparities(frame: PolarRectification, pair: EpipolarPair) -> PolarRectification:
-    max_log_scale, max_shear = 0.1, 0.06  # Limits of the alignment of the disparities along the rows
-    left, right = matches_in_frame(frame, pair.matches, within=False)
-    if len(left) < MIN_MATCHES:
-        return frame
-    # The disparity slope is the difference of the scales along x and of the shears along y.
-    slope = disparity_gradients(left, right).mean(axis=0)
-    scale = np.exp(np.clip(-slope[0], -max_log_scale, max_log_scale))
-    shear = np.clip(-0.5 * slope[1], -max_shear, max_shear)
-    scales = frame.scales * [max(scale, 1.0), max(1.0 / scale, 1.0)]
-    return replace(frame, scales=scales, shears=np.array([shear, -shear]))
 
 
 def _rows_of(pencil: EpipolarPencil, phi: F64, both: list[tuple[HalfLines, F64, F64]], scales: F64) -> F64:

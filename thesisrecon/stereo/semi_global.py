@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from thesisrecon._numba import copy_to, empty, full, kernel, zeros
-from thesisrecon.arrays import F32, I16, U8
+from thesisrecon.arrays import I16, U8
 from thesisrecon.errors import require_range
 from thesisrecon.records import DisparityMap
 from thesisrecon.stereo import _cost, _postprocessing
@@ -203,8 +203,19 @@ class SemiGlobalMatching:
             own = found[:, start:stop]
             _postprocessing.best_disparities(sums, start - top, first, (own[0], own[1], own[2]), half)
         found[0][images[0].valid == 0] = np.nan
+        # The disparities of the left image are checked, filtered and smoothed.
+        disparity, right_disparity, confidence = found
         texture = _postprocessing.texture_of(images[0], measured)
-        return self._postprocess(found[0], found[1], found[2], images, texture)
+        step = np.float32(1.0)  # Largest disparity difference of neighbours on one surface
+        _postprocessing.check_left_right(disparity, right_disparity, confidence, largest_px=1.0, least=0.02)
+        # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
+        _postprocessing.remove_speckles(disparity, texture > np.float32(1.7), step, 60)
+        refined = _postprocessing.refine_by_gradient(disparity, *images, passes=2)
+        closed, smooth = _postprocessing.fill_pinholes(refined, least=5), np.empty_like(refined)
+        closed[np.isnan(texture)] = np.nan
+        _postprocessing.edge_preserving_mean(closed, step, 2, smooth)
+        confidence = _postprocessing.final_confidence(confidence, refined, smooth, texture)
+        return DisparityMap(smooth, confidence, _postprocessing.disparity_noise(closed, smooth))
 
     def _weights(self, channels: int, noise: float) -> I16:
         """Weights of a census bit and of a quarter level, and truncation, for noise in grey levels."""
@@ -214,20 +225,3 @@ class SemiGlobalMatching:
         of_bit = round(self.census_share * one / _cost.CENSUS_BITS)
         of_level = max(round((1.0 - self.census_share) * one / cap), int(self.census_share < 1.0))
         return np.array([of_bit, of_level, cap], np.int16)
-
-    def _postprocess(
-        self, left: F32, right: F32, confidence: F32, images: tuple[_cost.StereoImage, _cost.StereoImage],
-        texture: F32,
-    ) -> DisparityMap:  # fmt: skip
-        """Check, filter and smooth the disparities (H, W) of the left image; inputs are overwritten."""
-        step = np.float32(1.0)  # Largest disparity difference of neighbours on one surface
-        _postprocessing.check_left_right(left, right, confidence, largest_px=1.0, least=0.02)
-        # Noise does not reach this texture. Smaller regions, and larger ones without texture, are removed.
-        _postprocessing.remove_speckles(left, texture > np.float32(1.7), step, 60)
-        left = _postprocessing.refine_by_gradient(left, *images, passes=2)
-        closed, smooth = _postprocessing.fill_pinholes(left, least=5), np.empty_like(left)
-        closed[np.isnan(texture)] = np.nan
-        _postprocessing.edge_preserving_mean(closed, step, 2, smooth)
-        confidence = _postprocessing.final_confidence(confidence, left, smooth, texture)
-        sigma_px = _postprocessing.disparity_noise(closed, smooth)
-        return DisparityMap(smooth, confidence, sigma_px)

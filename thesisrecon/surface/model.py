@@ -77,27 +77,23 @@ def project_to_view(camera: Camera, vertices: F64) -> tuple[F64, F64]:
     return xy, depth
 
 
-def _visible_vertices(view: PinholeView, buffer: F32, xy: F64, depth: F64) -> B8:
-    """Vertices (N,) with pixels ``xy`` and ``depth`` that lie inside the image and are not occluded."""
-    camera = _texture_blending.view_camera(view)
-    width, height = camera.size
-    with np.errstate(invalid="ignore"):
-        inside = (xy >= 0.0).all(axis=1) & (xy[:, 0] <= width - 1.0) & (xy[:, 1] <= height - 1.0)
-    x, y = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
-    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
-    places = ((y, x), (y, right), (below, x), (below, right))
-    farthest = np.max([buffer[place] for place in places], axis=0)
-    seen = np.all([view.seen[place] for place in places], axis=0)
-    tolerance = _texture_blending.DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-    return np.asarray(inside & seen & (depth <= farthest + tolerance))
-
-
 def face_quality(mesh: TexturedMesh, views: Sequence[PinholeView], buffers: Sequence[F32]) -> F32:
     """Count the pixels (M, V) of each face in each view, 0 if its outside is not completely visible."""
     quality = np.zeros((len(mesh.faces), len(views)), dtype=np.float32)
     for v, view in enumerate(views):
-        xy, depth = project_to_view(_texture_blending.view_camera(view), mesh.vertices)
-        seen = _visible_vertices(view, buffers[v], xy, depth)
+        camera, buffer = _texture_blending.view_camera(view), buffers[v]
+        xy, depth = project_to_view(camera, mesh.vertices)
+        # Vertices inside the image that are not occluded.
+        last = np.array(camera.size) - 1
+        with np.errstate(invalid="ignore"):
+            inside: B8 = np.asarray(((xy >= 0.0) & (xy <= last)).all(axis=1))
+        x, y = near = np.where(inside[:, None], xy, 0.0).astype(np.int64).T
+        right, below = np.minimum(near + 1, last[:, None])
+        places = ((y, x), (y, right), (below, x), (below, right))
+        farthest = np.max([buffer[place] for place in places], axis=0)
+        tolerance = _texture_blending.DEPTH_TOLERANCE_PX * depth / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+        seen = inside & (depth <= farthest + tolerance)
+        seen &= np.all([view.seen[place] for place in places], axis=0)
         a, b, c = (xy[mesh.faces[:, k]] for k in range(3))
         # y points down: faces that are anticlockwise from outside have a negative area.
         area = 0.5 * ((c[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1]) - (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]))
@@ -241,7 +237,23 @@ def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U
     unseen = np.flatnonzero(label < 0)
     if not len(unseen):
         return uv, texture
-    color = _surroundings(neighbours, label, uv, texture)[unseen]
+    # Colours of seen faces are propagated from face to face to unseen ones.
+    x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
+    known = label >= 0
+    every = np.where(known[:, None], texture[y, x], 0).astype(np.float64)
+    while not known.all():
+        open_ = np.flatnonzero(~known)
+        around = neighbours[open_]
+        known_side = (around >= 0) & known[around]
+        reached = known_side.any(axis=1)
+        if not reached.any():
+            every[~known] = every[known].mean(axis=0)
+            break
+        weights = known_side[reached].astype(np.float64)
+        mean = (every[around[reached]] * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
+        every[open_[reached]] = mean
+        known[open_[reached]] = True
+    color = np.rint(every).astype(np.uint8)[unseen]
     code, patch = np.unique(color // color_step @ (1 << 16, 1 << 8, 1), return_inverse=True)
     size = np.bincount(patch)
     shades = np.stack([np.rint(np.bincount(patch, color[:, k]) / size) for k in range(3)], axis=1)
@@ -256,26 +268,6 @@ def _swatches(neighbours: I64, label: I64, uv: F64, texture: U8) -> tuple[F64, U
     middle = np.stack([column * swatch + swatch // 2, texture.shape[0] + row * swatch + swatch // 2], axis=1)
     uv[unseen] = middle[patch][:, None, :]
     return uv, np.concatenate([texture, strip])
-
-
-def _surroundings(neighbours: I64, label: I64, uv: F64, texture: U8) -> U8:
-    """(M, 3) uint8 colours of seen faces, propagated from face to face to unseen ones."""
-    x, y = np.clip(np.rint(uv.mean(axis=1)).astype(np.int64), 0, np.array(texture.shape[1::-1]) - 1).T
-    known = label >= 0
-    color = np.where(known[:, None], texture[y, x], 0).astype(np.float64)
-    while not known.all():
-        open_ = np.flatnonzero(~known)
-        around = neighbours[open_]
-        known_side = (around >= 0) & known[around]
-        reached = known_side.any(axis=1)
-        if not reached.any():
-            color[~known] = color[known].mean(axis=0)
-            break
-        weights = known_side[reached].astype(np.float64)
-        mean = (color[around[reached]] * weights[..., None]).sum(axis=1) / weights.sum(axis=1)[:, None]
-        color[open_[reached]] = mean
-        known[open_[reached]] = True
-    return np.rint(color).astype(np.uint8)
 
 
 @dataclass(frozen=True)
