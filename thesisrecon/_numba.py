@@ -8,7 +8,6 @@ the key is a digest of all code and constants that a kernel refers to, as for th
 # mypy: disable-error-code="no-untyped-call"
 
 import contextlib
-import dataclasses
 import dis
 import functools
 import gc
@@ -28,7 +27,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
-from types import CodeType, FunctionType, MappingProxyType, MethodType, ModuleType
+from types import CodeType, FunctionType, MappingProxyType, ModuleType
 from typing import Any, ParamSpec, TypeVar, overload
 
 import numba
@@ -261,7 +260,8 @@ _LIBRARIES = [Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "p
 
 # Only the names of these libraries are hashed, even if the value itself belongs to one.
 _BY_NAME = {*sys.stdlib_module_names, "numpy", "scipy", "numba"}
-_PLAIN = {int, float, str, bytes, bool, type(None)}
+# Python and its libraries note other things in classes, some of them when an instance is pickled.
+_NOTED = ("_abc_impl", "_is_protocol", "_is_runtime_protocol", "__dict__", "__weakref__")
 
 
 def code_digest(*values: Any) -> str:
@@ -271,8 +271,12 @@ def code_digest(*values: Any) -> str:
     pickled gives a new digest each time, so that stored results are never used for it.
     """
     walk = _Walk({"thesisrecon", *(_package_of(value) for value in values)} - _BY_NAME)
-    walk.follow(values)
-    return hashlib.sha256("".join(f"{text}\0" for text in walk.found).encode()).hexdigest()
+    walk.add(values)
+    # Those that are found on the way are appended.
+    for value in walk.reached:
+        if walk.follows(value.__module__):
+            walk.add(_parts_of_class(value) if isinstance(value, type) else walk.parts_of(value))
+    return walk.digest.hexdigest()
 
 
 def _package_of(value: Any) -> str:
@@ -298,159 +302,102 @@ def _is_library(package: str) -> bool:
     )
 
 
-class _Pickler(pickle.Pickler):
-    """Collects the functions and classes that an object refers to; pickle notes their names only."""
-
-    def __init__(self, stream: io.BytesIO) -> None:
-        super().__init__(stream, 5)
-        self.code: list[Any] = []
-
-    def persistent_id(self, value: Any) -> str | None:
-        if isinstance(value, (FunctionType, type, ModuleType)) or hasattr(value, "py_func"):
-            self.code.append(value)
-            return str(value.__name__)
-        return None
-
-
 class _Walk:
-    """Collects as text everything that the behaviour of a value depends on."""
+    """Hashes values; functions and classes by their names, what they consist of afterwards and once."""
 
     def __init__(self, packages: set[str]) -> None:
-        self._packages = packages
-        self._seen: dict[int, Any] = {}  # keeps the objects, so that no identity is used twice
-        self.found: list[str] = []
+        self._packages, self._seen = packages, set[int]()
+        self.reached: list[Any] = []  # functions and classes
+        self.digest = hashlib.sha256()
 
-    def _followed(self, module: str) -> bool:
+    def follows(self, module: str) -> bool:
+        """Whether the code of a module counts, not only its name."""
         package = str(module).partition(".")[0]
         return package in self._packages or not _is_library(package)
 
-    def follow(self, value: Any) -> None:
-        """Add everything that the behaviour of a value depends on."""
-        if type(value) in _PLAIN:
-            self.found.append(repr(value))
-            return
-        # A kernel; other objects may answer to any name.
-        if hasattr(value, "targetoptions") and isinstance(getattr(value, "py_func", None), FunctionType):
-            self.follow(sorted(value.targetoptions.items()))
-            value = value.py_func
-        if isinstance(value, (staticmethod, classmethod, MethodType)):
-            value = value.__func__
-        if isinstance(value, FunctionType):
-            self._function(value)
-        elif isinstance(value, type):
-            self._class(value)
-        elif isinstance(value, property):
-            self.follow((value.fget, value.fset))
-        elif isinstance(value, functools.cached_property):
-            self.follow(value.func)
-        elif isinstance(value, functools.partial):
-            self.follow((value.func, value.args, value.keywords))
-        elif hasattr(value, "__wrapped__"):
-            self.follow(value.__wrapped__)
-        else:
-            self._plain(value)
-
-    def _plain(self, value: Any) -> None:
-        library = not self._followed(type(value).__module__)
-        if type(value) in (list, set, frozenset) or isinstance(value, tuple):
-            self.found.append(f"{type(value).__name__} {len(value)}")
-            # The order of a set changes from process to process.
-            for item in sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value:
-                self.follow(item)
-        elif type(value) is MappingProxyType or (isinstance(value, dict) and library):
-            self.found.append(f"mapping {len(value)}")
-            for key, item in value.items():
-                self.follow((key, item))
-        elif isinstance(value, np.ndarray):
-            self.found.append(f"{value.dtype} {value.shape} {value.tobytes().hex()}")
-        elif isinstance(value, ModuleType):
-            self.found.append(value.__name__)
-        elif isinstance(value, ContextVar):
-            # It cannot be pickled.
-            self.found.append(value.name)
-        elif isinstance(value, (int, float, complex, str, bytes, np.generic, np.dtype, Path, type(None))):
-            self.found.append(repr(value))
-        else:
-            self._class(type(value))
-            if id(value) in self._seen:
-                return
-            self._seen[id(value)] = value
-            if dataclasses.is_dataclass(value):
-                for field in dataclasses.fields(value):
-                    self.follow((field.name, getattr(value, field.name, None)))
-            elif library and isinstance(name := getattr(value, "__qualname__", None), str):
-                owner = getattr(value, "__self__", None)
-                self.found.append(name)
-                self.follow(None if isinstance(owner, type) else owner)
-            else:
-                self._state(value)
-
-    def _state(self, value: Any) -> None:
-        """The pickled state of an object, and the functions and classes in it."""
+    def add(self, value: Any) -> None:
+        """Hash a value."""
         stream = io.BytesIO()
-        pickler = _Pickler(stream)
+        pickler = _Pickler(stream, self)
+        # Equal values give equal bytes, whether they are one object or several.
+        pickler.fast = True
         try:
             pickler.dump(value)
-            self.found.append(hashlib.sha256(stream.getvalue()).hexdigest())
         except Exception:
             # Any class may raise anything here.
-            self.found.append(uuid.uuid4().hex)
-        self.follow(pickler.code)
+            stream.write(uuid.uuid4().bytes)
+        self.digest.update(stream.getvalue())
 
-    def _function(self, function: FunctionType) -> None:
-        self.found.append(f"{function.__module__}.{function.__qualname__}")
-        if id(function) in self._seen or not self._followed(function.__module__):
-            return
-        self._seen[id(function)] = function
-        self.follow((function.__defaults__, function.__kwdefaults__))
+    def name_of(self, value: Any) -> str:
+        """The name of a function or class, which is reached with it."""
+        if id(value) not in self._seen:
+            self._seen.add(id(value))
+            self.reached.append(value)
+        return f"{value.__module__}.{value.__qualname__}"
+
+    def parts_of(self, function: FunctionType) -> list[Any]:
+        """Defaults, closure, byte code, constants and the values of global names, also of modules."""
+        parts: list[Any] = [function.__defaults__, function.__kwdefaults__]
         for cell in function.__closure__ or ():
-            try:
-                self.follow(cell.cell_contents)
-            except ValueError:  # not yet filled
-                self.found.append("empty")
-        self._code(function.__code__, function)
+            with contextlib.suppress(ValueError):  # not yet filled
+                parts.append(cell.cell_contents)
+        codes = [function.__code__]
+        for code in codes:
+            names, plain = code.co_names, [c for c in code.co_consts if c != function.__doc__]
+            codes += [constant for constant in plain if isinstance(constant, CodeType)]
+            parts += [code.co_code, names, code.co_varnames, code.co_freevars, code.co_exceptiontable]
+            parts.append([constant for constant in plain if not isinstance(constant, CodeType)])
+            values = [function.__globals__[name] for name in names if name in function.__globals__]
+            modules = [value for value in values if isinstance(value, ModuleType)]
+            operations, arguments = code.co_code[::2], code.co_code[1::2]
+            # Few functions import.
+            places = [k for k, o in enumerate(operations) if o == _IMPORT] if _IMPORT in operations else []
+            for name in (names[arguments[k]] for k in places if arguments[k] < len(names)):
+                with contextlib.suppress(ImportError):
+                    # `from . import name` has no module name.
+                    modules += [importlib.import_module(name)] if name and self.follows(name) else []
+            for module in modules:
+                used = [getattr(module, name, None) for name in names if self.follows(module.__name__)]
+                modules += [one for one in used if isinstance(one, ModuleType) and one not in modules]
+                values += used
+            parts.append(values)
+        return parts
 
-    def _class(self, kind: type) -> None:
-        self.found.append(f"{kind.__module__}.{kind.__qualname__}")
-        if id(kind) in self._seen or not self._followed(kind.__module__):
-            return
-        self._seen[id(kind)] = kind
-        self.found.append(str(vars(kind).get("__annotations__", "")))
-        self.follow(kind.__bases__)
-        for name, member in list(vars(kind).items()):
-            # Python and its libraries note other things there, some of them when an instance is pickled.
-            noted = name.startswith("__annot") or (name.startswith("__") and not hasattr(member, "__get__"))
-            if not noted and name not in ("_abc_impl", "_is_protocol", "_is_runtime_protocol"):
-                self.found.append(name)
-                self.follow(member)
 
-    def _code(self, code: CodeType, function: FunctionType) -> None:
-        self.found.append(code.co_code.hex())
-        names = f"{code.co_names} {code.co_varnames} {code.co_freevars}"
-        self.found.append(f"{names} {code.co_exceptiontable.hex()}")
-        for constant in code.co_consts:
-            if isinstance(constant, CodeType):
-                self._code(constant, function)
-            elif constant != function.__doc__:
-                self.follow(constant)
-        modules = []
-        for name in code.co_names:
-            if name in function.__globals__:
-                value = function.__globals__[name]
-                modules += [value] if isinstance(value, ModuleType) else []
-                self.found.append(name)
-                self.follow(value)
-        operations, arguments = code.co_code[::2], code.co_code[1::2]
-        # Few functions import.
-        places = [k for k, o in enumerate(operations) if o == _IMPORT] if _IMPORT in operations else []
-        for name in (code.co_names[arguments[k]] for k in places if arguments[k] < len(code.co_names)):
-            with contextlib.suppress(ImportError):
-                # `from . import name` has no module name.
-                modules += [importlib.import_module(name)] if name and self._followed(name) else []
-        for module in modules:
-            if self._followed(module.__name__):
-                for name in code.co_names:
-                    value = getattr(module, name, None)
-                    if isinstance(value, ModuleType) and value not in modules:
-                        modules.append(value)
-                    self.follow(value)
+def _parts_of_class(kind: type) -> list[Any]:
+    """Annotations, bases and members of a class."""
+    members = [
+        (name, member)
+        for name, member in list(vars(kind).items())
+        if name not in _NOTED and not name.startswith("__annot")
+        if not name.startswith("__") or hasattr(member, "__get__")
+    ]
+    return [str(vars(kind).get("__annotations__", "")), kind.__bases__, members]
+
+
+class _Pickler(pickle.Pickler):
+    """Writes by what it consists of what pickle refuses, or writes in another way in each process."""
+
+    def __init__(self, stream: io.BytesIO, walk: _Walk) -> None:
+        super().__init__(stream, 5)
+        self._walk = walk
+
+    def persistent_id(self, value: Any) -> Any:
+        if isinstance(value, FunctionType | type):
+            return self._walk.name_of(value)
+        if isinstance(value, ModuleType | ContextVar):
+            return getattr(value, "__name__", None) or value.name
+        if isinstance(value, set | frozenset):
+            return sorted(value, key=repr)
+        if type(value) is MappingProxyType:
+            return dict(value)
+        # A kernel; other objects may answer to any name.
+        if hasattr(value, "targetoptions") and isinstance(getattr(value, "py_func", None), FunctionType):
+            return sorted(value.targetoptions.items()), value.py_func
+        if isinstance(value, property):
+            return value.fget, value.fset
+        if isinstance(value, functools.cached_property):
+            return (value.func,)
+        if "__wrapped__" in getattr(value, "__dict__", ()) or isinstance(value, staticmethod | classmethod):
+            return (value.__wrapped__,)
+        return None
