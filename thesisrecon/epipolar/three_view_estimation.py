@@ -63,7 +63,19 @@ def fit_trifocal(
         raise StageFailure.of("undetermined-tensor", "they are in a degenerate configuration") from error
     problem = _ReprojectionProblem(T, points, segments, equations.transforms, loss_px)
     fit = _minimize_reprojection_error(problem, equations)
-    _require_determined(fit, np.concatenate([points, segments.reshape(3, -1, 2)], axis=1))
+    # The noise alone must not decide the fit.
+    xy = np.concatenate([points, segments.reshape(3, -1, 2)], axis=1)
+    across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
+    narrowest, noise = float(across.min()) / np.sqrt(xy.shape[1]), f"noise of {fit.sigma_px:.2g} px"
+    found = list[str]()
+    if not fit.relative_std <= WEAK:
+        change = f"{fit.relative_std:.0%} of its size (at most {WEAK:.0%})"
+        found.append(f"{noise} changes the tensor by {change}")
+    if not narrowest > 3.0 * fit.sigma_px:
+        narrow = f"the matches of one image deviate from a line by only {narrowest:.2g} px"
+        found.append(f"{narrow}, less than three times the {noise}")
+    if found:
+        raise StageFailure.of("undetermined-tensor", "; ".join(found))
     residuals = np.full((3, len(inliers)), np.nan)
     residuals[:, inliers] = fit.point_residuals_px
     return replace(fit, point_residuals_px=residuals, inliers=inliers)
@@ -186,25 +198,6 @@ def _minimize_reprojection_error(problem: _ReprojectionProblem, equations: _Tens
         relative_std=float(np.sqrt((n + m) * np.linalg.norm(J @ of_cameras @ J.T, ord=2))),
         inliers=np.ones(n, dtype=bool),
     )
-
-
-def _require_determined(fit: TrifocalFit, xy: F64) -> None:
-    """Raise StageFailure if the noise alone decides a fit to points and segment ends xy (3, K, 2)."""
-    across = np.linalg.svd(xy - xy.mean(axis=1, keepdims=True), compute_uv=False)[:, 1]
-    narrowest = float(across.min()) / np.sqrt(xy.shape[1])
-    sigma, found = fit.sigma_px, []
-    if not fit.relative_std <= WEAK:
-        found.append(
-            f"noise of {sigma:.2g} px changes the tensor by {fit.relative_std:.0%} of its size (at most "
-            f"{WEAK:.0%})"
-        )
-    if not narrowest > 3.0 * sigma:
-        found.append(
-            f"the matches of one image deviate from a line by only {narrowest:.2g} px, less than three times "
-            f"the noise of {sigma:.2g} px"
-        )
-    if found:
-        raise StageFailure.of("undetermined-tensor", "; ".join(found))
 
 
 @dataclass(frozen=True)

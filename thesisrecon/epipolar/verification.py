@@ -141,7 +141,14 @@ def _classify(case: _InlierData) -> Configuration:
     plane = homography.find_dominant_plane(case.f, case.points, case.agree, sigma=case.sigma, rng=rng)
     if plane is not None:
         H, squared = plane[0], plane[1] * case.sigma**2
-        noise = _plane_noise(squared[case.agree])
+        # Noise from the squared distances, chi-square(2), with outliers.
+        variance = float(np.median(squared[case.agree])) / 1.386294
+        for _ in range(3):
+            inside = squared[case.agree & (squared < NEAR * variance)]
+            if len(inside) < MINIMUM:
+                break
+            variance = float(inside.sum()) / (2.0 * 0.97743 * (len(inside) - 4))
+        noise = float(np.sqrt(max(variance, 1e-24)))
         near, far = squared < NEAR * noise**2, squared > FAR * noise**2
         # Standard errors by which the squared parallax of the matches near the plane exceeds the noise: of
         # the residuals, 2 K - 8 of a homography and K - 7 of F, K - 1 lie along the epipolar lines.
@@ -163,17 +170,6 @@ def _classify(case: _InlierData) -> Configuration:
             )
             return Configuration.ROTATION if rotation else Configuration.PLANE
     return Configuration.TRANSLATION if _translation_ratio(case) <= 1.0 else Configuration.GENERAL
-
-
-def _plane_noise(squared: F64) -> float:
-    """Noise from squared distances (N,) to a homography, chi-square(2), with outliers."""
-    variance = float(np.median(squared)) / 1.386294
-    for _ in range(3):
-        near = squared[squared < NEAR * variance]
-        if len(near) < MINIMUM:
-            break
-        variance = float(near.sum()) / (2.0 * 0.97743 * (len(near) - 4))
-    return float(np.sqrt(max(variance, 1e-24)))
 
 
 def _eigenvalue_errors(H: F64, covariance: F64) -> float:

@@ -191,12 +191,8 @@ def sample_cubic(image: F32, xy: F64, widen: bool, out: F32) -> None:
                     value = 0.0
                     for k in range(4):
                         row = image[y0 - 1 + k]
-                        value += wy[k] * (
-                            wx[0] * row[x0 - 1, c]
-                            + wx[1] * row[x0, c]
-                            + wx[2] * row[x0 + 1, c]
-                            + wx[3] * row[x0 + 2, c]
-                        )
+                        left_part = wx[0] * row[x0 - 1, c] + wx[1] * row[x0, c]
+                        value += wy[k] * (left_part + wx[2] * row[x0 + 1, c] + wx[3] * row[x0 + 2, c])
                     total[c] = value
                 if not np.isnan(total[0]):
                     for c in range(channels):

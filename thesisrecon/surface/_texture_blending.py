@@ -167,20 +167,6 @@ def combine_colors(weight: F32, color: F32, power: float, scatter: float, out: F
             out[n, k] = np.float32(mean[k] / total)
 
 
-def grow_colors(texture: U8, drawn: B8) -> None:
-    """Extend the drawn texels by the mean of their neighbours."""
-    y, x = np.nonzero(scipy.ndimage.binary_dilation(drawn, np.ones((3, 3))) & ~drawn)
-    last, total, count = np.array(drawn.shape) - 1, np.zeros((len(y), 3)), np.zeros(len(y), np.int64)
-    for dy, dx in product((-1, 0, 1), repeat=2):
-        # Beyond the border a texel is its own neighbour, which is not drawn.
-        inside = (y + dy >= 0) & (y + dy <= last[0]) & (x + dx >= 0) & (x + dx <= last[1])
-        at = np.where(inside, y + dy, y), np.where(inside, x + dx, x)
-        total += texture[at] * drawn[at][:, None]
-        count += drawn[at]
-    texture[y, x] = (total / count[:, None] + 0.5).astype(np.uint8)
-    drawn[y, x] = True
-
-
 def continue_faces(corners: F64, farthest: float, face: I64, weights: F32) -> None:
     """Extrapolate faces to adjacent empty texels, up to barycentric coordinates of ``farthest``."""
     # `corners` (M, 3, 3): homogeneous texels; updates `face` (H, W), -1: none, and `weights` (H, W, 2).
@@ -228,8 +214,19 @@ def paint_texture(
             color, shown = blend_colors(views, points, towards, pool)
             texture.reshape(-1, 3)[at[shown]] = np.clip(np.rint(color[shown]), 0, 255)
             drawn.ravel()[at[shown]] = True
+    height, width = texture.shape[:2]
     for _ in range(grown_texels):
-        grow_colors(texture, drawn)
+        # The drawn texels are extended by the mean of their neighbours.
+        y, x = np.nonzero(scipy.ndimage.binary_dilation(drawn, np.ones((3, 3))) & ~drawn)
+        total, count = np.zeros((len(y), 3)), np.zeros(len(y), np.int64)
+        for dy, dx in product((-1, 0, 1), repeat=2):
+            # Beyond the border a texel is its own neighbour, which is not drawn.
+            inside = (y + dy >= 0) & (y + dy < height) & (x + dx >= 0) & (x + dx < width)
+            place = np.where(inside, y + dy, y), np.where(inside, x + dx, x)
+            total += texture[place] * drawn[place][:, None]
+            count += drawn[place]
+        texture[y, x] = (total / count[:, None] + 0.5).astype(np.uint8)
+        drawn[y, x] = True
     return texture
 
 
