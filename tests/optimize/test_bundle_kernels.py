@@ -345,6 +345,16 @@ def _scatter(block, xy, *, loss=20.0):
     return fit, linear, block_scatter(linear)
 
 
+def test_the_scatter_of_nearly_undetermined_cameras_is_not_measurable():
+    """Their variances are so large that rounding leaves nothing of what is expected."""
+    block = make_block(points=200)
+    linear = _scatter(block, block.xy + SIGMA * np.random.default_rng(0).normal(size=block.xy.shape))[1]
+    lost = replace(linear, taken=3.0 * linear.taken, solve=lambda B: 1e9 * linear.solve(B))
+    found = block_scatter(lost)
+    assert np.isnan(found.overdispersion)
+    assert np.isnan(found.ratio).all()
+
+
 def test_the_variances_are_those_of_bundle_adjustment_and_grow_with_the_intrinsics():
     block = make_block(points=200)
     fit, linear, scatter = _scatter(

@@ -126,7 +126,7 @@ def block_scatter(fit: LinearisedFit) -> BlockScatter:
     for n, c in enumerate(rows):
         squares[n] = np.sum(np.bincount(point, (fit.J @ c) * fit.residual) ** 2)
     expected = np.sum((fit.J @ rows.T) ** 2, axis=0) - np.sum((fit.taken @ rows.T) ** 2, axis=0)
-    alone = curvature * (squares / np.maximum(expected, 1e-300))
+    alone = curvature * np.divide(squares, expected, out=np.full_like(squares, np.nan), where=expected > 0.0)
     valid = np.isfinite(ratio) & (alone > 0.0)
     estimated, number = values.number >= 0, values.number
     covariance = rows[len(poses) :, first:]
@@ -400,7 +400,7 @@ def _block_ratio(fit: LinearisedFit, rows: F64, block: I64) -> F64:
         half = (J.T @ (J @ rows.T) - taken.T @ (taken @ rows.T)).T
         expected += np.sum(half * rows, axis=1) - np.sum(fit.solve(half.T).T * half, axis=1)
         squares += (rows @ (J.T @ fit.residual[here])) ** 2
-    return np.where(expected > 0.0, squares / np.maximum(expected, 1e-300), np.nan)
+    return np.asarray(np.divide(squares, expected, np.full(len(rows), np.nan), where=expected > 0.0))
 
 
 def _loss_correction(weighted: F64, delta: float) -> float:
