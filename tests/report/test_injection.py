@@ -10,6 +10,7 @@ import pytest
 
 from tests.report.synthetic import Structure, Witness, unpacked
 from thesisrecon.cli.commands import run_command
+from thesisrecon.runtime._precompilation import precompile
 
 COURTYARD = Path(__file__).parents[2] / "fixtures" / "courtyard" / "images"
 MARK = "header-of-a-photograph"
@@ -53,6 +54,8 @@ def page_of(place, names, title, snare):
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
     """The same run with plain names and with evil ones."""
+    # A run that compiles says so on its page.
+    precompile("matches", 2, lambda *_: None)
     place = tmp_path_factory.mktemp("pages")
     return (
         page_of(place / "plain", PLAIN, "scene", "nothing"),

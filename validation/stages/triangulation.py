@@ -30,7 +30,7 @@ ADJUSTED = "ours (cameras too)"
 MOVED = 1e-3  # Relative perturbation of camera entries before the adjustment, about a pixel
 OPENCV, OPENCV_POLYNOMIAL, COLMAP = "OpenCV", "OpenCV, correctMatches", "COLMAP"
 NOISES_PX = (0.5, 1.0, 2.0)
-POINTS = 400
+POINTS, TRIALS = 400, 4  # of each scene, noise and frame
 Method = Callable[[F64, F64], F64]
 
 
@@ -118,8 +118,7 @@ def _solver(method: str, views: int) -> Method | None:
 
 
 def _problems(options: ReportOptions) -> Iterator[Problem]:
-    trials = 1 if options.quick else 4
-    for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(trials)):
+    for scene, sigma, projective, trial in product(SCENES, NOISES_PX, (False, True), range(TRIALS)):
         rng = np.random.default_rng([options.seed, trial])
         frame: Group = "projective" if projective else "metric"
         drawn = draw_rig(scene, sigma, frame, rng, POINTS)
