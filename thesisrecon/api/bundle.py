@@ -380,9 +380,12 @@ def _whitening(covariances: F64 | None, dense: tuple[int, ...] | None, observed:
     Q = Q if dense is None else Q[observed.view_index, observed.point_index]
     Q = Q[:, None, None] * np.eye(2) if Q.ndim == 1 else Q
     try:
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(Q)))
+        root = np.asarray(np.linalg.inv(np.linalg.cholesky(Q)))
     except np.linalg.LinAlgError:
-        raise ValueError("covariances must be positive (definite) for each observation") from None
+        root = np.full((1, 2, 2), np.nan)
+    if not np.isfinite(root).all():
+        raise ValueError("covariances must be positive (definite) for each observation")
+    return root
 
 
 def _inside(views: Sequence[Camera], o: Observations) -> B8:

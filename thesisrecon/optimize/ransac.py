@@ -255,7 +255,9 @@ def resect_robust(
     left = 2 * int(fit.inliers.sum()) - unknown
     fits, k = [fit], fit.inliers
     if K is not None:
-        poses = other_poses(fit.R, fit.t, np.append(pinhole_rows(K), 0.0), rays[k], X[k], xy[k])
+        # Rays are used of few points only.
+        some = rays[np.flatnonzero(k)[:_FEW]]
+        poses = other_poses(fit.R, fit.t, np.append(pinhole_rows(K), 0.0), some, X[k], xy[k])
         fits += [_of_pose(pose, K, k) for pose in poses]
     (cost, fit), *others = sorted([(_cost(one, X, xy), one) for one in fits], key=lambda one: one[0])
     variance = 1.0 if threshold_px is None else VARIANCE_OF_INLIERS

@@ -49,7 +49,7 @@ class BundleOptions:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        require_range(self, sigma_px="(0, inf]", loss_px="(0, inf]")
+        require_range(self, sigma_px="(0, inf)", loss_px="(0, inf]")
 
 
 @dataclass(frozen=True)
