@@ -229,22 +229,7 @@ def self_check(
     doubtful = None if join is None or join.share >= MIN_JOINED_SHARE else join
     if doubtful is not None:
         failed.append(doubtful.sentence)
-    low, high = check["focal_min_long_sides"], check["focal_max_long_sides"]
-    std, explained, off = check["focal_std_rel_max"], check["explained_share"], check["sigma_rel"]
-    moved, aspect_std = check["principal_shift_undetermined"], check["aspect_std_max"]
-    far = check["sigmas_to_minimum"]
-    passed = {
-        Notice("not-converged", far): not far > MAX_SIGMAS_TO_MINIMUM,
-        Notice("implausible-focal", low, high): low > 0.2 and high < 20.0,
-        Notice("focal-std", std): std < 0.15,
-        Notice("low-model-inliers", explained): explained > 0.6,
-        Notice("large-noise", off): off < 0.0015,
-        # Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
-        Notice("centre-shift", moved): moved < 0.15,
-        # An object is stretched by the error of the aspect ratio.
-        Notice("aspect-std", aspect_std): aspect_std < 0.05,
-    }
-    return SelfCheck(check, failed + [sentence for sentence, ok in passed.items() if not ok], doubtful)
+    return SelfCheck(check, [*failed, *_failed_model(check)], doubtful)
 
 
 def _failed_views(views: PerViewChecks, model: _model.MetricEstimate) -> list[str]:
@@ -280,6 +265,26 @@ def _named(views: I64) -> str:
 def _range(shares: F64) -> str:
     low, high = (f"{100.0 * np.nan_to_num(edge(shares)):.0f}" for edge in (np.min, np.max))
     return f"{low} %" if low == high else f"{low} to {high} %"
+
+
+def _failed_model(check: Mapping[str, float]) -> list[str]:
+    """A sentence for each failed check of the model as a whole."""
+    low, high = check["focal_min_long_sides"], check["focal_max_long_sides"]
+    std, share, noise = check["focal_std_rel_max"], check["explained_share"], check["sigma_rel"]
+    shift, aspect_std = check["principal_shift_undetermined"], check["aspect_std_max"]
+    far = check["sigmas_to_minimum"]
+    passed = {
+        Notice("not-converged", far): not far > MAX_SIGMAS_TO_MINIMUM,
+        Notice("implausible-focal", low, high): low > 0.2 and high < 20.0,
+        Notice("focal-std", std): std < 0.15,
+        Notice("low-model-inliers", share): share > 0.6,
+        Notice("large-noise", noise): noise < 0.0015,
+        # Cropping a tenth of the image on two sides moves the principal point by 0.12 long sides.
+        Notice("centre-shift", shift): shift < 0.15,
+        # An object is stretched by the error of the aspect ratio.
+        Notice("aspect-std", aspect_std): aspect_std < 0.05,
+    }
+    return [sentence for sentence, ok in passed.items() if not ok]
 
 
 def returned_cameras(model: _model.MetricEstimate) -> UpgradedCameras:

@@ -131,20 +131,7 @@ def join_models(
     agree = points.distances(found) < SIGMAS
     if agree.sum() < max(MIN_COMMON, MIN_SHARE * len(agree)):
         return None
-    # Expected number of similarities on which as many random points, in the extent of all, agree.
-    variance, axes = np.linalg.eigh(points.covariance(found)[agree])
-    spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a.T), axes)
-    gate = 2.0 * SIGMAS * np.sqrt(variance / np.maximum(12.0 * spread, 1e-300))
-    # The most telling three are spent on the similarity.
-    chance = np.sort(np.log(np.minimum(gate, 1.0)).sum(axis=1))[3:].sum()
-    n, k = len(agree), int(agree.sum())
-    chance += np.log(scipy.special.comb(n, k)) + np.log(scipy.special.comb(k, 3))
-    # Standard deviations of the rotation (rad) and the relative scale.
-    some = points.select(agree)
-    J = central_differences(lambda step: some.whitened(some.moved(found, step)).ravel(), np.zeros(7))
-    singular, Vt = np.linalg.svd(J, full_matrices=False)[1:]
-    std = np.linalg.norm(Vt.T / np.maximum(singular, 1e-300), axis=1)[:4]
-    if chance > np.log(MAX_CHANCE) or std.max() > MAX_STD:
+    if _log_chance(points, found, agree) > np.log(MAX_CHANCE) or _std(points, found, agree) > MAX_STD:
         return None
     joined = _merged(first, second, found, numbers[agree])
     return None if _contradicted(joined, first.registered) else joined
@@ -261,6 +248,26 @@ def _refined(points: _Points, s: Similarity) -> Similarity:
         found = scipy.optimize.least_squares(residuals, np.zeros(7), loss="soft_l1", max_nfev=20)
         s = min((s, some.moved(s, found.x)), key=points.cost)
     return s
+
+
+def _log_chance(points: _Points, s: Similarity, agree: B8) -> float:
+    """Log expected number of similarities on which as many random points, in the extent of all, agree."""
+    variance, axes = np.linalg.eigh(points.covariance(s)[agree])
+    spread = np.einsum("nik,ij,njk->nk", axes, np.cov(points.a.T), axes)
+    gate = 2.0 * SIGMAS * np.sqrt(variance / np.maximum(12.0 * spread, 1e-300))
+    # The most telling three are spent on the similarity.
+    chance = np.sort(np.log(np.minimum(gate, 1.0)).sum(axis=1))[3:].sum()
+    n, k = len(agree), int(agree.sum())
+    return float(chance + np.log(scipy.special.comb(n, k)) + np.log(scipy.special.comb(k, 3)))
+
+
+def _std(points: _Points, s: Similarity, agree: B8) -> float:
+    """Largest standard deviation of the rotation (rad) and the relative scale."""
+    some = points.select(agree)
+    J = central_differences(lambda step: some.whitened(some.moved(s, step)).ravel(), np.zeros(7))
+    singular, Vt = np.linalg.svd(J, full_matrices=False)[1:]
+    std = np.linalg.norm(Vt.T / np.maximum(singular, 1e-300), axis=1)
+    return float(std[:4].max())
 
 
 def _observed(model: Reconstruction, other: Reconstruction) -> B8:

@@ -287,22 +287,12 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
         far = [bool(np.abs(log - np.median(log)).max() > MIN_FOCAL_DIFFERENCE) for log in own]
         apart = [s for s, differs in zip(focals, far, strict=True) if decrease and differs]
         misfit = max(decrease, 1.0) if not apart else 1.0
-        for s in apart:
-            focal, stds = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s.places)
-            low, high = int(focal.argmin()), int(focal.argmax())
-            ratio, ends = focal[high] / focal[low] - 1.0, views[s.places[[high, low]]]
-            facts = ends[0], ratio, ends[1], max(stds[low], stds[high])
-            advice = "Use one camera per image (cameras = per-image), or leave the zoomed images out"
-            found.append((Notice("shared-focal-contradicted", *facts), advice))
+        found += [_focals_differ(views, alone, s) for s in apart]
         contradicted[FOCAL] = bool(apart)
         for s in [s for s in focals if s not in apart]:
             # With less certain own focals the sharing cannot be tested.
             if (std := float(_focal_std(alone, s.places).max())) > 0.03:
-                # That of focals which scatter by ``ZOOM_STD``; it is inflated afterwards, the scatter is not.
-                spread = _adjust_per_view(model, adjustment, (FOCAL,), ZOOM_STD / USUAL_INFLATION)
-                together = model.cameras.intrinsics[model.cameras.group[views[s.places]], FOCAL]
-                off = np.log(spread.cameras.intrinsics[s.places, FOCAL] / together)
-                focal_std[views[s.places]] = np.hypot(_focal_std(spread, s.places), off).max()
+                focal_std[views[s.places]] = _std_of_a_kind(model, adjustment, s)
                 known = f"only to {std:.0%} (1 sigma)" if std < 1.0 else "not at all"
                 warnings.append(Notice("untestable-shared-focal", known, ZOOM_STD))
         before = alone
@@ -312,22 +302,10 @@ def check_shared_cameras(model: MetricEstimate, adjustment: MetricAdjustment) ->
         both = _adjust_per_view(model, adjustment, (*freed, *CENTRE))
         freedom = 2 * sum(s.degrees_of_freedom for s in centres)
         for s in centres if _beyond_chance(before.cost - both.cost, freedom) else ():
-            # In long sides, from the known principal point or from the median.
-            mean = adjustment.row_prior(model).mean[model.cameras.group[views[s.places]]]
-            off = (both.cameras.intrinsics[s.places] - mean)[:, CENTRE]
-            off /= model.sizes[views[s.places]].max(axis=1, keepdims=True)
-            off = off if s.known else off - np.median(off, axis=0)
-            if not np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
-                continue
-            advice = "se one camera per image (cameras = per-image) if the images were cropped individually"
-            if s.known:
-                fact = Notice("given-centre-contradicted", len(s.places), np.abs(off).max())
-                found.append((fact, f"Leave it out, or u{advice}"))
-            else:
-                apart_by = np.ptp(off, axis=0).max()
-                fact = Notice("shared-centre-contradicted", len(s.places), apart_by)
-                found.append((fact, f"U{advice}"))
-                contradicted[list(CENTRE)] = True
+            off = _centres_off(model, adjustment, views, both, s)
+            if np.abs(off).max() > MIN_CENTRE_DIFFERENCE:
+                found.append(_centres_differ(s, off))
+                contradicted[list(CENTRE)] |= not s.known
     if np.isfinite(focal_std).any():
         focal_std[everywhere & ~model.registered] = np.nanmax(focal_std)
     return SharedCameraTest(tuple(found), tuple(warnings), focal_std, contradicted, misfit)
@@ -355,6 +333,43 @@ def _focal_std(fit: MetricBundleResult, rows: I64) -> F64:
     variance = fit.intrinsics_covariance[rows, FOCAL, FOCAL]
     std = USUAL_INFLATION * np.sqrt(np.maximum(variance, 0.0)) / fit.cameras.intrinsics[rows, FOCAL]
     return np.where(np.isfinite(std) & (variance > 0.0), np.hypot(std, 2e-3), np.inf)
+
+
+def _std_of_a_kind(model: MetricEstimate, adjustment: MetricAdjustment, s: _SharedGroup) -> float:
+    """Relative standard deviation of the shared focal of a set if its focals scatter by ``ZOOM_STD``."""
+    # Standard deviations are inflated afterwards, the assumed scatter must not be.
+    scattered = _adjust_per_view(model, adjustment, (FOCAL,), ZOOM_STD / USUAL_INFLATION)
+    rows = model.cameras.group[np.flatnonzero(model.registered)[s.places]]
+    off = np.log(scattered.cameras.intrinsics[s.places, FOCAL] / model.cameras.intrinsics[rows, FOCAL])
+    return float(np.hypot(_focal_std(scattered, s.places), off).max())
+
+
+def _centres_off(
+    model: MetricEstimate, adjustment: MetricAdjustment, views: I64, both: MetricBundleResult, s: _SharedGroup
+) -> F64:
+    """(n, 2) offsets, in long sides, of own principal points from the known one or the median."""
+    rows = model.cameras.group[views[s.places]]
+    off = (both.cameras.intrinsics[s.places] - adjustment.row_prior(model).mean[rows])[:, CENTRE]
+    off /= model.sizes[views[s.places]].max(axis=1, keepdims=True)
+    return np.asarray(off if s.known else off - np.median(off, axis=0))
+
+
+def _focals_differ(views: I64, alone: MetricBundleResult, s: _SharedGroup) -> tuple[str, str]:
+    focal, std = alone.cameras.intrinsics[s.places, FOCAL], _focal_std(alone, s.places)
+    low, high = int(focal.argmin()), int(focal.argmax())
+    ratio, ends = focal[high] / focal[low] - 1.0, views[s.places[[high, low]]]
+    return (
+        Notice("shared-focal-contradicted", ends[0], ratio, ends[1], max(std[low], std[high])),
+        "Use one camera per image (cameras = per-image), or leave the zoomed images out",
+    )
+
+
+def _centres_differ(s: _SharedGroup, off: F64) -> tuple[str, str]:
+    advice = "se one camera per image (cameras = per-image) if the images were cropped individually"
+    if s.known:
+        fact = Notice("given-centre-contradicted", len(s.places), np.abs(off).max())
+        return fact, f"Leave it out, or u{advice}"
+    return Notice("shared-centre-contradicted", len(s.places), np.ptp(off, axis=0).max()), f"U{advice}"
 
 
 def contradicted_focal_priors(model: MetricEstimate, adjustment: MetricAdjustment) -> list[str]:
